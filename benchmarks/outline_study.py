@@ -31,9 +31,9 @@ from rich.text import Text
 
 from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
-from legcal.processors import processors
 from legcal.report.render import Report, report, table
 from legcal.simulation.study import Record, failure_of, run_study
+from legcal.workers import processors
 
 Found = dict[str, Any]
 """What all sessions of a machine showed, as in the document: its name, ``met``, figures."""

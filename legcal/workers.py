@@ -27,7 +27,6 @@ from typing import Any, Protocol, SupportsIndex, TypeGuard, TypeVar, cast
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.processors import processors
 from legcal.signals import held_back_signals, leave_interrupts_to_parent
 from legcal.version import __version__
 
@@ -61,6 +60,13 @@ class Submitter(Protocol):
 _Submit = Callable[..., Any]
 Workers = int | str | Submitter
 """A number of processes; the address of a Dask scheduler; or a Dask client or another executor."""
+
+
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def is_number(workers: object) -> TypeGuard[int]:

@@ -1,5 +1,7 @@
 """What several test files share."""
 
+from __future__ import annotations
+
 import gc
 import os
 import signal
@@ -8,21 +10,18 @@ from collections.abc import Generator, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import process_settings  # noqa: F401
 import pytest
-import typer.main
-from hexapod_example import Run, copy_of_the_example
 from xdist.scheduler import LoadScopeScheduling
 
-from legcal import calibrate
-from legcal.calibration.four_steps import Steps
-from legcal.machine import loader
-from legcal.machine.files import find_model
-from legcal.machine.formats import read_source
-from legcal.machine.model import Machine
-from legcal.machine.spanning_tree import Source
+# What takes long to load is loaded where it is used: the process that only hands out tests waits.
+if TYPE_CHECKING:
+    from hexapod_example import Run
+
+    from legcal.machine.model import Machine
+    from legcal.machine.spanning_tree import Source
 
 # Plugins that other packages bring into Hypothesis (trio's, with selenium) warn when they load.
 os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")
@@ -86,7 +85,12 @@ def answered_signals() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _commands_and_models_are_read_once() -> Iterator[None]:
     """Read the signatures of commands, and each model or copy of one, once a process."""
-    read, load = read_source, loader._load
+    import typer.main
+
+    from legcal.machine import loader
+    from legcal.machine.files import find_model
+
+    read, load = loader.read_source, loader._load
     sources: dict[bytes, Source] = {}
     machines: dict[tuple[str, ...], Machine] = {}
 
@@ -132,15 +136,30 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def without_steps() -> Iterator[None]:
     """Calibrate without the four steps: half of the time where the cameras are given."""
+    from legcal.calibration.four_steps import Steps
+
     left_out = Steps(None, None, "They were left out.")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("legcal.calibration.estimate.four_steps", lambda *_: left_out)
         yield
 
 
+@pytest.fixture(scope="module")
+def without_remedies() -> Iterator[None]:
+    """Refuse what is not identifiable without trying what would mend it, which takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        name = "legcal.calibration.identify.identifiability.find_remedies"
+        patch.setattr(name, lambda *_: ())
+        yield
+
+
 @pytest.fixture(scope="session")
 def example_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Calibrate a copy of the example once for all tests that look at the result."""
+    from hexapod_example import Run, copy_of_the_example
+
+    from legcal import calibrate
+
     folder = copy_of_the_example(tmp_path_factory.mktemp("example") / "hexapod")
     output = folder.parent / "calibrated"
     stages: list[str] = []

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from hexapod_sessions import disturbed_hexapod, paper_session
+from hexapod_sessions import disturbed_hexapod, paper_session, plain_scene
 from outline_sessions import closed_poses, moved_poses, true_machine
-from plain_scenes import plain_scene
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners

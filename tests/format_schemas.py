@@ -26,8 +26,8 @@ from legcal.exports.formats import ExportDocument
 from legcal.files.published import write_schemas
 from legcal.files.schema import Document, SparseDocument
 from legcal.machine.description_table import TableFile
+from legcal.machine.files import MechanismFile
 from legcal.machine.inspection import Inspection
-from legcal.machine.schema import MechanismFile
 from legcal.planning.planned_session import PlanDocument
 from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument

@@ -1,18 +1,18 @@
 """Sessions of the hexapod of section 4.3 in memory, before cameras that see some of its legs."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-from plain_scenes import plain_scene
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.axes import LegAxes, axes_from_outlines, axes_of_table
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import point_like_legs
 from legcal.machine.loader import load_mechanism
@@ -38,6 +38,7 @@ from legcal.simulation.settings import (
     Spread,
 )
 from legcal.simulation.truth import write_true_model
+from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint
 from legcal.vision.camera import Camera
 
 SIGMA_Q = 2e-6  # [m]
@@ -59,6 +60,45 @@ class PaperSession:
     def radii(self) -> dict[str, float]:
         """The radii of the parts of all legs [m]."""
         return {part: r for leg in self.machine.legs for part, r in leg.radius_of_part.items()}
+
+
+def plain_scene(
+    A: Array,  # (n_poses, n_legs, 3)
+    B: Array,
+    views: Sequence[Viewpoint],
+    view: IntArray,  # (n_rows,) view and pose of each image
+    pose: IntArray,
+    radii: Mapping[tuple[int, str], float],  # of each (leg, part) [m]
+    seen: Sequence[Sequence[int]] | None = None,  # legs of each row; None for all
+    span: tuple[float, float] = (0.15, 0.85),  # of the length of a leg that is seen
+    arms: Mapping[tuple[int, str], Array] | None = None,  # which parts are arms: their ends
+) -> Scene:
+    """Return a scene in which nothing is hidden: images show legs over one part of their length."""
+    length, arms = np.linalg.norm(B - A, axis=-1), arms or {}
+    shown = []
+    for row, k in enumerate(pose.tolist()):
+        stretches: list[list[Stretch]] = [[] for _ in length[k]]
+        of_arms: list[Stretch | None] = [None for _ in length[k]]
+        for (j, part), radius in radii.items():
+            if seen is not None and j not in seen[row]:
+                continue
+            whole = length[k, j]
+            if (j, part) in arms:
+                whole = np.linalg.norm(np.diff(arms[j, part][k], axis=0))
+            start, end = (float(part_of * whole) for part_of in span)
+            stretch = Stretch(j, part, radius, start, end)
+            if (j, part) in arms:
+                of_arms[j] = stretch
+            else:
+                stretches[j].append(stretch)
+        shown.append(
+            tuple(
+                LegView((span[1] - span[0]) * bool(s), 0.0, tuple(s), arm)
+                for s, arm in zip(stretches, of_arms, strict=True)
+            )
+        )
+    images = Images(view, pose, np.zeros(len(view), dtype=np.intp), tuple(shown))
+    return Scene(A, B, tuple(views), images, {j: ends for (j, _), ends in arms.items()})
 
 
 @cache

@@ -296,7 +296,7 @@ def _shows(columns: int, rows: int) -> SeenBoard:
         ((9, 6), [(6, 9)] * 2 + [(12, 3)], (10, 7), "10x7 squares (9x6 inner corners)"),
         ((9, 6), [(5, 4), (8, 3)], (9, 6), ""),
         ((9, 6), [(7, 5)] * 3, (9, 6), "8 x 6 squares or that part of one is seen in 3 of its 3"),
-        ((11, 8), [(6, 9)] * 2 + [(5, 4)], (10, 7), "was taken for the smaller one"),
+        ((11, 8), [(6, 9)] * 2 + [(5, 4)], (11, 8), "10 x 7 squares or that part of one"),
         ((9, 6), [(10, 7)] * 2 + [(8, 5)], None, "a chessboard of 11 x 8 squares in 2 of its 3"),
         ((9, 6), [], (9, 6), ""),
     ],
@@ -375,7 +375,7 @@ def test_images_are_searched_by_row_and_a_view_without_the_board_is_refused() ->
     assert len(nothing) == 0
     assert describe_image(board, blank) is None
     require_board(other, nothing, lambda _: image, _measurements((1,)), [])
-    with pytest.raises(NotVisible, match=r"c1: .* any of its 1 image: found tags with numbers up"):
+    with pytest.raises(NotVisible, match=r"c1: .* any of its 1 image: found an AprilGrid of 3 x 2"):
         require_board(other, nothing, lambda _: image, _measurements((1,)), ["c1"])
 
 

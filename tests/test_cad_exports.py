@@ -7,13 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from ankles import ROD, write_ankle
-from cad_exports import LENGTH, RADIUS, SHAFT, write_head_mjcf, write_head_urdf
+from cad_exports import (
+    LENGTH,
+    RADIUS,
+    ROD,
+    SHAFT,
+    write_ankle,
+    write_head_mjcf,
+    write_head_urdf,
+)
 
 from legcal import load_mechanism, plan
 from legcal.errors import ModelError
+from legcal.machine.cylinders import cylinder_about_z
 from legcal.machine.home import home_of_legs
-from legcal.machine.mesh_cylinders import cylinder_about_z
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_writer import write_calibrated_yaml, write_model, write_urdf
 from legcal.machine.parameters import (

@@ -241,6 +241,7 @@ def test_images_choose_the_lens_model() -> None:
     assert residual_px < chosen.validated_px < 1.5 * residual_px
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     "model", ["equidistant", pytest.param("rational_polynomial", marks=pytest.mark.slow)]
 )
@@ -288,7 +289,7 @@ def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     values, names = intrinsic_values(camera), intrinsic_names(camera)
     rng = np.random.default_rng(0)
     off = []
-    for drawn in rng.multivariate_normal(values, fit.covariance, 200):
+    for drawn in rng.multivariate_normal(values, fit.covariance, 80):
         other = with_intrinsics(camera, dict(zip(names, drawn.tolist(), strict=True)))
         comparison = compare_cameras(camera, other)
         assert comparison.sigma_px is not None
@@ -462,22 +463,27 @@ def _block(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"sigma": {"f": 1.0}}, ("legcal_camera.sigma", "found f,", "fx, fy, cx")),
+        ({"sigma": {"f": 1.0}}, ("legcal_camera", "found f,", "fx, fy, cx")),
         ({"sigma": {"fx": -1.0}}, ("legcal_camera.sigma.fx",)),
-        ({"names": ["fx", "f"]}, ("legcal_camera.names", "found f,")),
-        ({"names": ["fx", "fx"]}, ("legcal_camera.names", "fx twice")),
-        ({"names": None}, ("covariance without names",)),
-        ({"covariance": None}, ("names without covariance",)),
-        ({"covariance": [[4.0, 0.0]]}, ("1 rows", "2 rows of 2 numbers for fx, cx")),
-        ({"covariance": [[4.0], [0.0, 1.0]]}, ("rows of other lengths", "2 rows of 2")),
+        ({"names": ["fx", "f"]}, ("legcal_camera", "found f,")),
         ({"covariance": [[4.0, "x"], [0.0, 1.0]]}, ("covariance", "a number")),
-        ({"covariance": [[4.0, 0.1], [0.2, 1.0]]}, ("not symmetric",)),
-        ({"covariance": [[4.0, 3.0], [3.0, 1.0]]}, ("not positive semidefinite",)),
-        ({"covariance": [[1e-20, 1e300], [1e300, 1e-20]]}, ("not positive semidefinite",)),
-        ({"covariance": [[4.0, 0.1], [0.1, 0.0]]}, ("not positive semidefinite",)),
-        ({"covariance": [[4.0, 0.0], [0.0, -1.0]]}, ("the variance -1 of cx",)),
-        ({"covariance": [[4.0, 0.0], [0.0, 1e-30]]}, ("the variance 1e-30 of cx",)),
-        ({"sigma": {"fx": 2.1}}, ("deviation 2 of fx", "needed 2.1 as in sigma")),
+        *(
+            (changed, ("legcal_camera.covariance", "no covariance"))
+            for changed in (
+                {"names": ["fx", "fx"]},
+                {"names": None},
+                {"covariance": None},
+                {"covariance": [[4.0, 0.0]]},
+                {"covariance": [[4.0], [0.0, 1.0]]},
+                {"covariance": [[4.0, 0.1], [0.2, 1.0]]},
+                {"covariance": [[4.0, 3.0], [3.0, 1.0]]},
+                {"covariance": [[1e-20, 1e300], [1e300, 1e-20]]},
+                {"covariance": [[4.0, 0.1], [0.1, 0.0]]},
+                {"covariance": [[4.0, 0.0], [0.0, -1.0]]},
+                {"covariance": [[4.0, 0.0], [0.0, 1e-30]]},
+                {"sigma": {"fx": 2.1}},
+            )
+        ),
     ],
 )  # fmt: skip
 def test_what_is_no_covariance_is_refused_by_name(

@@ -24,7 +24,7 @@ from legcal.calibration.change_detection import (
     possible_changes,
 )
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import dataset_at
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
@@ -374,6 +374,3 @@ def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
     assert best.values[0] == pytest.approx(1e-4, rel=1e-3)
     assert len(movement.explanations) == 1
     assert {c.what for c in single} >= {f"length of {name}" for name in machine.leg_names}
-
-
-# Rates of the whole check.

@@ -1,25 +1,54 @@
 """Parameters fixed, freed and given priors by name: what overrides come to, and their refusals."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from chosen import HEXAPOD, choose, known
 from dataset_folder import Folder, folder
 
 from legcal import load_dataset, load_mechanism
 from legcal.calibration.joint_fit.parameter_choices import (
     Choices,
+    KnownParameters,
     Prior,
     known_parameters,
     resolve,
 )
+from legcal.data.measurements import View
 from legcal.data.overrides import overrides_of_call
 from legcal.errors import UsageError
 from legcal.machine.parameters import parametrization_of
+from legcal.vision.camera import Camera
 
 __all__ = ["folder"]
+
+# Three views of two cameras
+K = np.array([[1290.0, 0.0, 511.0], [0.0, 1285.0, 380.0], [0.0, 0.0, 1.0]])
+OTHER_K = np.array([[1800.0, 0.0, 511.0], [0.0, 1800.0, 380.0], [0.0, 0.0, 1.0]])
+VIEWS = (
+    View("c2", Camera(K, 1024, 768)),
+    View("c1", Camera(K.copy(), 1024, 768)),
+    View("tele", Camera(OTHER_K, 1024, 768)),
+)
+Priors = Mapping[str, object] | Sequence[str]
+
+
+def known(model: str = "hexapod", *, axes_given: bool = False) -> KnownParameters:
+    return known_parameters(load_mechanism(model), VIEWS, axes_given=axes_given)
+
+
+HEXAPOD = known()
+
+
+def choose(
+    priors: Priors = (),
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
+    parameters: KnownParameters = HEXAPOD,
+) -> Choices:
+    return resolve(overrides_of_call(priors, fixed, free), parameters)
 
 
 @pytest.mark.parametrize("model", ["hexapod-rod", "3-upu-tilted", "3-rpr", "tricept"])

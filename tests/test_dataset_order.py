@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.holdout import dataset_at, split_images
+from legcal.data.image_choice import dataset_at, split_images
 from legcal.data.image_tables import (
     Order,
     canonical_order,

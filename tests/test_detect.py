@@ -36,6 +36,8 @@ from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import PredictedLeg, predict_legs
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
+
 BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
 
 

@@ -19,6 +19,8 @@ from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.examination import CHECKS, Examination, Finding
 from legcal.simulation.settings import Level
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
+
 COLUMNS = [f"leg{k}_prismatic" for k in range(1, 7)]
 
 

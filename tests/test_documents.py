@@ -22,7 +22,7 @@ from legcal.cli.app import app
 from legcal.data.dataset_file import DatasetEntry
 from legcal.files.schema import parse_yaml, validate
 from legcal.machine.description_table import TableFile
-from legcal.machine.schema import MechanismFile
+from legcal.machine.files import MechanismFile
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN_ELSEWHERE = {  # by the language of a block, or its page

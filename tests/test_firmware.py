@@ -276,6 +276,7 @@ def off_by(text: str, true: Machine) -> float:
     return float(distance / np.sqrt(len(nozzle)))
 
 
+@pytest.mark.system
 def test_a_calibrated_printer_prints_with_what_was_exported(tmp_path: Path) -> None:
     nominal, true = machine_of(KLIPPER, tmp_path), printer_with_errors(tmp_path / "true")
     perfect = ParameterErrors()

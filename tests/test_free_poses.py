@@ -171,7 +171,7 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
 
 @pytest.mark.parametrize(
     ("n_motors", "by_clicks"),
-    [(3, False), (0, True)],
+    [pytest.param(3, False, marks=pytest.mark.system), (0, True)],
 )
 def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_path: Path) -> None:
     machine = by_hand(n_motors, tmp_path)

@@ -24,18 +24,21 @@ import legcal
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
+    ranks_of_dataset,
 )
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.holdout import dataset_at
+from legcal.data.image_choice import dataset_at
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
 from legcal.report.identify import identify_table
 from legcal.vision.board import Board, FixedBoard
+
+pytestmark = pytest.mark.usefixtures("without_remedies")  # test_identify_ranks.py has them
 
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
 LEGS = tuple(f"leg{j}" for j in range(1, 7))
@@ -173,7 +176,7 @@ def test_all_problems_of_views_are_refused_at_once() -> None:
     with pytest.raises(UsageError) as refused:
         legcal.identifiability(loaded("hexapod"), views, images=-1)
     assert len(refused.value.problems) == 6
-    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found 2", "'leg1'")
+    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found '2'", "'leg1'")
     assert all(word in problem for word, problem in zip(named, refused.value.problems, strict=True))
 
 
@@ -237,7 +240,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
-        return identifiability_of_dataset(two_images(), choices).full.rank
+        return ranks_of_dataset(two_images(), choices)[1].rank
 
     alone = rank(Choices())
     assert rank(Choices(fixed=frozenset(names))) == 30
@@ -266,6 +269,3 @@ def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
     json.dumps(found.document(), allow_nan=False)
     assert found.full.rank + len(found.full.weak) == found.full.of
     assert found.identifiable == all(d.harmless for d in found.full.weak)
-
-
-# Words

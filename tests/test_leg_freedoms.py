@@ -1,14 +1,20 @@
-"""Types, mobility, constraints and motors of every layout, against the screws of the joints."""
+"""Layouts: mobility, constraints and motors against screws of joints; frames on fixed legs."""
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
-from layouts import Layout, LegLayout, MachineSpec, write_machine
-from leg_screws import freedoms_of
+from fit_sessions import machine_session
+from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
 from machines import exechon, exechon_and_ups, four_upu, of_types, planar, two_upr_two_sps
+from scipy.linalg import null_space
 from thinned import thinned
 
+from legcal.calibration.joint_fit.fit import refine
+from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import geometries
 
@@ -46,6 +52,43 @@ def _usual(kind: str, layout: str) -> bool:
     return [*KINDS].index(kind) % len(LAYOUTS) == [*LAYOUTS].index(layout)
 
 
+# Freedoms by the screws of joints, without anything of legcal: the platform moves as every leg
+# alone lets it, so that its twists are those in which the twists of all legs have part.
+
+
+class Freedoms(NamedTuple):
+    """What the joints of a machine leave."""
+
+    mobility: int
+    n_constraints: int  # of all legs
+    n_redundant: int  # of them, those that follow from others
+    left_by_motors: int  # freedoms of the platform with all motors held
+
+
+def freedoms_of(machine: MachineSpec) -> Freedoms:
+    """Return the freedoms of a platform at home."""
+    wrenches = [null_space(_twists(leg)).T for leg in machine.legs]
+    held = [null_space(_twists(leg, with_slider=leg.kind != "actuated")).T for leg in machine.legs]
+    free, with_motors = (np.linalg.matrix_rank(np.concatenate(w), 1e-9) for w in (wrenches, held))
+    n = sum(map(len, wrenches))
+    return Freedoms(6 - int(free), n, n - int(free), 6 - int(with_motors))
+
+
+def _twists(leg: LegSpec, *, with_slider: bool = True) -> Array:
+    """Return the screws (n, 6) of the joints of a leg: angular parts, velocities of the origin."""
+    found = []
+    ends = (leg.A, leg.base_axis), (leg.B_home, leg.platform_axis)
+    for letter, (point, axis) in zip(leg.type, ends, strict=False):
+        axes = np.eye(3)
+        if letter != "S":
+            outer = np.asarray(axis)
+            axes = np.array([outer, np.cross(leg.u, outer)])[: {"R": 1, "U": 2}[letter]]
+        found += [np.concatenate([w, np.cross(point, w)]) for w in axes]
+    if with_slider and leg.kind != "constant":
+        found.append(np.concatenate([np.zeros(3), leg.u]))
+    return np.array(found)
+
+
 @pytest.mark.parametrize(("kind", "layout"), thinned(product(KINDS, LAYOUTS), _usual))
 def test_freedoms_are_those_of_the_screws_of_the_joints(
     kind: str, layout: str, tmp_path: Path
@@ -70,3 +113,42 @@ def test_freedoms_are_those_of_the_screws_of_the_joints(
     of = f"{expected.n_redundant} of the {expected.n_constraints}"
     assert len(said) == (expected.n_redundant > 0)
     assert all(of in note for note in said)
+
+
+# Legs fixed to the platform among those that define its frame
+
+FIXED: dict[str, tuple[list[str], list[str], tuple[int, ...]]] = {
+    "TriVariant": (["SS", "SS", "U"], [A, A, A], (0, 1, 2)),
+    "TriVariant, the fixed leg first": (["SS", "SS", "U"], [A, A, A], (2, 0, 1)),
+    "TriVariant, the fixed leg second": (["SS", "SS", "U"], [A, A, A], (0, 2, 1)),
+    "Tricept": (["US", "US", "US", "U"], [A, A, A, P], (3, 0, 1)),
+    "Tricept, the fixed leg last": (["US", "US", "US", "U"], [A, A, A, P], (0, 1, 3)),
+    "SP": (["SS", "US", "SS", "S", "SS"], [A, A, A, A, P], (0, 3, 1)),
+    "RP": (["SS", "R", "SS"], [A, A, P], (0, 1, 2)),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "layout"),
+    thinned(  # each layout, the fixed leg at each place of the frame
+        product(FIXED, LAYOUTS),
+        [
+            ("TriVariant, the fixed leg first", "cut behind the slider"),
+            ("SP", "hung from the platform"),
+            ("RP", "hung from the base"),
+        ],
+    ),
+)
+def test_exact_outlines_give_the_machine_whatever_defines_its_frame(
+    kind: str, layout: str, tmp_path: Path
+) -> None:
+    types, kinds, frame = FIXED[kind]
+    drawn = replace(of_types(types, kinds), frame_legs=frame)
+    session = machine_session(str(write_machine(tmp_path, drawn, LAYOUTS[layout])))
+    found = refine(session.legs, session.measurements, session.outlines, session.start)
+    truth = session.truth.legs
+    assert (
+        max(np.abs(a.A - b.A).max() for a, b in zip(session.start.legs, truth, strict=True)) > 2e-3
+    )
+    for leg, true in zip(found.legs, truth, strict=True):
+        assert np.abs(np.concatenate([leg.A - true.A, leg.B - true.B])).max() < 1e-7

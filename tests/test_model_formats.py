@@ -60,8 +60,7 @@ def assert_same_analysis(found: Machine, expected: Machine) -> None:
     thinned(
         product(FORMATS, ("3-upu", "tricept", "3-rpr", "hexapod", "hexapod-strut")),
         lambda name, machine: (
-            machine == "tricept"
-            or (machine == "3-upu" and name in ("mjcf bodies", "loop_joint", "gepetto"))
+            machine == ("3-upu" if name in ("mjcf bodies", "loop_joint", "gepetto") else "tricept")
         ),
     ),
 )

@@ -11,9 +11,8 @@ from staged_sessions import Observed, planned
 
 from legcal.calibration.identify import identifiability
 from legcal.calibration.identify.identifiability import check_identifiable
-from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.ranks import Analysis, is_scale_open, scale_sources
 from legcal.calibration.identify.report import RmsMotion
-from legcal.calibration.identify.scale import is_scale_open, scale_sources
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import NotIdentifiable

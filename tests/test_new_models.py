@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
 from legcal.machine.dimensions import Dimensions
-from legcal.machine.family import description_of
+from legcal.machine.family import description_of, write_template
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind
@@ -22,7 +22,6 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import create_model
-from legcal.machine.table_template import write_template
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"

@@ -310,6 +310,7 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
     assert 0.7 < np.mean(normalised) < 1.5
 
 
+@pytest.mark.system
 def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
     session, n, sigma = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4), 4, 0.08
     start, normalised, found_px = disturbed_start(session), [], []
@@ -329,6 +330,7 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
 
 
+@pytest.mark.system
 def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None:
     session = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4)
     rng = np.random.default_rng(0)
@@ -468,7 +470,8 @@ def gammas_tried(session: HexapodSession, lost: float, seed: int) -> tuple[Solut
     return first, trials
 
 
-@pytest.mark.parametrize("lost", thinned([np.inf, 0.15], [0.15]))
+@pytest.mark.system
+@pytest.mark.parametrize("lost", [np.inf, 0.15])
 def test_the_most_likely_gamma_is_that_of_the_same_outlines(
     session: HexapodSession, lost: float
 ) -> None:

@@ -1,20 +1,11 @@
-"""The benchmarks bound, convergence and classes: designs, their bound, sessions, statistics."""
-
-import dataclasses
-import io
-import json
-from pathlib import Path
-from typing import TypeVar
+"""The benchmarks bound and classes: designs, their bound, sessions, statistics."""
 
 import bound as bound_study
 import classes_study
-import convergence as convergence_study
 import numpy as np
 import pytest
 from bound import BoundStudy, errors_of
-from classes_study import FIT, ClassesStudy, as_stated, errors_of_fit
-from convergence import ConvergenceStudy
-from fit_sessions import machine_session
+from classes_study import FIT
 from outline_bound import Bound, bound_of
 from outline_sessions import (
     MACHINES,
@@ -26,33 +17,18 @@ from outline_sessions import (
     draw_session,
     one_fit,
 )
-from outline_study import (
-    Found,
-    OutlineStudy,
-)
-from rich.console import Console
+from outline_study import Found
 from thinned import thinned
 
-from legcal.calibration.joint_fit.solution import Solution
-from legcal.geometry.motions import components
-from legcal.machine.kinematics import platform_in_base
-from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import vector_of
-from legcal.simulation.study import Record, run_study
+from legcal.simulation.study import Record
 
 NOISE = Noise()
 N_POSES = 5
 
 
-FREE_3_UPU = 7  # turns of both axes of a leg at once (six), and its size
-S = TypeVar("S", bound=OutlineStudy)
 FAILED: Record = {"failure": {"kind": "DidNotConverge", "message": "It still fell."}}
 PLATFORM = {"dX": 2e-3, "dE": 0.01}
-
-
-def _quick(kind: type[S]) -> S:
-    """Return a study of few poses of the machine that is quickest to fit."""
-    return kind(("3-rpr",), n_poses=N_POSES)
 
 
 def _design(machine: str) -> Design:
@@ -67,12 +43,6 @@ def _session(
     machine: str, errors: StartErrors = BoundStudy.errors, seed: int = 0
 ) -> OutlineSession:
     return draw_session(_design(machine), NOISE, errors, np.random.default_rng(seed))
-
-
-def _printed(table: object) -> str:
-    told = io.StringIO()
-    Console(file=told, width=80).print(table)
-    return told.getvalue()
 
 
 # Statistics of estimators that are drawn
@@ -200,16 +170,6 @@ def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     assert np.linalg.norm(found - truth) < 0.05 * np.linalg.norm(start - truth)
 
 
-@pytest.mark.slow
-def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> None:
-    design, relative = design_of("delta", 3, 6, Noise().sigma_px), 0.02
-    bound = bound_of(design, Noise().sigma_q, relative)
-    sigma = dict(zip(bound.names, np.sqrt(np.diagonal(bound.covariance)), strict=True))
-    wanted = relative / np.sqrt(len(design.parts))
-    for leg, name in zip(design.legs.nominal, design.legs.names, strict=True):
-        assert sigma[f"{name}.length"] / leg.q0 == pytest.approx(wanted, rel=1e-3)
-
-
 def test_noise_of_sessions_has_the_covariance_that_outlines_carry() -> None:
     design = _design("3-rpr")
     exact, offsets, readings = design.outlines, [], []
@@ -223,123 +183,3 @@ def test_noise_of_sessions_has_the_covariance_that_outlines_carry() -> None:
     assert np.allclose(white.T @ white / len(white), np.eye(2), atol=0.05)
     assert np.std(readings) == pytest.approx(NOISE.sigma_q, rel=0.05)
     assert np.array_equal(design.outlines.covariance, session.outlines.covariance)
-
-
-# A machine of which some directions stay open
-
-
-@pytest.fixture(scope="module")
-def open_machine() -> tuple[Design, OutlineSession, Solution]:
-    """Return a session of a 3-UPU that only translates, and its fit."""
-    exact, machine = machine_session("3-upu"), load_mechanism("3-upu")
-    R, t = components(exact.truth.T_Rb_Re)
-    design = Design(
-        legs=dataclasses.replace(exact.legs, nominal=exact.truth.legs),
-        home=platform_in_base(machine, machine.home),
-        R=np.asarray(R),
-        t=np.asarray(t),
-        q=exact.measurements.q,
-        camera=exact.measurements.views[0].camera,
-        T_Rb_camera=tuple(T.inv() for T in exact.truth.T_camera_Rb),
-        seen=(None,) * len(exact.measurements.views),
-        view=exact.measurements.view,
-        pose=exact.measurements.pose,
-        outlines=exact.outlines,
-    )
-    session = draw_session(design, NOISE, BoundStudy.errors, np.random.default_rng(4))
-    return design, session, one_fit(session, NOISE.radius_sigma)
-
-
-def test_errors_along_what_is_held_do_not_count(
-    open_machine: tuple[Design, OutlineSession, Solution],
-) -> None:
-    design, session, solution = open_machine
-    stated = as_stated(design, solution)
-    n = len(design.parametrization)
-    assert (stated.rank, len(solution.kinematic.held_basis)) == (n - FREE_3_UPU, FREE_3_UPU)
-    _, held = solution.kinematic.of_values(design.parametrization.names)
-    error = np.random.default_rng(0).normal(size=n) * 1e-4
-    nse = stated.nse(error)
-    assert stated.nse(error + 0.01 * held.sum(axis=0)) == pytest.approx(nse, rel=1e-6)
-    assert stated.nse(error + 1e-4 * stated.parts.sum(axis=0)) > 1.5 * nse
-    errors = errors_of_fit(design, session, solution, NOISE)
-    assert errors["rank"] == n - FREE_3_UPU
-    assert 0.2 < errors["nse"] < 2.5
-    assert 0.2 < errors["of_bound"] < 2.5
-    assert len(errors["of_sigma"]) == 3  # offsets
-
-
-# Runs
-
-
-@pytest.fixture(scope="module")
-def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run the studies of bound and classes once, with a few runs."""
-    folder = tmp_path_factory.mktemp("study")
-    run_study(_quick(BoundStudy), 3, output=folder / "bound")
-    run_study(_quick(ClassesStudy), 2, output=folder / "classes")
-    return folder
-
-
-@pytest.mark.slow
-def test_the_study_of_the_bound_has_a_row_for_every_parameter(output: Path) -> None:
-    document = json.loads((output / "bound" / "study.json").read_bytes())
-    (found,) = document["machines"]
-    assert (found["machine"], found["runs"], found["failed"]) == ("3-rpr", 3, 0)
-    assert [row["name"] for row in found["parameters"]] == list(_design("3-rpr").names)
-    assert found["pooled"].keys() == {"ratio", "nse", "coverage"}
-    assert all(figure["limits_of_chance"] for figure in found["pooled"].values())
-    page = (output / "bound" / "bound.md").read_text()
-    assert all(f"| {name} |" in page for name in _design("3-rpr").names)
-    told = _printed(BoundStudy().table([found]))
-    assert "…" not in told
-    assert all(words in told for words in ("each/bound", "3 runs are too few", "at the bound"))
-
-
-@pytest.mark.slow
-def test_the_study_of_classes_compares_nominal_model_steps_and_fit(output: Path) -> None:
-    document = json.loads((output / "classes" / "study.json").read_bytes())
-    (found,) = document["machines"]
-    assert (found["machine"], found["rank"], found["of"]) == ("3-rpr", 9, 9)
-    by = found["estimators"]
-    assert all(by[name]["runs"] == 2 for name in ("nominal", "literal", "default", "fit"))
-    assert by["nominal"]["dX_mm"] > 20.0 * by["fit"]["dX_mm"]
-    assert by["literal"]["dX_mm"] != by["default"]["dX_mm"]
-    assert found["figures"].keys() == {"ratio", "nse", "coverage"}
-    page = (output / "classes" / "classes.md").read_text()
-    assert page.count("| 3-rpr |") == 3
-    told = _printed(ClassesStudy().table([found]))
-    assert "…" not in told
-    assert "determined" in told
-    assert all("2 runs are too few" in text for text in (page, told))
-
-
-@pytest.mark.slow
-def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    study = _quick(ConvergenceStudy)
-    result = run_study(study, 2, output=tmp_path / "out")
-    (found,) = result.document()["machines"]
-    assert (found["right"], found["wrong"], found["refused"]) == (2, 0, 0)
-    assert found["met"]
-    assert 0.0 < found["worst_sigma"] <= 5.0
-    assert found["before"]["dX_mm"] > 50.0 * found["after"]["dX_mm"]
-    assert found["after"]["dX_mm"] < 5.0 * found["predicted"]["dX_mm"]
-    told = _printed(study.table(result.document()["machines"]))
-    assert "1 sigma" in told
-    assert "…" not in told
-
-    def shifted(session: OutlineSession, radius_sigma: float) -> Solution:
-        solution = one_fit(session, radius_sigma)
-        legs = tuple(dataclasses.replace(leg, q0=leg.q0 + 1e-3) for leg in solution.legs)
-        values = {
-            name: value + 1e-3 * name.endswith("offset")
-            for name, value in solution.estimates.values.items()
-        }
-        estimates = dataclasses.replace(solution.estimates, values=values)
-        return dataclasses.replace(solution, legs=legs, estimates=estimates)
-
-    monkeypatch.setattr(convergence_study, "one_fit", shifted)
-    (found,) = run_study(study, 1).document()["machines"]
-    assert (found["right"], found["wrong"], found["met"]) == (0, 1, False)

@@ -178,7 +178,7 @@ DIFFERENT: tuple[tuple[bytes, list[str]], ...] = (
     (phone(lens="Acme front camera"), ["front camera", "back camera", "one lens"]),
     (phone(focal=6.0), ["6 mm", "4.25 mm", "one focal length"]),
     (phone(focal35=52), ["52 mm", "26 mm", "one field of view"]),
-    (phone(zoom=2.0), ["digital zoom of 2", "without zoom", "one digital zoom"]),
+    (phone(zoom=2.0), ["digital zoom of 2", "digital zoom of 1", "one digital zoom"]),
     (phone(focus=2.0), ["2 m", "0.5 m", "one focus"]),
     (phone(width=80, height=48), ["80 x 48 px and cropped"]),
     (phone(width=48, height=64), ["48 x 64 px and turned"]),
@@ -251,7 +251,7 @@ RECORDED = {"device": ["Acme One"], "focal_length_mm": [4.25], "focal_length_35m
     [
         ({"device": ["Acme Two"]}, ["'Acme One'", "'Acme Two'"]),
         ({"focal_length_mm": [6.0]}, ["4.25 mm", "6 mm"]),
-        ({"digital_zoom": [2.0]}, ["without zoom", "digital zoom of 2"]),
+        ({"digital_zoom": [2.0]}, ["digital zoom of 1", "digital zoom of 2"]),
         ({"taken_size": [[128, 96]]}, ["of the size", "128 x 96 px and rescaled by 0.5"]),
         ({"software": ["GIMP 2.10"]}, ["'17.1'", "'GIMP 2.10'"]),
         ({}, []),
@@ -265,26 +265,6 @@ def test_photographs_unlike_those_of_the_board_are_named(
     assert len(found) == bool(words)
     for word in [*words, *NAMES[:3], "camera_info.yaml", "views c1, c2"] if words else []:
         assert word in found[0]
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (phone(zoom=2.0), ["digital zoom of 2"]),
-        (phone(width=80, height=48), ["80 x 48 px and cropped"]),
-        (phone(width=48, height=64), ["48 x 64 px and turned"]),
-        (phone(width=128, height=96), ["128 x 96 px"]),
-    ],
-)
-def test_what_few_calibrations_hold_for_is_asked_about(
-    folder: Folder, content: bytes, words: list[str]
-) -> None:
-    (note,) = notes(folder, dict.fromkeys(range(4), content))
-    assert [word for word in [*words, "no record", "legcal camera"] if word not in note] == []
-    folder.camera.pop("legcal_camera", None)
-    board = {"digital_zoom": [2.0], "taken_size": [[128, 96]]}
-    said = notes(folder, dict.fromkeys(range(4), content), board)
-    assert all("no record" not in sentence for sentence in said)
 
 
 def test_lossy_compression_is_noted_once_with_views_and_quality(folder: Folder) -> None:

@@ -177,7 +177,7 @@ def test_the_command_writes_what_python_plans(
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)
+    monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -197,6 +197,7 @@ def test_the_command_writes_what_python_plans(
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("answered_signals", "drawn_once")
 def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,
@@ -214,7 +215,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr("legcal.cli.sessions._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)
+    monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
     assert json.loads(printed.out)["error"]["kind"] == "Interrupted"

@@ -155,6 +155,7 @@ def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose
     assert not [row for row in result["parameters"] if ".radius." in row["name"]]
 
 
+@pytest.mark.usefixtures("without_remedies")
 def test_identify_says_what_a_board_on_the_platform_determines(of_boards: SimulatedDataset) -> None:
     found = identifiability_of_dataset(load_dataset(of_boards.folder))
     assert found.identifiable

@@ -22,7 +22,7 @@ import legcal
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.calibration.session_changes import session_tests
-from legcal.data.image_order import image_sequences
+from legcal.data.image_choice import image_sequences
 from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
@@ -114,7 +114,9 @@ def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> N
     assert machine.mobility == MOBILITY.get(name, machine.mobility)
 
 
-@pytest.mark.parametrize("name", ["7-UPS", "2-RPS + 2-SPS + rod"])
+@pytest.mark.parametrize(
+    "name", ["7-UPS", pytest.param("2-RPS + 2-SPS + rod", marks=pytest.mark.system)]
+)
 def test_poses_for_plans_of_redundant_machines_are_those_of_least_squares(name: str) -> None:
     machine = machine_of(name)
     legs = fitted_legs(machine)

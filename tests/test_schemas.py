@@ -21,7 +21,7 @@ from legcal.errors import LegcalError
 from legcal.files.published import schema_names
 from legcal.files.schema import read_yaml
 from legcal.machine.description_table import read_description
-from legcal.machine.schema import read_mechanism_file
+from legcal.machine.files import read_mechanism_file
 from legcal.simulation.settings import Level
 from legcal.vision.camera_file import read_camera
 

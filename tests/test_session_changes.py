@@ -20,9 +20,7 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Finding, Kind, session_tests
 from legcal.calibration.verdict import commanded
 from legcal.data.dataset import Dataset
-from legcal.data.holdout import dataset_at
-from legcal.data.image_choice import chosen_images, own_zeros
-from legcal.data.image_order import image_sequences
+from legcal.data.image_choice import chosen_images, dataset_at, image_sequences, own_zeros
 from legcal.errors import UsageError
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray

@@ -133,8 +133,6 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
      ("'leg1', 'leg2', 'leg3', 'leg4', 'leg5', 'leg6'", "min_length")),
     (wide("bx,by,bz,px,py,pz"), OPTIONS, ("--unit mm",)),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[2:]), ("type", "--type UPS")),
-    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--travel", "0", "9"),
-     ("--travel", "travel_low", "--min-length")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--base-radius", "9"),
      ("--base-radius", "--family only")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[:-2], "--height", "700"),

@@ -294,6 +294,7 @@ def _w_first(rotation: Rotation) -> Rotation:
     return Rotation.from_quat(np.roll(rotation.as_quat(), 1))
 
 
+@pytest.mark.system
 def test_radii_that_are_all_wrong_by_a_fifth_are_found(tmp_path: Path) -> None:
     """Those of single legs are found in test_recognition.py."""
     made = spoiled(tmp_path / "radii", 3, ("c1", "c2"))

@@ -22,10 +22,9 @@ from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
-from legcal.data.image_causes import image_notes
 from legcal.data.image_tables import inverse
 from legcal.data.landmarks import LANDMARKS_NAME
-from legcal.data.measurements import few_views
+from legcal.data.measurements import few_views, image_notes
 from legcal.data.outlines import (
     Outlines,
     are_of_arms,

@@ -53,9 +53,8 @@ from legcal.calibration.pipeline import chosen_parameters, exact_cameras
 from legcal.causes import Cause, by_cause
 from legcal.data.cache import note_on_missing_photographs
 from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
-from legcal.data.holdout import dataset_at
-from legcal.data.image_causes import images_in_words
-from legcal.data.measurements import few, few_views, reading_columns, row_names
+from legcal.data.image_choice import dataset_at
+from legcal.data.measurements import few, few_views, images_in_words, reading_columns, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
 from legcal.data.photograph_notes import compression_notes, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words

@@ -37,8 +37,7 @@ from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_BIAS_PX
 from legcal.causes import Cause
 from legcal.data.corners import Corners
-from legcal.data.image_causes import image_notes
-from legcal.data.measurements import Measurements, few, few_views
+from legcal.data.measurements import Measurements, few, few_views, image_notes
 from legcal.data.outlines import (
     Outlines,
     along_legs,

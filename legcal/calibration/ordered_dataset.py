@@ -19,8 +19,7 @@ from legcal.causes import Cause, by_cause
 from legcal.data.axes import LegAxes
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset
-from legcal.data.holdout import dataset_at
-from legcal.data.image_causes import images_in_words
+from legcal.data.image_choice import dataset_at
 from legcal.data.image_tables import (
     Order,
     canonical_order,
@@ -29,7 +28,7 @@ from legcal.data.image_tables import (
     reorder_measurements,
 )
 from legcal.data.landmarks import platforms_by_landmarks
-from legcal.data.measurements import Measurements, few, row_names
+from legcal.data.measurements import Measurements, few, images_in_words, row_names
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, IntArray

@@ -41,7 +41,7 @@ from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
-from legcal.calibration.joint_fit.solution import OutlineResiduals, Solution, outline_residuals
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
 from legcal.calibration.plots import plot_residuals
 from legcal.calibration.summary import Summarised, few_lines
@@ -61,6 +61,13 @@ from legcal.vision.camera import camera_numbers, shared_cameras
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+from dataclasses import replace
+
+from legcal.brief import brief
+from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.data.image_tables import canonical_order
+from legcal.data.outlines import Outlines
+from legcal.geometry.types import Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -413,3 +420,38 @@ def _holdout(calibration: Calibration) -> Holdout | None:
             expected_dE_rad=pair.expected_rotation,
         ),
     )
+
+
+# Residuals
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class OutlineResiduals:
+    """Residuals of the outlines in the fit, including those it rejected."""
+
+    index: IntArray  # (n,): rows of the table of outlines
+    # (n, 2): distance of each end from the predicted outline, common-mode edge biases removed [px]
+    offset: Array
+    whitened: Array  # (n, 2): the same, uncorrelated and in standard deviations
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def outline_residuals(
+    posterior: Posterior, dataset: Dataset, outlines: Outlines
+) -> OutlineResiduals:
+    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
+    problem = posterior.problem
+    offset = problem.offsets(posterior.state)
+    covariance = posterior.noise.covariance(problem.outlines.covariance)
+    L = np.linalg.cholesky(covariance) if len(offset) else covariance
+    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
+    # The fit numbers outlines as they stand in canonical order.
+    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
+    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
+    number = order.reorder(numbered).contrast.astype(np.intp)
+    index = number[problem.outlines.index]
+    back = np.argsort(index, kind="stable")
+    return OutlineResiduals(index[back], offset[back], whitened[back])

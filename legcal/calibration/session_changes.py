@@ -249,7 +249,7 @@ def session_tests(
         The rows that were fitted.
     sequences : sequence of (n,) array
         Rows in the order of their images, as of
-        :func:`legcal.data.image_order.image_sequences`.
+        :func:`legcal.data.image_choice.image_sequences`.
     """
     if not len(posterior.problem.outlines):
         return SessionTests()

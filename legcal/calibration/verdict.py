@@ -42,6 +42,8 @@ from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
+_ROUNDED = 0.51e-4  # [mm or deg] of the commands there
+AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
 
 def judge(
@@ -235,8 +237,7 @@ def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
     return Verdict(doubts, f"{heading}: {found}. {doubts[0].sentence}{others}", remedy)
 
 
-_ROUNDED = 0.51e-4  # [mm or deg] of the commands there
-AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
+# The plan of a session
 
 
 def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) -> tuple[str, ...]:

@@ -89,10 +89,9 @@ def new(
     from rich.text import Text
 
     from legcal.machine.dimensions import Dimensions
-    from legcal.machine.family import description_of
+    from legcal.machine.family import description_of, write_template
     from legcal.machine.inspection import machine_document
     from legcal.machine.model_builder import create_model
-    from legcal.machine.table_template import write_template
     from legcal.report.machine import inspect_table
     from legcal.report.render import report
 
@@ -492,7 +491,7 @@ def example(
     as_json: JsonOption = False,
 ) -> None:
     """Copy the dataset that comes with legcal: a hexapod, 45 photographs (11 MB)."""
-    from legcal.data.example import copy_example
+    from legcal.data.new_dataset import copy_example
 
     copy_example(output)
     lines = (

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from legcal.errors import LegcalError, OutOfResources, UsageError, code_of_kind, printable
-from legcal.processors import processors
 
 MAX_IMAGE_WORKERS = 4  # processes that search images by default; each takes about 150 MB
 REPORT = "report.html"  # the page in the folder of a result
@@ -159,6 +158,8 @@ def command_line() -> str:
 
 def image_workers(cluster: str | None, workers: int | None = None) -> int | str:
     """Return the cluster or the number of processes that search images, few: each takes memory."""
+    from legcal.workers import processors
+
     return chosen_workers(cluster, workers, min(processors(), MAX_IMAGE_WORKERS))
 
 

@@ -22,7 +22,6 @@ from legcal.cli.options import (
     show,
     write_page,
 )
-from legcal.processors import processors
 
 
 class _Level(StrEnum):
@@ -167,6 +166,7 @@ def paper(
     from legcal.simulation.observe import TableNoise
     from legcal.simulation.paper import PaperStudy
     from legcal.simulation.study import StudyResult, run_study
+    from legcal.workers import processors
 
     def make_page(study_result: StudyResult, folder: Path) -> None:
         caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.svg enlarges it."

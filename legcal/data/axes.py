@@ -21,8 +21,6 @@ from legcal.data.measurements import (
     find_legs,
     find_rows,
     places,
-    refuse_unknown_legs,
-    refuse_unknown_rows,
 )
 from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
@@ -317,8 +315,6 @@ def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) 
         "searched",
     )
     row, leg = find_rows(table, measurements), find_legs(table, leg_names)
-    refuse_unknown_rows(table, row, measurements)
-    refuse_unknown_legs(table, leg, leg_names)
     values, sigmas = table.numbers(VALUES), table.numbers(SIGMAS)
     upright = np.cos(values[:, 0]) * np.cos(values[:, 1])
     for i in np.flatnonzero(np.abs(upright) < MIN_UPRIGHT).tolist():

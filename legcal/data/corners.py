@@ -15,7 +15,7 @@ import numpy as np
 
 from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
-from legcal.data.measurements import Measurements, find_rows, places, refuse_unknown_rows
+from legcal.data.measurements import Measurements, find_rows, places, refuse_outside
 from legcal.data.outlines import DETAIL_COLUMN, SOURCES, UNLESS_REJECTED, VERDICT_COLUMNS, VERDICTS
 from legcal.data.reasons import USED, Rejection, read_rejection
 from legcal.errors import DatasetError
@@ -140,16 +140,10 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
         if text.isdigit() and int(text) >= n_corners:
             table.refuse(i, describe(text), needed, "corner", remedy=remedy)
     row = find_rows(table, measurements)
-    refuse_unknown_rows(table, row, measurements)
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
     table.need(NUMBERS, used)
     numbers = table.numbers(NUMBERS)
-    cameras = [view.camera for view in measurements.views]
-    size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[row]]
-    outside = (numbers[:, :2] < -0.5) | (numbers[:, :2] > size - 0.5)
-    for i, k in np.argwhere(outside & (row >= 0)[:, None]).tolist():
-        needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"
-        table.refuse(i, f"{numbers[i, k]:g} px", needed, NUMBERS[k], remedy="correct it")
+    refuse_outside(table, row, NUMBERS[:2], measurements)
     corner, source = table.text("corner"), table.text("source")
     keys = list(zip(row.tolist(), corner, source, strict=True))
     table.once([None if key[0] < 0 else key for key in keys], "the same image and corner")

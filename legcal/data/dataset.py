@@ -524,27 +524,6 @@ def read_given_axes(
     return axes.choose(used), [note] if left_out else []
 
 
-def rows_without_axes(
-    table_path: Path, measurements: Measurements, axes: LegAxes
-) -> list[tuple[int, Problem]]:
-    """Return one problem for each row of the measurements that has no axis."""
-    blank = np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist()
-    return [
-        (
-            row,
-            Problem(
-                "the row could not be used",
-                f"no axis of it in {AXES_NAME}",
-                "one of a leg that its view uses",
-                "add one or remove the row",
-                str(table_path),
-                row + 1,
-            ),
-        )
-        for row in blank
-    ]
-
-
 def read_given_corners(
     path: Path, boards: tuple[FixedBoard, ...], measurements: Measurements
 ) -> Corners | None:
@@ -559,79 +538,52 @@ def read_given_corners(
     return read_corners(path, boards, measurements)
 
 
-def rows_without_board(
-    dataset: Dataset, corners: Corners, hand_held: Sequence[int]
-) -> list[tuple[int, Problem]]:
-    """Return one problem for each row of a hand-held view in which the board has no pose."""
-    table_path, on_base = dataset.table_path, dataset.board_on("base")
-    shown = corners.used if on_base is None else corners.used & on_base.has(corners.corner)
-    counts = np.bincount(corners.row[shown], minlength=dataset.measurements.n_rows)
-    return [
-        (
-            row,
-            Problem(
-                "its camera could not be placed",
-                f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}",
-                f"{MIN_CORNERS} in every image of a camera that is held in the hand",
-                "add them or remove the row",
-                str(table_path),
-                row + 1,
-            ),
-        )
-        for row in hand_held
-        if counts[row] < MIN_CORNERS
-    ]
-
-
 def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, Problem]]]:
     """Return the metadata of images by their names, and the problems by row.
 
     There is one problem for each row that neither an image nor tables make usable.
     """
-    table_path, measurements = dataset.table_path, dataset.measurements
+    measurements, corners, axes = dataset.measurements, dataset.corners, dataset.axes
+    facts, problems = dict[str, ImageFacts](), list[tuple[int, Problem]]()
+
+    def refuse(row: int, what: str, found: str, needed: str, remedy: str, *columns: str) -> None:
+        place = str(dataset.table_path), row + 1
+        problems.append((row, Problem(what, found, needed, remedy, *place, columns=columns)))
+
     held = [view.hand_held for view in measurements.views]
-    hand_held = [row for row, v in enumerate(measurements.view.tolist()) if held[v]]
-    if dataset.corners is None:
-        problems = [
-            (
-                row,
-                Problem(
-                    "its camera could not be placed",
-                    f"neither an image nor {CORNERS_NAME}",
-                    "the board in every image of a camera that is held in the hand",
-                    "name an image or give the corners",
-                    str(table_path),
-                    row + 1,
-                    columns=("image",),
-                ),
+    no_place, of_held = "its camera could not be placed", "every image of a hand-held camera"
+    shown = np.zeros(measurements.n_rows, dtype=np.intp)  # corners of the board on the base
+    if corners is not None:
+        on_base = dataset.board_on("base")
+        counted = corners.used if on_base is None else corners.used & on_base.has(corners.corner)
+        shown = np.bincount(corners.row[counted], minlength=measurements.n_rows)
+    for row in np.flatnonzero(np.array(held, dtype=np.bool_)[measurements.view]).tolist():
+        if corners is not None and shown[row] < MIN_CORNERS:
+            found = f"{shown[row] or 'no'} corners of the board in {CORNERS_NAME}"
+            needed = f"{MIN_CORNERS} in {of_held}"
+            refuse(row, no_place, found, needed, "add them or remove the row")
+        elif corners is None and not measurements.image[row]:
+            found, remedy = (
+                f"neither an image nor {CORNERS_NAME}",
+                "name an image or give the corners",
             )
-            for row in hand_held
-            if not measurements.image[row]
-        ]
-    else:
-        problems = rows_without_board(dataset, dataset.corners, hand_held)
-    if dataset.axes is not None:
-        return {}, [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
-    facts: dict[str, ImageFacts] = {}
+            refuse(row, no_place, found, f"the board in {of_held}", remedy, "image")
+    no_use, remedy = "the row could not be used", "name an image or remove the row"
+    if axes is not None:
+        for row in np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist():
+            found, needed = f"no axis of it in {AXES_NAME}", "one of a leg that its view uses"
+            refuse(row, no_use, found, needed, "add one or remove the row")
+        return {}, problems
     outlines = dataset.observations
     in_tables = set() if outlines is None else set(outlines.row.tolist())
     tables = f"outlines of it in {OBSERVATIONS_NAME}"
-    if dataset.board_on("platform") is not None and dataset.corners is not None:
-        in_tables |= set(dataset.corners.row[dataset.corners.used].tolist())
+    if dataset.board_on("platform") is not None and corners is not None:
+        in_tables |= set(corners.row[corners.used].tolist())
         tables += f" or corners in {CORNERS_NAME}"
     for row in range(measurements.n_rows):
         path = dataset.image_path(row)
         if path is None and row not in in_tables:
-            problem = Problem(
-                "the row could not be used",
-                f"neither an image nor {tables}",
-                "one of them",
-                "name an image or remove the row",
-                str(table_path),
-                row + 1,
-                columns=("image",),
-            )
-            problems.append((row, problem))
+            refuse(row, no_use, f"neither an image nor {tables}", "one of them", remedy, "image")
         elif path is not None and (os.path.exists(path) or row not in in_tables):
             facts[measurements.image[row]], problem_of_image = dataset.inspect_image(row)
             problems += [(row, problem_of_image)] if problem_of_image else []

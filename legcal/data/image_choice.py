@@ -1,22 +1,98 @@
-"""Images that a call names: ``p22``, ``c2:p22``, ``p22..p45`` or ``c2``, separated by commas.
+"""Choices of images: by the order in which they were taken, by name, or at random.
 
-A range has all images between two in the order in which they were taken, see
-:mod:`legcal.data.image_order`; a view stands for its images.
+The order is that of their times, else of the numbers in their names. A call names images ``p22``,
+``c2:p22``, ``p22..p45`` or ``c2``, separated by commas: a range has all images between two in that
+order, a view stands for its images. Images that a fit must predict are held out in whole poses,
+since images of one pose share its unknowns, and at random, in an order that does not depend on the
+files, so that every leg in every view loses no more than its share.
 """
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import date, datetime, time
+from pathlib import PurePosixPath
 
 import numpy as np
 
 from legcal.data.dataset import Dataset
-from legcal.data.image_order import image_sequences
+from legcal.data.image_tables import canonical_order, measurements_at
 from legcal.data.measurements import Measurements, OwnZero, row_names
-from legcal.errors import UsageError
+from legcal.errors import NotIdentifiable, UsageError
 from legcal.files.schema import closest, describe
-from legcal.geometry.types import BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
+
+_NUMBER = re.compile(r"\d+")
+_EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
+_SEED = 20020721
+
+
+def image_sequences(
+    measurements: Measurements, taken_at: Mapping[str, str]
+) -> tuple[IntArray, ...]:
+    """Return the rows in the order of their images, one array for each order that is known.
+
+    Times order the images of all views; *taken_at* has those of files by image, as EXIF writes
+    them. Numbers in names order the images of one view: nothing says which view came first.
+    The order of rows in the table has no meaning.
+    """
+    times = _times(measurements, taken_at)
+    if times is not None:
+        return (np.argsort(times, kind="stable"),)
+    names = row_names(measurements)
+    sequences = []
+    for v in range(len(measurements.views)):
+        rows = np.flatnonzero(measurements.view == v)
+        numbers = _numbers([names[row] for row in rows.tolist()])
+        if numbers is not None:
+            sequences.append(rows[np.argsort(numbers)])
+    return tuple(sequences)
+
+
+def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | None:
+    """Return the time of each row [s], None unless all are known and most poses differ in it."""
+    times = measurements.time
+    if times is None or not np.isfinite(times).all():
+        times = np.full(measurements.n_rows, np.nan)
+        for row, image in enumerate(measurements.image):
+            moment = moment_of(taken_at.get(image, ""))
+            if moment is None:
+                return None
+            times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
+    n_moments = len(np.unique(times))
+    return times if 2 * n_moments > measurements.n_poses else None
+
+
+def moment_of(text: str, day: date | None = None) -> datetime | None:
+    """Return the time in a text: ISO 8601, as EXIF writes it, or of the day alone."""
+    text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
+    try:
+        return datetime.fromisoformat(text).replace(tzinfo=None)
+    except ValueError:
+        pass
+    try:
+        return None if day is None else datetime.combine(day, time.fromisoformat(text))
+    except ValueError:
+        return None
+
+
+def _numbers(names: Sequence[str]) -> IntArray | None:
+    """Return the rank of each name by the last number in its stem, None unless they all differ.
+
+    Where all names have as many numbers, as dates and times have, the first ones count before.
+    """
+    found = [
+        [int(digits) for digits in _NUMBER.findall(PurePosixPath(name).stem)] for name in names
+    ]
+    if len(names) < 2 or not all(found):
+        return None
+    if len({len(numbers) for numbers in found}) > 1:
+        found = [numbers[-1:] for numbers in found]
+    ranks = {numbers: rank for rank, numbers in enumerate(sorted({tuple(n) for n in found}))}
+    return np.array([ranks[tuple(n)] for n in found]) if len(ranks) == len(names) else None
 
 
 def sequences_of(dataset: Dataset) -> tuple[IntArray, ...]:
@@ -155,3 +231,79 @@ def _rows_named(m: Measurements, name: str) -> tuple[int, IntArray]:
         remedy = closest(name, [*names, *views])
         raise ValueError(f"found no image {describe(name)}, needed one of the dataset; {remedy}")
     return view, rows
+
+
+def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]:
+    """Return the rows of the images to fit and of the held-out images, each ascending."""
+    if not 0.0 < fraction < 1.0:
+        raise UsageError(
+            f"The images to keep aside could not be chosen: found the fraction {fraction:g}, "
+            "needed a number between 0 and 1 (0.2 keeps a fifth aside); correct it."
+        )
+    measurements = dataset.measurements
+    shown = _shown(dataset)
+    wanted = max(1, round(fraction * measurements.n_rows))
+    most = np.minimum(np.ceil(fraction * shown.sum(axis=0)), shown.sum(axis=0) - 1)
+    held_out = np.zeros(measurements.n_rows, dtype=np.bool_)
+    for pose in _shuffled_poses(dataset):
+        tried = held_out | (measurements.pose == pose)
+        fits = np.all(shown[tried].sum(axis=0) <= np.maximum(most, 0.0))
+        if fits and tried.sum() <= wanted:
+            held_out = tried
+    if not held_out.any():
+        raise NotIdentifiable(
+            f"{dataset.folder}: no images could be kept aside: found "
+            f"{measurements.n_rows} image{'s' * (measurements.n_rows != 1)} of "
+            f"{measurements.n_poses} pose{'s' * (measurements.n_poses != 1)}, needed so many that "
+            f"a whole pose is {100 * fraction:g} % of them and every leg stays in every view that "
+            "shows it; take more images or leave out --holdout."
+        )
+    return np.flatnonzero(~held_out), np.flatnonzero(held_out)
+
+
+def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
+    """Return a dataset with some of its images only."""
+    observations, axes, corners = dataset.observations, dataset.axes, dataset.corners
+    return replace(
+        dataset,
+        measurements=measurements_at(dataset.measurements, rows),
+        observations=None if observations is None else observations.at(rows),
+        axes=None if axes is None else axes.at(rows),
+        corners=None if corners is None else corners.at(rows),
+        landmarks=None if dataset.landmarks is None else dataset.landmarks.at(rows),
+    )
+
+
+def _shuffled_poses(dataset: Dataset) -> IntArray:
+    """Return all poses in a random order that does not depend on the order of the rows."""
+    measurements = dataset.measurements
+    rows = canonical_order(measurements, dataset.machine.leg_names).rows
+    poses = np.array(list(dict.fromkeys(measurements.pose[rows].tolist())), dtype=np.intp)
+    return np.random.default_rng(_SEED).permutation(poses)
+
+
+def _shown(dataset: Dataset) -> BoolArray:
+    """Return a mask of the legs by view that each row shows or may show, (n_rows, views * legs)."""
+    measurements, names = dataset.measurements, dataset.machine.leg_names
+    shown = np.zeros((measurements.n_rows, len(measurements.views), len(names)), dtype=np.bool_)
+    has_observations = np.zeros(measurements.n_rows, dtype=np.bool_)
+    for table, used in _tables(dataset):
+        row, leg = table[used].T
+        shown[row, measurements.view[row], leg] = True
+        has_observations[row] = True
+    for row in np.flatnonzero(~has_observations).tolist():
+        view = int(measurements.view[row])
+        shown[row, view] = [measurements.views[view].uses(name) for name in names]
+    return shown.reshape(measurements.n_rows, -1)
+
+
+def _tables(dataset: Dataset) -> list[tuple[IntArray, BoolArray]]:
+    """Return for each table the image row and leg (n, 2) of its entries, and the mask of use."""
+    tables = []
+    if dataset.axes is not None:
+        axes = dataset.axes
+        tables.append((np.column_stack([axes.row, axes.leg]), np.ones(len(axes), dtype=np.bool_)))
+    if dataset.observations is not None:
+        outlines = dataset.observations
+        tables.append((np.column_stack([outlines.row, outlines.leg]), outlines.used))
+    return tables

@@ -21,7 +21,7 @@ from legcal.data.measurements import (
     Measurements,
     find_rows,
     places,
-    refuse_unknown_rows,
+    refuse_outside,
     row_names,
 )
 from legcal.errors import DatasetError
@@ -116,7 +116,6 @@ def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measureme
         needed="joints that are clicked in pictures; add them, or delete the file",
     )
     row = find_rows(table, measurements)
-    refuse_unknown_rows(table, row, measurements)
     joints = joint_names(leg_names)
     chosen = table.text("joint")
     for i, name in enumerate(chosen):
@@ -124,12 +123,7 @@ def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measureme
             remedy = f"a joint of the mechanism, as leg1.base; {closest(name, joints)}"
             table.refuse(i, f"the unknown joint {describe(name)}", remedy, "joint")
     px = table.numbers(("u", "v"))
-    cameras = [view.camera for view in measurements.views]
-    size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[row]]
-    outside = (px < -0.5) | (px > size - 0.5)
-    for i, k in np.argwhere(outside & (row >= 0)[:, None]).tolist():
-        inside = f"-0.5 to {size[i, k] - 0.5:g} px, inside the picture; correct it"
-        table.refuse(i, f"{px[i, k]:g} px", inside, COLUMNS[3 + k])
+    refuse_outside(table, row, COLUMNS[3:5], measurements)
     table.once(
         [
             (image, name) if image >= 0 and name in joints else None

@@ -13,22 +13,23 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
+from legcal.causes import Cause, by_cause
 from legcal.data.reading_units import (
-    PULSES,
     ReadingUnit,
     default_unit,
+    doubtful_units,
+    joint_values,
     legs_with_readings,
+    likely_cause,
     sigmas_of_legs,
 )
 from legcal.errors import DatasetError, Problem
 from legcal.files.folder import path_problem
-from legcal.files.quantity import ANGLE, LENGTH
 from legcal.files.schema import closest, describe
 from legcal.files.table import Column, Table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -42,12 +43,6 @@ ROUNDED, NOISY = 1e-3, 3.0
 # Minimum fraction and number of rows outside the travel for a search of a common cause
 MANY, FEWEST = 0.25, 2
 MAX_READING_SPREAD = 10.0  # maximum difference [sigma] between rows of one pose
-INCH = 0.0254  # [m]
-# Fractions of the travel in use: in the stated unit, and in another possible, or certain, unit
-HARDLY_MOVES, MAY_MOVE, SURELY_MOVES = 0.02, 0.2, 0.5
-WOULD_MOVE = 0.05  # minimum fraction of the travel that corrected readings would use
-MIN_POSES = 5  # different poses, as an arm needs (6'): fewer are a check, perhaps close together
-USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 _TEXTS = ("view", "image", "pose")  # columns
 _MAX_SHOWN = 3  # readings quoted in a sentence about many
 
@@ -153,19 +148,17 @@ def places(measurements: Measurements) -> list[tuple[str, str]]:
     return list(zip(views, row_names(measurements), strict=True))
 
 
-def find_rows(table: Table, measurements: Measurements) -> IntArray:
-    """Return for each row of a table the row of the measurements, -1 where unknown."""
-    index = {place: row for row, place in enumerate(places(measurements))}
-    named = zip(table.text("view"), table.text("image"), strict=True)
-    return np.array([index.get(place, -1) for place in named], dtype=np.intp)
+def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) -> IntArray:
+    """Return for each row of a table of images the row of the measurements, -1 where unknown.
 
-
-def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements) -> None:
-    """Refuse rows of a table with an image unknown to :func:`find_rows`."""
+    Unknown views and images are refused, unless said otherwise.
+    """
     names = places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
+    index = {place: row for row, place in enumerate(names)}
     named = list(zip(table.text("view"), table.text("image"), strict=True))
-    for i in np.flatnonzero(row < 0).tolist():
+    rows = np.array([index.get(place, -1) for place in named], dtype=np.intp)
+    for i in np.flatnonzero(rows < 0).tolist() if refuse else ():
         view, image = named[i]
         if view not in views:
             unknown, remedy = f"the unknown view {describe(view)}", closest(view, views)
@@ -174,20 +167,31 @@ def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements)
             near = closest(image, [name for v, name in names if v == view])
             needed = f"an image of view {view} in the measurements"
             table.refuse(i, describe(image), needed, "image", remedy=near)
+    return rows
 
 
-def find_legs(table: Table, leg_names: Sequence[str]) -> IntArray:
-    """Return the leg that each row of a table names, -1 where unknown."""
+def find_legs(table: Table, leg_names: Sequence[str], *, refuse: bool = True) -> IntArray:
+    """Return the leg that each row of a table names, -1 where unknown; these are refused."""
     index = {name: j for j, name in enumerate(leg_names)}
-    return np.array([index.get(name, -1) for name in table.text("leg")], dtype=np.intp)
-
-
-def refuse_unknown_legs(table: Table, leg: IntArray, leg_names: Sequence[str]) -> None:
-    """Refuse rows of a table with a leg unknown to :func:`find_legs`."""
     names = table.text("leg")
-    for i in np.flatnonzero(leg < 0).tolist():
+    legs = np.array([index.get(name, -1) for name in names], dtype=np.intp)
+    for i in np.flatnonzero(legs < 0).tolist() if refuse else ():
         unknown, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
         table.refuse(i, unknown, "a leg of the mechanism", "leg", remedy=remedy)
+    return legs
+
+
+def refuse_outside(
+    table: Table, rows: IntArray, columns: Sequence[str], measurements: Measurements
+) -> None:
+    """Refuse pixels, in two columns, outside the image of their row of the measurements."""
+    px = table.numbers(columns)
+    cameras = [view.camera for view in measurements.views]
+    size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[rows]]
+    outside = ((px < -0.5) | (px > size - 0.5)) & (rows >= 0)[:, None]
+    for i, k in np.argwhere(outside).tolist():
+        needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"
+        table.refuse(i, f"{px[i, k]:g} px", needed, columns[k], remedy="correct it")
 
 
 def few(names: Sequence[str]) -> str:
@@ -199,6 +203,27 @@ def few(names: Sequence[str]) -> str:
 def few_views(names: Sequence[str]) -> str:
     """Return views in words, at most a few names: ``views c1, c2``."""
     return f"view{'s' * (len(names) > 1)} {few(names)}"
+
+
+def image_notes(measurements: Measurements, causes: Mapping[int, Cause]) -> list[str]:
+    """Return one sentence for each cause, which begins with the images of its rows."""
+    return [
+        f"{images_in_words(measurements, rows)}{': ' if len(rows) == 1 else ', each: '}{cause}"
+        for cause, rows in by_cause(causes)
+    ]
+
+
+def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
+    """Return rows in words: ``3 images of views c1, c2 (a.png, b.png, c.png)``.
+
+    A single one is ``view c1, image a.png``.
+    """
+    names = row_names(measurements)
+    views = dict.fromkeys(measurements.views[int(measurements.view[row])].name for row in rows)
+    of_views = few_views(list(views))
+    if len(rows) == 1:
+        return f"view {next(iter(views))}, image {names[rows[0]]}"
+    return f"{len(rows)} images of {of_views} ({few([names[row] for row in rows])})"
 
 
 def reading_columns(
@@ -241,264 +266,58 @@ def readings_in(
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
     Readings outside their travel by more than 5 % of it are refused; smaller excesses are noted if
-    they exceed rounding and noise. Readings that hardly move in their unit but use the travel in a
-    larger unit are refused as well, or noted where that is uncertain, as with few poses. *units*
-    and standard deviations *sigma* (n_motors,) come from a dataset; without units, tables are in m
-    and rad.
+    they exceed rounding and noise. Many readings that hardly move in their unit and use the travel
+    in a larger one are refused as well. *units* and standard deviations *sigma* (n_motors,) come
+    from a dataset; without units, tables are in m and rad.
     """
-    actuated = legs_with_readings(legs)
-    noise = np.zeros(len(actuated)) if sigma is None else NOISY * sigma
-    values = table.numbers(str(leg.prismatic) for leg in actuated)
-    stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in actuated]
-    readings = np.empty_like(values)
-    for j, unit in enumerate(stated):
-        readings[:, j] = unit.values(values[:, j])
-    notes = []
-    beyond: list[tuple[str, str, bool]] = []  # column, its values in words, whether in many rows
-    motor_columns = zip(actuated, stated, values.T, readings.T, noise.tolist(), strict=True)
-    for leg, unit_of_motor, numbers, column, of_noise in motor_columns:
+    motors = legs_with_readings(legs)
+    values = table.numbers(str(leg.prismatic) for leg in motors)
+    stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in motors]
+    readings = joint_values(values, stated)
+    noise = np.zeros(len(motors)) if sigma is None else NOISY * sigma
+    notes, outside, often = [], dict[int, str](), dict[tuple[bool, str], list[int]]()
+    for j, (leg, unit, column) in enumerate(zip(motors, stated, readings.T, strict=True)):
         lower, upper = leg.travel
         if not 0.0 < upper - lower < np.inf:
             continue
-        beyond_travel = np.maximum(lower - column, column - upper)
-        outside = beyond_travel > max(ROUNDED * (upper - lower), of_noise)
-        far = (beyond_travel > 0.0) & ~leg.in_travel(column)
-        unit_name, ends = unit_of_motor.name, sorted(map(unit_of_motor.reading, leg.travel))
-        travel = f"{ends[0]:g} to {ends[1]:g} {unit_name} (the joint limits of the model)"
-        if np.any(far):
-            actual = (
-                f"found {_some(table, numbers, far, unit_name)}, needed {travel} with a margin of "
-            )
-            actual += f"{TRAVEL_MARGIN:.0%}"
-            n = len(column)
-            many = np.count_nonzero(far) >= max(MANY * n, min(FEWEST, n))
-            beyond.append((str(leg.prismatic), actual, bool(many)))
-        elif np.any(outside):
+        beyond = np.maximum(lower - column, column - upper)
+        is_odd = beyond > max(ROUNDED * (upper - lower), float(noise[j]))
+        is_far = (beyond > 0.0) & ~leg.in_travel(column)
+        ends = sorted(map(unit.reading, leg.travel))
+        travel = f"{ends[0]:g} to {ends[1]:g} {unit.name} (the joint limits of the model)"
+        if np.any(is_far):
+            some, n = _some(table, values[:, j], is_far, unit.name), len(column)
+            outside[j] = f"found {some}, needed {travel} with a margin of {TRAVEL_MARGIN:.0%}"
+            if np.count_nonzero(is_far) >= max(MANY * n, min(FEWEST, n)):
+                often.setdefault((leg.reads_angle, unit.name), []).append(j)
+        elif np.any(is_odd):
             notes.append(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
-                f"{travel}: {_some(table, numbers, outside, unit_name)}."
+                f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
-    often = [name for name, _, most in beyond if most]
-    cause = ""
-    if often:
-        # A large divisor brings any readings into the travel: they must also move there.
-        wrong = [j for j, leg in enumerate(actuated) if str(leg.prismatic) in often]
-        all_motors = list(range(len(actuated)))
-        tries = (all_motors, WOULD_MOVE), (wrong, WOULD_MOVE), (wrong, 0.0), (all_motors, 0.0)
-        for some, least in tries:
-            cause = cause or _likely_cause(
-                values[:, some],
-                [actuated[j] for j in some],
-                [stated[j] for j in some],
-                in_dataset=units is not None,
-                least=least,
-            )
-    alike = often if cause else []
-    for name, actual, _ in beyond:
-        if name in alike[1:]:
+    groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
+    for alike in often.values():
+        of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
+        if cause := likely_cause(values[:, alike], *of_alike, in_dataset=units is not None):
+            groups |= {j: ([], "") for j in alike} | {alike[0]: (alike, cause)}
+    for j, actual in outside.items():
+        columns, remedy = groups.get(j, ([j], "correct the readings or the limits"))
+        if not columns:
             continue
-        of_this, remedy = [name], "correct the readings or the limits"
-        if name in alike:
-            remedy = cause
-            if len(alike) > 1:
-                of_this, actual = alike, f"in {name} {actual}"
+        where = f"in {motors[j].prismatic} " * (len(columns) > 1)
         table.refuse_file(
             Problem(
-                f"readings are outside the travel: {actual}",
+                f"readings are outside the travel: {where}{actual}",
                 remedy=remedy,
                 file=str(table.path),
-                columns=tuple(of_this),
+                columns=tuple(str(motors[k].prismatic) for k in columns),
             )
         )
-    if not beyond:
-        for doubt in doubted_units(values, readings, actuated, stated):
-            if doubt.is_sure:
-                remedy = (
-                    f"write readings: {doubt.other} in the dataset file, and convert them first "
-                    f"if they are in {doubt.stated}"
-                )
-                table.refuse_file(doubt.problem(table.path, remedy))
-            else:
-                columns = f"column{'s' * (len(doubt.columns) > 1)} {few(doubt.columns)}"
-                notes.append(f"{table.path}, {columns}: readings {doubt.uses}; check their unit.")
+    if not outside:
+        statement = "write readings: {} in the dataset file"
+        for problem in doubtful_units(table.path, values, motors, stated, statement):
+            table.refuse_file(problem)
     return readings, tuple(notes)
-
-
-class DoubtedUnit(NamedTuple):
-    """A unit in which readings hardly move, and a larger unit in which they use the travel."""
-
-    columns: tuple[str, ...]
-    uses: str  # fraction of the travel in use in either unit, in words
-    stated: str  # the unit
-    other: str  # the larger unit
-    is_sure: bool
-
-    def problem(self, path: Path, remedy: str) -> Problem:
-        """Return the problem of a table with these readings."""
-        return Problem(
-            "the unit of the readings could not be decided",
-            f"that they {self.uses}",
-            "the unit in which they are",
-            remedy,
-            str(path),
-            columns=self.columns,
-        )
-
-
-def doubted_units(
-    values: Array, readings: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit]
-) -> list[DoubtedUnit]:
-    """Return the columns that hardly move in their unit but would in a larger unit.
-
-    The largest units are never doubted, so that small motions can always be written in them.
-    """
-    doubts = list[DoubtedUnit]()
-    n_poses = len(np.unique(values, axis=0))
-    for name in dict.fromkeys(unit.name for unit in units):
-        some = [j for j, unit in enumerate(units) if unit.name == name]
-        width = np.ptp([legs[j].travel for j in some], axis=1)
-        sizes = ANGLE if legs[some[0]].reads_angle else LENGTH
-        if not n_poses or name not in sizes or not np.all((width > 0.0) & np.isfinite(width)):
-            continue
-        used = float(np.max(np.ptp(readings[:, some], axis=0) / width))
-        for other_unit, size in sizes.items():
-            meant = size * values[:, some]
-            moved = float(np.mean(np.ptp(meant, axis=0) / width))
-            if used >= HARDLY_MOVES or moved <= MAY_MOVE or size <= sizes[name]:
-                continue
-            if not np.all(in_travel(meant, [legs[j] for j in some])):
-                continue
-            columns = tuple(str(legs[j].prismatic) for j in some)
-            uses = (
-                f"use {100 * used:.2g} % of the travel in {name}, which is stated, and "
-                f"{100 * moved:.2g} % in {other_unit}"
-            )
-            is_sure = n_poses >= MIN_POSES and moved > SURELY_MOVES
-            doubts.append(DoubtedUnit(columns, uses, name, other_unit, is_sure))
-            break
-    return doubts
-
-
-def _likely_cause(
-    values: Array,
-    legs: Sequence[Leg],
-    units: Sequence[ReadingUnit],
-    *,
-    in_dataset: bool,
-    least: float = 0.0,
-) -> str:
-    """Return the likely mistake in *values* (n_rows, n_legs) and the remedy; "" if unclear.
-
-    Among the corrections that bring all readings into their travel, it is the one with the largest
-    motion there, which must exceed the fraction *least*. The values are in *units*.
-    """
-    groups = dict.fromkeys(
-        (leg.reads_angle, unit.name) for leg, unit in zip(legs, units, strict=True)
-    )
-    if len(groups) > 1:
-        for group in sorted(groups, reverse=True):
-            some = [j for j, unit in enumerate(units) if (legs[j].reads_angle, unit.name) == group]
-            chosen = [[sequence[j] for j in some] for sequence in (legs, units)]
-            cause = _likely_cause(
-                values[:, some],
-                *chosen,  # type: ignore[arg-type]
-                in_dataset=in_dataset,
-                least=least,
-            )
-            if cause:
-                return cause
-        return ""
-    name = units[0].name
-    if legs[0].reads_angle:
-        tried = _as_angles(values, legs, units, in_dataset)
-    elif name == "m":
-        tried = _as_lengths(values, legs)
-    else:
-        tried = tuple(
-            (size * values, f"{other}: write readings: {other}")
-            for other, size in LENGTH.items()
-            if other != name
-        )
-    width = np.ptp([leg.travel for leg in legs], axis=1)
-    likely, most = "", least
-    for meant, meaning in tried:
-        moved = float(np.mean(np.ptp(meant, axis=0) / width))
-        if moved > most and np.all(in_travel(meant, legs)):
-            likely, most = f"these look like {meaning}", moved
-    low, high = USUAL_PULSES
-    if (
-        not likely
-        and legs[0].reads_angle
-        and name != PULSES
-        and np.all((values > low) & (values < high))
-    ):
-        likely = "these look like pulses of servos in us: "
-        likely += (
-            f"write readings: {{{legs[0].prismatic}: {{unit: us, centre_us: 1500, us_per_deg: "
-            "11.1}, ...} in the dataset file, with the numbers of your servos"
-            if in_dataset
-            else "convert them to radians"
-        )
-    return likely
-
-
-def _as_angles(
-    values: Array, legs: Sequence[Leg], units: Sequence[ReadingUnit], in_dataset: bool
-) -> tuple[tuple[Array, str], ...]:
-    """Return possible corrections of readings of motors that turn [rad], with words for each."""
-    name, degrees = units[0].name, np.degrees(1.0)
-
-    def write(unit: str) -> str:
-        return f"write readings: {unit} in the dataset file"
-
-    angles = np.column_stack([u.values(x) for u, x in zip(units, values.T, strict=True)])
-    pulses = [leg.actuator.pulses if leg.actuator is not None else None for leg in legs]
-    meanings: list[tuple[Array, str]] = []
-    if name == "rad":
-        or_write = f", or {write('deg')}" if in_dataset else ""
-        meanings += [
-            (values / degrees, f"degrees: multiply them by pi/180{or_write}"),
-            (-values / degrees, "degrees with the opposite sign: multiply them by -pi/180"),
-            (values * degrees, "radians divided by 180/pi once too often: multiply by 180/pi"),
-        ]
-    else:
-        meanings.append((values, f"radians: {write('rad')}"))
-        if name == PULSES:
-            meanings.append((values / degrees, f"degrees: {write('deg')}"))
-    if name != PULSES and all(pulses):
-        meant = [p.angles(x) for p, x in zip(pulses, values.T, strict=True) if p is not None]
-        remedy = write(PULSES) if in_dataset else "convert them to radians"
-        meanings.append((np.column_stack(meant), f"pulses of servos in us: {remedy}"))
-    reverse = "reverse them" if name != PULSES else "give us_per_deg the other sign"
-    return (*meanings, (-angles, f"readings with the opposite sign: {reverse}"))
-
-
-def _as_lengths(readings: Array, legs: Sequence[Leg]) -> tuple[tuple[Array, str], ...]:
-    """Return possible corrections of readings in metres, with words for each."""
-    whole = "subtract the leg lengths at reading zero (legcal inspect tells them)"
-    return (
-        (LENGTH["mm"] * readings, "millimetres: divide them by 1000"),
-        (readings_of_lengths(readings, legs), f"whole leg lengths: {whole}"),
-        (
-            readings_of_lengths(LENGTH["mm"] * readings, legs),
-            f"whole leg lengths in millimetres: divide them by 1000, and {whole}",
-        ),
-        (LENGTH["cm"] * readings, "centimetres: divide them by 100"),
-        (INCH * readings, "inches: multiply them by 0.0254"),
-        (-readings, "readings with the opposite sign: reverse them"),
-    )
-
-
-def readings_of_lengths(lengths: Array, legs: Sequence[Leg]) -> Array:
-    """Return the readings (n_rows, n_legs) of whole leg lengths (n_rows, n_legs) [m]."""
-    columns = zip(legs, lengths.T, strict=True)
-    return np.array([leg.readings_at(column) for leg, column in columns]).T
-
-
-def in_travel(readings: Array, legs: Sequence[Leg]) -> BoolArray:
-    """Return a mask of the readings (n_rows, n_legs) [m] in the travel of their legs, or nearly."""
-    columns = zip(legs, readings.T, strict=True)
-    return np.array([leg.in_travel(column) for leg, column in columns], dtype=np.bool_).T
 
 
 def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:

@@ -19,38 +19,41 @@ from typing import Any
 import yaml
 
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.dataset_file import ENCODER_SIGMAS
 from legcal.data.measurements import few, few_views, reading_columns
 from legcal.data.photograph_matching import (
     Matching,
     Photograph,
     Row,
-    columns_by_content,
     find_photographs,
     likely_pattern,
     match,
     with_likely_views,
 )
-from legcal.data.reading_units import are_commands, sigma_in, sigma_too_large, usual_sigma
+from legcal.data.reading_units import are_commands, default_unit, sigma_in, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
-from legcal.errors import DatasetError, UsageError
-from legcal.files.folder import OutputKind, check_path, result_folder
+from legcal.errors import DatasetError, OutOfResources, UsageError
+from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
 from legcal.files.published import with_schema
-from legcal.files.quantity import LENGTH, parse_quantity
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
 from legcal.files.table import format_table
-from legcal.machine.files import DATASET_YAML, shipped_names
+from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
+from legcal.vision.camera_export import rough_camera_info
 from legcal.vision.camera_file import read_camera
-from legcal.vision.exif_camera import FOCAL_SIGMA, camera_of_photographs, rough_camera_info
-from legcal.vision.image_facts import read_facts
+from legcal.vision.image_facts import FOCAL_SIGMA, camera_of_photographs, read_facts
 from legcal.vision.image_file import BadImage, image_size, inspect_image
 
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
+_EXAMPLE = "examples/hexapod"
+_EXAMPLE_KIND = OutputKind("example", "", "legcal_dataset")
+# Without results of a calibration beside them
+_EXAMPLE_FILES = (
+    "dataset.yaml", "measurements.csv", "camera_info.yaml", "images", "models", "urdf"
+)  # fmt: skip
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 2.5e-6  # [mean leg lengths] minimum default noise of readings
@@ -258,7 +261,7 @@ def plan_new_dataset(
     _check_place(folder, destination)
     photographs = find_photographs(folder)
     by_names, pattern = with_likely_views(photographs)
-    sheet = ReadingsSheet(path, machine, "photograph", columns_by_content(by_names))
+    sheet = ReadingsSheet(path, machine, "photograph")
     named = {view.casefold() for view in sheet.text("view") if view}
     if named <= {photograph.folder.casefold() for photograph in by_names}:
         photographs = by_names
@@ -414,70 +417,35 @@ def _sigmas(
     least: float,  # minimum default [m]
 ) -> tuple[float | dict[str, float], list[str]]:
     """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
-    if not any(leg.reads_angle for leg in motors):
-        if isinstance(stated, str):
-            stated = parse_quantity(stated, LENGTH, "--encoder-sigma")
-        if not isinstance(stated, Mapping):
-            return _sigma(stated, max(float(readings.digits.min()), least), least, motors)
-    if isinstance(stated, Mapping):
-        for leg in motors:
-            _check_sigma(stated.get(str(leg.prismatic), 0.0), leg)
-        return dict(stated), []
-    sigmas, notes = dict[str, float](), list[str]()
+    sigmas = dict[str, float]()
     for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
         name = str(leg.prismatic)
-        if stated is not None:
-            try:
-                sigmas[name] = sigma_in(stated, unit, leg)
-            except ValueError as error:
-                raise UsageError(
-                    "The standard deviation of a reading could not be used: " + str(error)
-                ) from None
-        else:
+        sigma = stated.get(name) if isinstance(stated, Mapping) else stated
+        if sigma is None:
             sigmas[name] = max(digit, usual_sigma(leg, least, unit))
+            continue
+        try:
+            of_number = unit if isinstance(sigma, str) else default_unit(leg)
+            sigmas[name] = sigma_in(sigma, of_number, leg)
+        except ValueError as error:
+            raise UsageError(f"--encoder-sigma could not be used: {error}") from None
+    slides = not any(leg.reads_angle for leg in motors)
+    smallest = min(sigmas.values())
+    notes = []
     if stated is None:
-        shown = [
-            f"{name} {sigma:.2g} {leg.reading_unit}"
-            for leg, (name, sigma) in zip(motors, sigmas.items(), strict=True)
-        ]
+        shown = f"{1e6 * smallest:.3g} um"
+        if not slides:
+            units = [leg.reading_unit for leg in motors]
+            of_motor = zip(sigmas.items(), units, strict=True)
+            shown = few([f"{name} {sigma:.2g} {unit}" for (name, sigma), unit in of_motor])
         why = "the last digit of the table, at least that of a good encoder"
         if any(map(are_commands, motors, readings.units)):
             why = "half a degree of what a hobby servo makes of its command"
         notes.append(
-            f"encoder_sigma is {few(shown)}, {why}: give --encoder-sigma if readings are known "
-            "better or worse."
+            f"encoder_sigma is {shown}, {why}: give --encoder-sigma if readings are known better "
+            "or worse."
         )
-    return sigmas, notes
-
-
-def _sigma(
-    stated: float | None, usual: float, encoder: float, motors: Sequence[Leg]
-) -> tuple[float, list[str]]:
-    """Return the standard deviation of a reading [m], and a note if it is a default."""
-    if stated is not None:
-        least, most = ENCODER_SIGMAS
-        if not least <= stated <= most:
-            raise UsageError(
-                f"The standard deviation of a reading could not be used: found {stated:g} m, "
-                f"needed {least:g} to {most:g} m; correct --encoder-sigma."
-            )
-        for leg in motors:
-            _check_sigma(stated, leg)
-        return stated, []
-    why = "the last digit of the table" if usual > encoder else "that of a good encoder"
-    return usual, [
-        f"encoder_sigma is {1e6 * usual:.3g} um, {why}: give --encoder-sigma if "
-        "readings are known better or worse."
-    ]
-
-
-def _check_sigma(sigma: float, leg: Leg) -> None:
-    """Refuse a standard deviation [m or rad] that no encoder has."""
-    if too_large := sigma_too_large(sigma, leg):
-        raise UsageError(
-            f"The standard deviation of a reading could not be used: found {too_large[0]}, needed "
-            f"{too_large[1]}; correct --encoder-sigma."
-        )
+    return smallest if slides and not isinstance(stated, Mapping) else sigmas, notes
 
 
 def _view(row: Row, photograph: Photograph) -> str:
@@ -505,10 +473,14 @@ def _cameras(
             f"cannot show, needed {NAME_NEEDED}; rename it."
         )
     for_all = [text for text in options if "=" not in text or os.path.isfile(text)]
-    named = [text.split("=", 1) for text in options if text not in for_all]
     of_one, problems = dict[str, str](), list[str]()
-    for name, file in named:
-        if of_one.setdefault(name, file) != file:
+    for name, _, file in (text.partition("=") for text in options if text not in for_all):
+        if name not in views:
+            problems.append(
+                f"--camera {name}={file} could not be used: found no view of that name, needed one "
+                f"of {few(views)}; correct it."
+            )
+        elif of_one.setdefault(name, file) != file:
             problems.append(
                 f"The camera file of view {describe(name)} could not be decided: found "
                 f"--camera {name}={of_one[name]} and --camera {name}={file}, needed one; leave "
@@ -519,37 +491,21 @@ def _cameras(
             f"The camera files could not be used: found {few(for_all)}, needed one for all views, "
             "or --camera VIEW=FILE for each; correct them."
         )
-    problems += [
-        f"--camera {name}={path} could not be used: found no view of that name, needed one of "
-        f"{few(views)}; correct it."
-        for name, path in of_one.items()
-        if name not in views
-    ]
-    path_of_view: dict[str, Path] = {}
+    path_of_view, made = dict[str, Path](), dict[Path, tuple[Camera, str]]()
     for view in views:
-        beside = [p.path.parent for (_, p), name in zip(matching.pairs, view_of, strict=True)
-                  if name == view]  # fmt: skip
-        near = [
-            path / name for path in (*beside[:1], folder, folder.parent) for name in _CAMERA_NAMES
-        ]
+        images = [photograph.path for (_, photograph), name in
+                  zip(matching.pairs, view_of, strict=True) if name == view]  # fmt: skip
+        near = (images[0].parent, folder, folder.parent)
+        files = [path / name for path in near for name in _CAMERA_NAMES]
         text = of_one.get(view, for_all[0] if for_all else None)
-        path = Path(text) if text else next((path for path in near if path.is_file()), None)
-        if path is not None:
-            path_of_view[view] = path
-    made = dict[Path, tuple[Camera, str]]()
-    for view in views:
-        view_images = [
-            p.path for (_, p), name in zip(matching.pairs, view_of, strict=True) if name == view
-        ]
-        camera = None if view in path_of_view else _camera_by_exif(view_images)
-        if camera is not None:
-            text = rough_camera_info(camera, "exif")
-            path = next(
-                (path for path, (_, other_text) in made.items() if other_text == text), None
-            )
+        if text or any(path.is_file() for path in files):
+            path_of_view[view] = Path(text or next(path for path in files if path.is_file()))
+        elif camera := _camera_by_exif(images):
+            content = rough_camera_info(camera, "exif")
+            path = next((path for path, (_, other) in made.items() if other == content), None)
             if path is None:
                 path = destination / f"camera_exif{f'_{len(made) + 1}' * bool(made)}.yaml"
-                made[path] = camera, text
+                made[path] = camera, content
             path_of_view[view] = path
     missing = [view for view in views if view not in path_of_view]
     if missing:
@@ -593,3 +549,33 @@ def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
     if str(model) in shipped_names() and not os.path.isfile(model):
         return str(model)
     return Path(os.path.relpath(machine.yaml_path.resolve(), destination.resolve())).as_posix()
+
+
+def copy_example(destination: Path) -> None:
+    """Copy the example (a simulated hexapod, 45 photographs), complete or not at all.
+
+    Raises
+    ------
+    UsageError
+        If the folder holds files.
+    OutOfResources
+        If it does not take the files, or legcal was installed without them.
+    """
+    check_path(destination, _EXAMPLE_KIND)
+    if destination.is_dir() and holds_files(destination):
+        raise UsageError(
+            f"{destination}: the example could not be written: found a folder with files, needed "
+            "a new or empty one; give another folder with -o."
+        )
+    source = shipped_folder(_EXAMPLE)
+    if not (source / DATASET_YAML).is_file():
+        raise OutOfResources(
+            f"{source}: the example could not be read: found no {DATASET_YAML}, needed the files "
+            "that come with legcal; install it again."
+        )
+    with result_folder(destination, _EXAMPLE_KIND) as folder:
+        for name in _EXAMPLE_FILES:
+            if (source / name).is_dir():
+                shutil.copytree(source / name, folder / name)
+            else:
+                shutil.copyfile(source / name, folder / name)

@@ -8,7 +8,7 @@ reason and source; and, where legcal measured it, how well it was seen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,11 +21,8 @@ from legcal.data.measurements import (
     find_legs,
     find_rows,
     places,
-    refuse_unknown_legs,
-    refuse_unknown_rows,
 )
 from legcal.data.reasons import Reason, Rejection, read_rejection
-from legcal.errors import Problem
 from legcal.files.folder import write_atomically
 from legcal.files.schema import closest, describe
 from legcal.files.table import Column, Table, format_table, read_table
@@ -37,8 +34,6 @@ from legcal.vision.camera import Camera
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
 ENCODING = ("gamma", "by_gamma")  # how an outline depends on the gamma of the camera
 MEASURED = (*QUALITY, *ENCODING, "polish")
-MAX_OFF = 0.5  # fraction of outlines off their lines from which on the whole table is wrong
-MIN_NEAR = 0.9  # minimum fraction of outlines near their lines for another reading of the table
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 VERDICTS = ("used", "rejected")
 SOURCES = ("detected", "edited")
@@ -287,7 +282,8 @@ def read_observations(
     remedy = "delete the file to have it written again"
     table = read_table(path, "table of observations", "outline", OUTLINE_COLUMNS, remedy=remedy)
     if skip_stale:
-        row, leg = find_rows(table, measurements), find_legs(table, leg_names)
+        row = find_rows(table, measurements, refuse=False)
+        leg = find_legs(table, leg_names, refuse=False)
         exists = np.array(
             [j >= 0 and part in parts[j] for j, part in zip(leg, table.text("part"), strict=True)],
             dtype=np.bool_,
@@ -295,8 +291,6 @@ def read_observations(
         detected = np.array([source == "detected" for source in table.text("source")], dtype=bool)
         table.keep((exists & (row >= 0)) | ~detected)
     row, leg = find_rows(table, measurements), find_legs(table, leg_names)
-    refuse_unknown_rows(table, row, measurements)
-    refuse_unknown_legs(table, leg, leg_names)
     part = table.text("part")
     for i in np.flatnonzero(leg >= 0).tolist():
         if part[i] not in parts[leg[i]]:
@@ -401,61 +395,7 @@ def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measur
         camera, h = measurements.views[v].camera, outlines.h[chosen][:, None]
         offset[chosen] = np.abs(camera.line_offset(h, xy[chosen])).max(axis=1)
     off = ~(offset <= LINE_TOLERANCE_PX)
-    most_are = off.sum() > MAX_OFF * outlines.used.sum()
-    meant = _likely_form(outlines.choose(outlines.used), measurements) if most_are else ""
-    if meant:
-        table.refuse_file(
-            Problem(
-                "the outlines could not be used",
-                f"the ends of {off.sum()} of {outlines.used.sum()} up to "
-                f"{offset[off].max():.3g} px from their lines (a, b, c)",
-                f"at most {LINE_TOLERANCE_PX:g} px",
-                f"they would suit them if {meant}",
-                str(table.path),
-            )
-        )
-        return
     for i in np.flatnonzero(off).tolist():
         actual = f"ends {offset[i]:.3g} px from the line (a, b, c)"
         needed, remedy = f"at most {LINE_TOLERANCE_PX:g} px", "correct the line or its ends"
         table.refuse(i, actual, needed, *NUMBERS[:7], remedy=remedy)
-
-
-def _likely_form(outlines: Outlines, measurements: Measurements) -> str:
-    """Return the likely mistake in a table of outlines off their lines, in words; "" if unclear."""
-    near: dict[str, int] = {}
-    for v in np.unique(measurements.view[outlines.row]):
-        view_rows = outlines.choose(measurements.view[outlines.row] == v)
-        camera = measurements.views[v].camera
-        for form, h, xy in _forms(camera, view_rows.h, view_rows.ends):
-            offset = np.abs(camera.line_offset(h[:, None], xy)).max(axis=1)
-            near[form] = near.get(form, 0) + int(np.sum(offset <= LINE_TOLERANCE_PX))
-    best = max(near, key=lambda form: near[form], default="")
-    return best if near.get(best, 0) >= MIN_NEAR * len(outlines) else ""
-
-
-def _forms(camera: Camera, h: Array, ends: Array) -> Iterator[tuple[str, Array, Array]]:
-    """Yield common mistakes in writing lines (n, 3) and ends (n, 2, 2) [px], with corrected values.
-
-    Corrected ends are on the sensor plane.
-    """
-    size = np.array([camera.width, camera.height], dtype=np.float64)
-    xy = camera.undistort(ends)
-    up = np.array([1.0, -1.0, 1.0])
-    below = np.array([0.0, size[1] - 1.0]) + ends * up[:2]
-    yield "b had the opposite sign: reverse it", h * up, xy
-    below = camera.undistort(below)
-    yield "v counted from the bottom: write the height of the image less 1 less v", h, below
-    yield "a and b were exchanged: exchange their headers", h[:, [1, 0, 2]], xy
-    exchanged = camera.undistort(ends[..., ::-1])
-    yield "u and v were exchanged: exchange their headers", h, exchanged
-    yield "c came before a and b: correct the headers", h[:, [1, 2, 0]], xy
-    yield "the ends were points of the sensor plane: write pixels", h, ends
-    parts = camera.undistort(ends * size)
-    yield "the ends were parts of the size of the image: write pixels", h, parts
-    of_pixels = h @ camera.K
-    yield (
-        "(a, b, c) were a line of pixels: multiply it by the transposed camera matrix",
-        of_pixels / np.linalg.norm(of_pixels, axis=1, keepdims=True),
-        xy,
-    )

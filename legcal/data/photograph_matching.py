@@ -16,13 +16,12 @@ from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from legcal.data.image_order import moment_of
+from legcal.data.image_choice import moment_of
 from legcal.data.measurements import few
 from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
-from legcal.vision.heic import HEIC_SUFFIXES
-from legcal.vision.image_facts import read_facts
+from legcal.vision.image_facts import HEIC_SUFFIXES, read_facts
 from legcal.vision.image_file import CONVERT, CONVERT_HEIC, FOREIGN_SUFFIXES, image_suffixes
 
 MAX_PHOTOGRAPHS = 50_000
@@ -100,29 +99,6 @@ def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograp
     if all(photograph.view.isdecimal() for photograph in with_views):
         return list(photographs), None
     return with_views, pattern
-
-
-def columns_by_content(
-    photographs: Sequence[Photograph],
-) -> dict[str, Callable[[Sequence[str]], bool]]:
-    """Return predicates on the cells of a column: whether it names photographs, or views."""
-    stems = {
-        _stem(text)
-        for photograph in photographs
-        for text in (photograph.name, photograph.label)
-        if text
-    }
-    views = {photograph.folder.casefold() for photograph in photographs} - {"."}
-
-    def are_photographs(cells: Sequence[str]) -> bool:
-        named = [_stem(cell) for cell in cells if cell]
-        return bool(named) and not all(map(str.isdecimal, named)) and stems.issuperset(named)
-
-    def are_views(cells: Sequence[str]) -> bool:
-        named = [cell.casefold() for cell in cells]
-        return len(views) > 1 and len(named) > len(views) and set(named) == views
-
-    return {"image": are_photographs, "view": are_views}
 
 
 def likely_pattern(photographs: Sequence[Photograph]) -> str | None:

@@ -1,8 +1,9 @@
-"""Units of readings: from a number in a table to the joint value of a motor.
+"""Readings: from a number in a table to the joint value of a motor.
 
 Tables have readings in m, of motors that turn in rad, unless ``readings`` in ``dataset.yaml`` says
 otherwise: another unit of length or angle, or pulses of hobby servos, of which the model or the
-dataset knows the centre and the us for one degree.
+dataset knows the centre and the us for one degree. Another unit than stated is recognised by the
+travel of the motors (:func:`meanings`).
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from pydantic import (
     model_validator,
 )
 
-from legcal.errors import BadValue, DatasetError, UsageError
+from legcal.errors import BadValue, DatasetError, Problem, UsageError
 from legcal.files.quantity import ANGLE, COUNTS, LENGTH, SHOWN_IN, split_quantity, unit_size
 from legcal.files.schema import FileSchema, Number, closest, describe
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Pulses
 from legcal.machine.leg import Leg
 
@@ -35,6 +36,12 @@ SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
 SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
 MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
 READING_UNITS = (*LENGTH, *ANGLE, PULSES)
+# Units that tables are usually in, of motors that slide and that turn
+USUAL_UNITS = {False: ("m", "mm", "cm", "in"), True: ("rad", "deg", PULSES)}
+USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
+# Fractions of the travel in use: in the stated unit, and in another that is certainly meant
+HARDLY_MOVES, SURELY_MOVES = 0.02, 0.5
+MIN_POSES = 5  # different poses, as an arm needs (6'): fewer are a check, perhaps close together
 
 
 def _unit_name(name: object) -> object:
@@ -50,6 +57,9 @@ ReadingUnitName = Annotated[
     BeforeValidator(_unit_name),
     WithJsonSchema({"anyOf": [{"enum": [*READING_UNITS]}, {"pattern": f"^{COUNTS}$"}]}),
 ]
+_PLURALS = {
+    "mm": "millimetres", "cm": "centimetres", "in": "inches", PULSES: "pulses of servos"
+}  # fmt: skip
 _WORDS = {"m": "metres", "rad": "radians", "deg": "degrees", "us": "us (pulses of a servo)"}
 
 
@@ -65,6 +75,11 @@ class ReadingUnit:
     def words(self) -> str:
         """The unit as messages about cells name it."""
         return _WORDS.get(self.name, self.name)
+
+    @property
+    def plural(self) -> str:
+        """The unit as readings in it are called."""
+        return _PLURALS.get(self.name, self.words)
 
     def values(self, readings: Array) -> Array:
         """Return the joint values [m or rad] of readings."""
@@ -294,3 +309,149 @@ def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
             f"{needed}; {remedy}."
         )
     return sigma
+
+
+@dataclass(frozen=True, eq=False)
+class Meaning:
+    """What the numbers in the columns of motors that all slide, or all turn, may be."""
+
+    units: tuple[ReadingUnit, ...]
+    q: Array  # (n_rows, n_motors) joint values [m or rad]
+    are_lengths: bool = False  # whole lengths of legs
+    is_reversed: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit."""
+        return self.units[0].name
+
+    def used(self, legs: Sequence[Leg]) -> Array:
+        """Return the fraction of the travel that each motor uses, (n_motors,)."""
+        travel = np.ptp([leg.travel for leg in legs], axis=1)
+        return np.asarray(np.ptp(self.q, axis=0) / travel)
+
+    def said(self, legs: Sequence[Leg], stated: str, *, in_dataset: bool) -> str:
+        """Return what the numbers look like, and what to do if *stated* is another unit."""
+        unit, remedies = self.units[0], list[str]()
+        words = f"whole leg lengths{f' in {unit.plural}' * (unit.name != 'm')}"
+        if not self.are_lengths:
+            words = "readings with the opposite sign" if self.is_reversed else unit.plural
+        if unit.name != stated:
+            other = f"convert them to {legs[0].reading_unit}"
+            remedies.append(
+                f"write readings: {unit.name} in the dataset file" if in_dataset else other
+            )
+        if self.are_lengths:
+            remedies.append("subtract the leg lengths at reading zero (legcal inspect tells them)")
+        if self.is_reversed:
+            other_sign = "give us_per_deg the other sign"
+            remedies.append(other_sign if unit.name == PULSES else "reverse them")
+        return f"these look like {words}: {' and '.join(remedies)}"
+
+
+def joint_values(values: Array, units: Sequence[ReadingUnit]) -> Array:
+    """Return the joint values [m or rad] of numbers (n_rows, n_motors) in a table."""
+    columns = zip(units, values.T, strict=True)
+    return np.array([unit.values(column) for unit, column in columns]).reshape(values.T.shape).T
+
+
+def meanings(values: Array, legs: Sequence[Leg], names: Sequence[str]) -> list[Meaning]:
+    """Return numbers (n_rows, n_motors) as readings, and lengths of struts, in some units."""
+    found = list[Meaning]()
+    for name in names:
+        try:
+            units = tuple(unit_named(name, leg) for leg in legs)
+        except ValueError:  # pulses that no model describes
+            continue
+        q = joint_values(values, units)
+        found.append(Meaning(units, q))
+        if all(leg.actuator is None for leg in legs):
+            found.append(Meaning(units, readings_of_lengths(q, legs), are_lengths=True))
+    return found
+
+
+def readings_of_lengths(lengths: Array, legs: Sequence[Leg]) -> Array:
+    """Return the readings (n_rows, n_legs) of whole leg lengths (n_rows, n_legs) [m]."""
+    columns = zip(legs, lengths.T, strict=True)
+    return np.array([leg.readings_at(column) for leg, column in columns]).T
+
+
+def in_travel(q: Array, legs: Sequence[Leg]) -> BoolArray:
+    """Return a mask of the joint values (n_rows, n_legs) in the travel of their legs, or nearly."""
+    columns = zip(legs, q.T, strict=True)
+    return np.array([leg.in_travel(column) for leg, column in columns], dtype=np.bool_).T
+
+
+def likely_cause(
+    values: Array,  # (n_rows, n_motors) as in the table
+    legs: Sequence[Leg],  # that all slide, or all turn
+    units: Sequence[ReadingUnit],  # stated, of one name
+    *,
+    in_dataset: bool,
+) -> str:
+    """Return the likely mistake in readings outside the travel, and its remedy; "" if unclear.
+
+    Of the corrections that bring all of them into the travel it is that with the largest motion
+    there: any large divisor brings them in.
+    """
+    name, turns = units[0].name, legs[0].reads_angle
+    corrected = [m for m in meanings(values, legs, USUAL_UNITS[turns])
+                 if m.are_lengths or m.unit != name]  # fmt: skip
+    corrected.append(Meaning(tuple(units), -joint_values(values, units), is_reversed=True))
+    possible = [m for m in corrected if in_travel(m.q, legs).all()]
+    if possible and len(values) > 1:
+        best = max(possible, key=lambda m: float(m.used(legs).mean()))
+        return best.said(legs, name, in_dataset=in_dataset)
+    low, high = USUAL_PULSES
+    if turns and name != PULSES and np.all((values > low) & (values < high)):
+        return "these look like pulses of servos in us: " + (
+            f"write readings: {{{legs[0].prismatic}: {{unit: us, centre_us: 1500, us_per_deg: "
+            "11.1}, ...} in the dataset file, with the numbers of your servos"
+            if in_dataset
+            else "convert them to radians"
+        )
+    return ""
+
+
+def doubtful_units(
+    path: Path,
+    values: Array,  # (n_rows, n_motors) as in the table
+    legs: Sequence[Leg],
+    units: Sequence[ReadingUnit],
+    statement: str,  # of another unit, for remedies: "write readings: {}"
+) -> list[Problem]:
+    """Return the problems of columns that hardly move in their unit, and would in a larger one.
+
+    Few poses may be close together, and small motions can always be written in the largest unit.
+    """
+    problems, q = list[Problem](), joint_values(values, units)
+    if len(np.unique(values, axis=0)) < MIN_POSES:
+        return []
+    for name in dict.fromkeys(unit.name for unit in units):
+        some = [j for j, unit in enumerate(units) if unit.name == name]
+        motors = [legs[j] for j in some]
+        width = np.ptp([leg.travel for leg in motors], axis=1)
+        if name == PULSES or not np.all((width > 0.0) & np.isfinite(width)):
+            continue
+        used = float(np.max(np.ptp(q[:, some], axis=0) / width))
+        usual = meanings(values[:, some], motors, USUAL_UNITS[motors[0].reads_angle])
+        other = max(
+            (m for m in usual if not m.are_lengths and in_travel(m.q, motors).all()),
+            key=lambda m: float(m.used(motors).mean()),
+            default=None,
+        )
+        if used >= HARDLY_MOVES or other is None or other.used(motors).mean() <= SURELY_MOVES:
+            continue
+        moved = 100.0 * float(other.used(motors).mean())
+        problems.append(
+            Problem(
+                "the unit of the readings could not be decided",
+                f"that they use {100.0 * used:.2g} % of the travel in {name}, which is stated, and "
+                f"{moved:.2g} % in {other.unit}",
+                "the unit in which they are",
+                f"{statement.format(other.unit)}, and convert them first if they are in {name}",
+                str(path),
+                columns=tuple(str(leg.prismatic) for leg in motors),
+            )
+        )
+    return problems

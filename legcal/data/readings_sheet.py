@@ -1,31 +1,34 @@
 """A table of readings as its owner keeps it: headings, units, readings or whole lengths.
 
 Columns are identified by their headings: an encoder by the name of its leg or joint, or by a
-number; a column of photographs or views by its cells as well. The unit comes from the headings,
-else it is the unit in which the readings lie in the travel of the legs.
+number. The unit comes from the headings, else it is the one in which the readings lie in the travel
+of the legs.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
-from legcal.data.measurements import (
-    doubted_units,
-    few,
+from legcal.data.measurements import few, reading_columns
+from legcal.data.reading_units import (
+    PULSES,
+    Meaning,
+    ReadingUnit,
+    doubtful_units,
     in_travel,
-    reading_columns,
+    is_length,
+    meanings,
     readings_of_lengths,
 )
-from legcal.data.reading_units import PULSES, ReadingUnit, is_length, unit_named
 from legcal.errors import DatasetError, Place, UsageError
 from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN, unit_size
 from legcal.files.schema import describe
@@ -47,7 +50,6 @@ _HEADINGS = {
 }  # fmt: skip
 _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})")
-ByContent = Mapping[str, Callable[[Sequence[str]], bool]]
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 # Units at the end of a heading without brackets that would else be part of a name
 _FOREIGN = {
@@ -74,9 +76,6 @@ class SheetReadings:
 class ReadingsSheet:
     """A table of readings, one row for each photograph or time (*row_noun*).
 
-    *by_content* has, for image and view, a predicate that recognises such a column by its cells,
-    whatever its heading.
-
     Attributes
     ----------
     motors : list of Leg
@@ -97,11 +96,10 @@ class ReadingsSheet:
         path: Path,
         machine: Machine,
         row_noun: str,
-        by_content: ByContent = MappingProxyType({}),
     ) -> None:
         self.path = path
         self.motors = [machine.legs[j] for j in machine.motors]
-        headings = _Headings(path, self.motors, by_content)
+        headings = _Headings(path, self.motors)
         self._table = read_table(
             path,
             "table of readings",
@@ -166,14 +164,9 @@ class ReadingsSheet:
                 what="reading",
             )
         if inside.all() and not lengths:
-            numbers = self._table.numbers(self._joints)
-            for doubt in doubted_units(numbers, q, self.motors, units):
-                if doubt.is_sure:
-                    remedy = (
-                        f"state {doubt.other} in the headings, or convert them to it if they are "
-                        f"in {doubt.stated}"
-                    )
-                    self._table.refuse_file(doubt.problem(self.path, remedy))
+            numbers, statement = self._table.numbers(self._joints), "state {} in the headings"
+            for problem in doubtful_units(self.path, numbers, self.motors, units, statement):
+                self._table.refuse_file(problem)
         self._table.check()
         digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
         last = [
@@ -193,18 +186,11 @@ class ReadingsSheet:
             legs, joints = [self.motors[j] for j in some], [self._joints[j] for j in some]
             stated = {unit for x in joints if (unit := self._heading_units.get(x, ""))}
             of_kind = _MotorsOfKind(
-                self.path,
-                legs,
-                joints,
-                self._table.numbers(joints),
-                sorted(stated),
-                lengths,
+                self.path, legs, joints, self._table.numbers(joints), sorted(stated), lengths
             )
-            option_of_kind = (
-                option if option is not None and is_length(option) is not turning else None
-            )
-            unit, origin = of_kind.unit(option_of_kind)
-            unit_of_motor |= dict(zip(some, of_kind.units(unit), strict=True))
+            is_of_kind = option is not None and is_length(option) is not turning
+            meaning, origin = of_kind.meaning(option if is_of_kind else None)
+            unit_of_motor |= dict(zip(some, meaning.units, strict=True))
             origins.append(origin)
         units = tuple(unit_of_motor[j] for j in range(len(self.motors)))
         return units, " and ".join(dict.fromkeys(origins))
@@ -236,10 +222,9 @@ class ReadingsSheet:
 class _Headings:
     """The meaning of the headings of a table of readings."""
 
-    def __init__(self, path: Path, motors: Sequence[Leg], by_content: ByContent) -> None:
+    def __init__(self, path: Path, motors: Sequence[Leg]) -> None:
         self.path = path
         self.motors = motors
-        self.by_content = by_content
         self.joints = [column.name for column in reading_columns(motors)]
         self.taken: dict[str, str] = {}  # meaning of each heading that is used
         self.units: dict[str, str] = {}  # unit in the heading of each joint
@@ -273,11 +258,6 @@ class _Headings:
                     clock = {i: _SECONDS[timed[1]]}
         free = [i for i in range(len(header)) if i not in meaning]
         meaning |= self._joints(free, readings, header)
-        for i in [i for i in free if i not in meaning]:
-            cells = [cells[i] for _, cells in lines[1:] if len(cells) == len(header)]
-            for name, holds in self.by_content.items():
-                if name not in meaning.values() and holds(cells):
-                    meaning[i] = name
         for i, name in meaning.items():
             self.taken[header[i]] = name
             if name in self.joints:
@@ -383,52 +363,50 @@ class _MotorsOfKind:
         """Whether they turn."""
         return self.legs[0].reads_angle
 
-    @property
-    def has_pulses(self) -> bool:
-        """Whether the model describes the pulses of all these motors."""
-        return all(
-            leg.actuator is not None and leg.actuator.pulses is not None for leg in self.legs
-        )
+    @cached_property
+    def possible(self) -> list[Meaning]:
+        """What the values may be: readings, or lengths of struts, in any unit."""
+        return meanings(self.values, self.legs, READING_ANGLES if self.turning else [*LENGTH])
 
     @property
-    def possible(self) -> list[str]:
+    def units(self) -> list[str]:
         """The units that their readings can have."""
-        if not self.turning:
-            return [*LENGTH]
-        return [unit for unit in READING_ANGLES if unit != PULSES or self.has_pulses]
+        return list(dict.fromkeys(meaning.unit for meaning in self.possible))
 
-    def units(self, name: str) -> list[ReadingUnit]:
-        """Return the unit of that name for each motor."""
-        return [unit_named(name, leg) for leg in self.legs]
-
-    def fits(self, unit: str, lengths: bool, *, moving: bool = True) -> bool:
+    def fits(self, meaning: Meaning, *, moving: bool = True) -> bool:
         """Return whether most values lie in the travel and, if *moving*, use a part of it."""
-        columns = zip(self.units(unit), self.values.T, strict=True)
-        q = np.column_stack([unit_of_motor.values(column) for unit_of_motor, column in columns])
-        q = readings_of_lengths(q, self.legs) if lengths else q
-        travel = np.ptp([leg.travel for leg in self.legs], axis=1)
-        moves = np.ptp(q, axis=0) > LEAST_USED * travel
-        return bool(2 * in_travel(q, self.legs).mean() >= 1.0 and (not moving or moves.any()))
+        moves = not moving or np.any(meaning.used(self.legs) > LEAST_USED)
+        return bool(moves and 2 * in_travel(meaning.q, self.legs).mean() >= 1.0)
 
-    def unit(self, option: str | None) -> tuple[str, str]:
-        """Return the unit and its origin in words: an option, the headings, or the travel."""
+    def meaning(self, option: str | None) -> tuple[Meaning, str]:
+        """Return what the values are, and where the unit is from in words.
+
+        It is stated by an option or the headings, else the one in which they lie in the travel.
+        """
         stated = self._stated_unit(option)
-        tried = (
-            (stated,) if stated else tuple(x for x in GUESSED[self.turning] if x in self.possible)
-        )
         origin = "as the heading says" if self.stated else "as given"
         if stated is None:
             origin = "the unit in which the readings lie in the travel of the legs"
-        for unit in tried:
-            if self.fits(unit, self.lengths):
-                return unit, origin
-        self._refuse_other(tried)
-        for unit in tried:
-            if self.fits(unit, self.lengths, moving=False):
-                return unit, origin
+        tried = [stated] if stated else GUESSED[self.turning]
+        named = [
+            meaning
+            for name in tried
+            for meaning in self.possible
+            if meaning.unit == name and meaning.are_lengths is self.lengths
+        ]
+        if not named:  # counts with a scale are no usual unit
+            named = [m for m in meanings(self.values, self.legs, tried)
+                     if m.are_lengths is self.lengths]  # fmt: skip
+        fitting = [m for m in named if self.fits(m)]
+        if not fitting:
+            self._refuse_other(named)
+            fitting = [m for m in named if self.fits(m, moving=False)]
+        if fitting:
+            return fitting[0], origin
+        has_pulses = PULSES in self.units
         raise DatasetError(
-            f"{self._start}, needed {_needed(self.legs[0], has_pulses=self.has_pulses)}; correct "
-            "the travel of the model, or the table."
+            f"{self._start}, needed {_needed(self.legs[0], has_pulses=has_pulses)}; correct the "
+            "travel of the model, or the table."
         )
 
     def _stated_unit(self, option: str | None) -> str | None:
@@ -444,9 +422,9 @@ class _MotorsOfKind:
             does = "turns" if self.turning else "slides"
             raise DatasetError(
                 f"{self.path}: the unit could not be used: found {unit} of '{self.joints[0]}', "
-                f"which {does}, needed one of {', '.join(self.possible)}; correct the heading."
+                f"which {does}, needed one of {', '.join(self.units)}; correct the heading."
             )
-        if unit == PULSES and not self.has_pulses:
+        if unit == PULSES and PULSES not in self.units:
             raise DatasetError(
                 f"{self.path}: the readings could not be used: found pulses of servos of which "
                 "neither centre nor us for one degree is known, needed both; write centre_us and "
@@ -461,24 +439,22 @@ class _MotorsOfKind:
         quantity = "lengths of legs" if self.lengths else "readings"
         return f"{self.path}: the {quantity} could not be used: found {low:g} to {high:g}"
 
-    def _refuse_other(self, tried: Sequence[str]) -> None:
+    def _refuse_other(self, tried: Sequence[Meaning]) -> None:
         """Refuse values that fit in a unit outside *tried*, or as lengths instead of readings."""
-        for unit in (*tried, *(unit for unit in self.possible if unit not in tried)):
-            for as_lengths in (self.lengths, not self.lengths):
-                if (as_lengths and self.legs[0].actuator is not None) or not self.fits(
-                    unit, as_lengths
-                ):
-                    continue
-                remedies = []
-                if as_lengths is not self.lengths:
-                    remedies.append("leave out --lengths" if self.lengths else "add --lengths")
-                if unit not in tried:
-                    remedies.append(f"state the unit {unit} in the headings")
-                raise DatasetError(
-                    f"{self._start}, which look like "
-                    f"{'lengths of legs' if as_lengths else 'readings'} in {unit}; "
-                    f"{' and '.join(remedies)}."
-                )
+        units = [meaning.unit for meaning in tried]
+        others = [meaning for meaning in self.possible if meaning not in tried]
+        others.sort(key=lambda m: (m.unit not in units, m.are_lengths is not self.lengths))
+        for other in filter(self.fits, others):
+            remedies = []
+            if other.are_lengths is not self.lengths:
+                remedies.append("leave out --lengths" if self.lengths else "add --lengths")
+            if other.unit not in units:
+                remedies.append(f"state the unit {other.unit} in the headings")
+            raise DatasetError(
+                f"{self._start}, which look like "
+                f"{'lengths of legs' if other.are_lengths else 'readings'} in {other.unit}; "
+                f"{' and '.join(remedies)}."
+            )
 
 
 def _needed(leg: Leg, *, has_pulses: bool) -> str:

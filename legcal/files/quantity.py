@@ -182,20 +182,10 @@ def _prior(value: float, sigma: float, dimension: str = "") -> Quantity:
     """Return a prior; refuse numbers that make none."""
     if not math.isfinite(value):
         raise ValueError(f"found the value {value:g}, needed a finite one; correct it.")
-    if not math.isfinite(sigma) or sigma <= 0.0:
+    if not MIN_SIGMA <= sigma <= MAX_SIGMA:
         raise ValueError(
-            f"found the sigma {sigma:g}, needed a finite one above zero; give one standard "
-            "deviation, or fix the parameter."
-        )
-    if sigma < MIN_SIGMA:
-        raise ValueError(
-            f"found the sigma {sigma:g}, needed at least {MIN_SIGMA:g}; fix the parameter at "
-            "the value instead."
-        )
-    if sigma > MAX_SIGMA:
-        raise ValueError(
-            f"found the sigma {sigma:g}, needed at most {MAX_SIGMA:g}; free the parameter or "
-            "leave the prior out."
+            f"found the sigma {sigma:g}, needed one standard deviation from {MIN_SIGMA:g} to "
+            f"{MAX_SIGMA:g}; correct it, fix the parameter at the value, or leave the prior out."
         )
     return Quantity(value, sigma, dimension)
 

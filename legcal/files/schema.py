@@ -27,7 +27,7 @@ from pydantic_core import ErrorDetails
 
 from legcal.brief import brief
 from legcal.causes import Cause
-from legcal.errors import BadValue, Code, DatasetError, Problem
+from legcal.errors import BadValue, Code, DatasetError, LegcalError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
 _MOST_NAMES = 10  # maximum number of names in a hint
@@ -189,8 +189,8 @@ def _at(node: yaml.Node, actual: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=actual, problem_mark=node.start_mark)
 
 
-def content_of(path: Path, noun: str) -> bytes:
-    """Return the bytes of a file, or refuse it in a sentence."""
+def content_of(path: Path, noun: str, kind: type[LegcalError] = DatasetError) -> bytes:
+    """Return the bytes of a file, or refuse it in a sentence, by an error of a kind."""
     unread = Problem(
         f"the {noun} could not be read",
         remedy=f"check the path of the {noun}",
@@ -199,24 +199,26 @@ def content_of(path: Path, noun: str) -> bytes:
     )
     if not os.path.isfile(path):  # unlike that of a Path, False where a name is too long
         actual = "a folder" if os.path.isdir(path) else "no such file"
-        raise DatasetError(replace(unread, found=actual, needed="a file", code=Code.MISSING_FILE))
+        raise kind(replace(unread, found=actual, needed="a file", code=Code.MISSING_FILE))
     try:
         return read_bytes(path, MAX_TEXT)
     except TooLarge as error:
         bad = replace(unread, found=str(error.strerror), needed=f"at most {MAX_TEXT}")
-        raise DatasetError(bad) from error
+        raise kind(bad) from error
     except OSError as error:
         remedy = f"{unread.remedy} and its permissions"
         bad = replace(unread, found=f"'{error.strerror}'", needed="a readable file", remedy=remedy)
-        raise DatasetError(bad) from error
+        raise kind(bad) from error
 
 
-def read_yaml(path: Path, noun: str) -> dict[str, Any]:
+def read_yaml(path: Path, noun: str, kind: type[LegcalError] = DatasetError) -> dict[str, Any]:
     """Return the mapping that a YAML file holds, with its keys as text."""
-    return parse_yaml(content_of(path, noun), path, noun)
+    return parse_yaml(content_of(path, noun, kind), path, noun, kind)
 
 
-def parse_yaml(content: bytes, path: Path, noun: str) -> dict[str, Any]:
+def parse_yaml(
+    content: bytes, path: Path, noun: str, kind: type[LegcalError] = DatasetError
+) -> dict[str, Any]:
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
     unread = Problem(f"the {noun} could not be read", file=str(path), code=Code.BAD_SYNTAX)
     try:
@@ -225,14 +227,14 @@ def parse_yaml(content: bytes, path: Path, noun: str) -> dict[str, Any]:
         bad = replace(unread, found=str(error.problem), needed="YAML", remedy="mend that line")
         if mark := error.problem_mark:
             bad = replace(bad, line=mark.line + 1, columns=(str(mark.column + 1),))
-        raise DatasetError(bad) from error
+        raise kind(bad) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         actual, needed = _first_line(error), "YAML text in UTF-8"
     else:
         if isinstance(document, dict):
             return typing.cast("dict[str, Any]", document)
         actual, needed = _kind_of(document), "'key: value' lines"
-    raise DatasetError(replace(unread, found=actual, needed=needed, remedy="write the file again"))
+    raise kind(replace(unread, found=actual, needed=needed, remedy="write the file again"))
 
 
 def _loaded(content: bytes) -> Any:
@@ -258,14 +260,18 @@ def _kind_of(value: object) -> str:
 
 
 def validate(
-    schema: type[_Schema], document: Mapping[str, Any], path: Path, prefix: str = ""
+    schema: type[_Schema],
+    document: Mapping[str, Any],
+    path: Path,
+    prefix: str = "",
+    kind: type[LegcalError] = DatasetError,
 ) -> _Schema:
     """Validate a mapping by its schema; ``prefix`` is its key in the file."""
     try:
         return schema.model_validate(dict(document))
     except ValidationError as error:
         details = error.errors(include_url=False)
-        raise DatasetError([_problem(schema, e, path, prefix) for e in details]) from error
+        raise kind([_problem(schema, e, path, prefix) for e in details]) from error
 
 
 class _Short(reprlib.Repr):

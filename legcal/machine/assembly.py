@@ -1,7 +1,7 @@
 """A described machine put together: a pose in which it closes, lengths and axes of all legs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -14,12 +14,10 @@ from legcal.geometry.lines import cross
 from legcal.geometry.motions import frame_on_points, motion_of
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
-from legcal.machine.actuator import Actuator
 from legcal.machine.description import (
     Description,
     Home,
     LegEntry,
-    LegType,
     legs_in_words,
     wrong_axes,
     wrong_lengths,
@@ -38,24 +36,16 @@ PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
 
 
-@dataclass(frozen=True, eq=False)
-class AssembledLeg:
-    """A leg with all its numbers."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AssembledLeg(LegEntry):
+    """A leg with all its numbers; its axes are in the base link at home."""
 
-    name: str
-    type: LegType
-    kind: LegKind
-    A_base: Array  # (3,) joint centre in the base link [m], with its motor at reading 0
-    B_platform: Array  # (3,) joint centre in the platform link [m]
+    travel: tuple[float, float]  # lowest and highest reading [m]; (0, 0) for a constant leg
+    base_axis: Array  # (3,) of an R, or the outer one of a U
+    platform_axis: Array  # (3,) of an R, or the outer one of a U
     u: Array  # (3,) direction from A to B at home, in the base link
     q0: float  # length at reading zero, or of a constant leg [m]
-    travel: tuple[float, float]  # lowest and highest reading [m]; (0, 0) for a constant leg
-    tube: float | None  # radius of the half at the base [m]
-    rod: float | None  # radius of the half at the platform [m]
-    base_axis: Array  # (3,) of an R, or the outer one of a U, in the base link at home
-    platform_axis: Array  # (3,) of an R, or the outer one of a U, in the base link at home
-    actuator: Actuator | None = None  # the motor that carries A, in the base link
-    q_home: float = 0.0  # the reading of that motor at home [m or rad]
+    q_home: float  # the reading of the motor that carries A at home [m or rad]
 
     @property
     def shortest_shown(self) -> float:
@@ -63,16 +53,14 @@ class AssembledLeg:
         return self.q0 + min(max(0.0, self.travel[0]), self.travel[1])
 
 
-@dataclass(frozen=True, eq=False)
-class Assembled:
-    """A machine with all its numbers."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Assembled(Description):
+    """A machine with all its numbers; home is a pose in which it closes, as in the file."""
 
-    name: str
     legs: tuple[AssembledLeg, ...]
-    home: Home  # a pose in which it closes, as written to the file
+    home: Home
     base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
     planar: bool  # motion in the xy plane of base and platform
-    home_readings: Mapping[str, float] = field(default_factory=dict)  # as stated [m or rad]
 
     @property
     def T_base_platform(self) -> RigidTransform:
@@ -97,20 +85,17 @@ def assemble(described: Description) -> Assembled:
     legs, problems = [], []
     for j, entry in enumerate(described.legs):
         q = 0.0 if entry.actuator is None else readings[entry.actuator.joint]
-        axes = _axes(entry, tangents[j], T, q)
+        base_axis, platform_axis = axes = _axes(entry, tangents[j], T, q)
         problems += wrong_axes(described, entry, u[j], axes)
         q0, travel = _law(entry, float(lengths[j]))
-        legs.append(
-            AssembledLeg(
-                entry.name, entry.type, entry.kind, entry.A_base, entry.B_platform, u[j], q0,
-                travel, entry.tube, entry.rod, *axes, entry.actuator, q,
-            )
-        )  # fmt: skip
+        numbers = {"travel": travel, "base_axis": base_axis, "platform_axis": platform_axis}
+        legs.append(AssembledLeg(**(vars(entry) | numbers), u=u[j], q0=q0, q_home=q))
     _refuse(problems)
     planar = all_revolute(described) and is_planar(legs, T)
     frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
     at_home = {name: readings[name] for name in described.home_readings}
-    return Assembled(described.name, tuple(legs), home, frame, planar, at_home)
+    numbers = {"legs": tuple(legs), "home": home, "base_frame": frame, "home_readings": at_home}
+    return Assembled(**(vars(described) | numbers), planar=planar)
 
 
 def all_revolute(described: Description) -> bool:

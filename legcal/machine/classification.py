@@ -105,13 +105,7 @@ def is_actuator(step: Step, motors: Sequence[str]) -> bool:
 
 
 def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> None:
-    """Check that an actuator carries nothing but a rod.
-
-    Raises
-    ------
-    OutOfClass
-        If another motor or a slider follows.
-    """
+    """Check that an actuator carries nothing but a rod."""
     onward = [step.connection for step in steps[1:]]
     second = next((c.joint for c in onward if c.joint in motors), None)
     if second is not None:
@@ -130,13 +124,7 @@ def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> 
 
 
 def _check_moves(chain: LegChain, axis: Axis, within: float) -> None:
-    """Check that an actuator that turns moves the joint at A.
-
-    Raises
-    ------
-    OutOfClass
-        If A is on its axis.
-    """
+    """Check that an actuator that turns moves the joint at A."""
     turns = chain.steps[0].connection.type == "revolute"
     if turns and axis.distance(chain.A) < within:
         raise OutOfClass(
@@ -263,12 +251,7 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -
 
     Three or more revolutes whose axes meet in one point are an S, two that meet at right angles a
     U. A revolute along the leg (whose direction may not be determined yet) only spins it. *axes*
-    are ordered from base or platform to the leg.
-
-    Raises
-    ------
-    OutOfClass
-        If the axes do not meet *within* this distance [m], or those of a U are not perpendicular.
+    are ordered from base or platform to the leg, and meet *within* this distance [m].
     """
     spheres = [axis for axis in axes if axis.direction is None]
     if spheres:
@@ -385,11 +368,6 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
 
     A universal joint and a revolute along the leg are an S, at whichever end the revolute is: the
     leg twists freely. If there is an S already, further revolutes spin the leg idly.
-
-    Raises
-    ------
-    OutOfClass
-        If there is no S for them, or the base has no joint but a revolute along the leg.
     """
     spare = [len(base.spins), len(platform.spins)]
     ends = [base, platform]
@@ -440,11 +418,6 @@ def _rod(
 
     A revolute along the rod passes through both centres and could belong to either joint; it is
     assigned to the one nearer to its origin. *on* is the motor that carries the rod, for messages.
-
-    Raises
-    ------
-    OutOfClass
-        If no split gives two joints with one centre each and axes that the method supports.
     """
     splits: list[tuple[float, int, LegEnds]] = []
     problems: dict[int, OutOfClass] = {}
@@ -593,11 +566,6 @@ def _telescope(
     If a joint has a centre, the axis of the leg is the line through it along the slider. Between
     two R joints it is the line along the slider that meets both axes; if these are parallel (planar
     machines), it is at the height of the origin of the slider joint.
-
-    Raises
-    ------
-    OutOfClass
-        If that line misses a joint by more than *within* [m], or is not perpendicular to an axis.
     """
     u = towards * axes[slider].along  # a joint moves its child
     base = _pivot(axes[:slider], u, leg, within)

@@ -6,7 +6,7 @@ Sliders follow from the pose; joint angles are solved from the closures of the U
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, Problem
+from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.mobility import CLOSED, leg_scale
 from legcal.machine.model import Machine, readings_at, slider_columns
@@ -181,9 +181,7 @@ def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str)
     """Return the error of a pose at which the chain does not close."""
     place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
     return DidNotConverge(
-        Problem(
-            f"the legs could not be closed with the platform at {place} mm: "
-            f"{problem}; check that the legs reach this pose ({machine.urdf.wording.home}).",
-            file=str(machine.yaml_path),
-        )
+        f"the legs could not be closed with the platform at {place} mm: "
+        f"{problem}; check that the legs reach this pose ({machine.urdf.wording.home}).",
+        file=machine.yaml_path,
     )

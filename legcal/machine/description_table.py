@@ -7,14 +7,21 @@ for all legs, or a list with one (or null) for each leg.
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import BadValue, DatasetError, ModelError
@@ -51,52 +58,16 @@ from legcal.machine.firmware_files import firmware_table
 from legcal.machine.leg import MAX_LEGS, LegKind
 
 
-def _is_number(value: object) -> bool:
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
-    )
+def _needed(words: str) -> WrapValidator:
+    """Return a validator that refuses a value with one sentence, whatever is wrong inside it."""
 
+    def check(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return validated(value)
+        except ValidationError as error:
+            raise BadValue(describe(value), words, "correct it") from error
 
-def _is_radius(value: Any) -> bool:
-    if isinstance(value, dict):
-        return (
-            bool(value)
-            and value.keys() <= {"tube", "rod"}
-            and all(_is_number(x) and x > 0 for x in value.values())
-        )
-    return _is_number(value) and value > 0
-
-
-def _is_pair(value: object) -> bool:
-    """Return whether a value is one pair of readings."""
-    return isinstance(value, list) and len(value) == 2 and all(_is_number(x) for x in value)
-
-
-_NUMBER: dict[str, Any] = {
-    "type": "number",
-    "exclusiveMinimum": -MAX_NUMBER,
-    "exclusiveMaximum": MAX_NUMBER,
-}
-_POSITIVE = {**_NUMBER, "exclusiveMinimum": 0}
-_ROW = {"type": "array", "items": _NUMBER}
-
-
-def _schema_per_leg(of_leg: dict[str, Any]) -> WithJsonSchema:
-    """Return the JSON Schema of the input of :func:`_value_per_leg`."""
-    of_each = {"type": "array", "items": {"anyOf": [of_leg, {"type": "null"}]}}
-    return WithJsonSchema({"anyOf": [of_leg, of_each]})
-
-
-def _value_per_leg(fits: Callable[[Any], bool], needed: str) -> BeforeValidator:
-    """Return a validator of one value for all legs, or a list with one (or null) for each."""
-
-    def check(value: Any) -> Any:
-        of_each = isinstance(value, list) and all(x is None or fits(x) for x in value)
-        if not (of_each or fits(value)):
-            raise BadValue(describe(value), needed, "correct it")
-        return value
-
-    return BeforeValidator(check)
+    return WrapValidator(check)
 
 
 def _lower_first(value: Any) -> Any:
@@ -106,38 +77,15 @@ def _lower_first(value: Any) -> Any:
     return value
 
 
-def _points(value: Any) -> Any:
-    rows = value if isinstance(value, list) else [value]
-    for i, row in enumerate(rows):
-        if not (isinstance(row, list) and len(row) in (2, 3) and all(map(_is_number, row))):
-            needed = f"three numbers below {MAX_NUMBER:g}, x y z (two in the plane)"
-            raise BadValue(f"{describe(row)} in row {i + 1}", needed, "correct it")
-    return [[*row, 0.0][:3] for row in rows]
+def _is_pair(value: Any) -> bool:
+    """Return whether a travel is one pair of readings, for all legs."""
+    return bool(value) and not any(x is None or isinstance(x, list) for x in value)
 
 
-def _directions(value: Any) -> Any:
-    rows = value if isinstance(value, list) else [value]
-    for i, row in enumerate(rows):
-        fits = row is None or (
-            isinstance(row, list)
-            and len(row) == 3
-            and all(map(_is_number, row))
-            and float(np.linalg.norm(row)) > 1e-6
-        )
-        if not fits:
-            needed = "a direction of three numbers that are not all zero, or null for the default"
-            raise BadValue(f"{describe(row)} in row {i + 1}", needed, "correct it")
-    return rows
-
-
-def _kinds(value: Any) -> Any:
-    entries = value if isinstance(value, list) else [value]
-    names = [kind.value for kind in LegKind]
-    for kind in entries:
-        if kind is not None and kind not in names:
-            needed = f"{', '.join(names)}, one for all legs or a list"
-            raise BadValue(describe(kind), needed, "correct it")
-    return value
+def _not_zero(direction: list[float]) -> list[float]:
+    if not float(np.linalg.norm(direction)) > 1e-6:
+        raise ValueError
+    return direction
 
 
 def _type_of_leg(value: object) -> object:
@@ -155,47 +103,49 @@ def _type(value: object) -> object:
     return value
 
 
-Points = Annotated[
-    list[Any],
-    BeforeValidator(_points),
-    WithJsonSchema({"type": "array", "items": {**_ROW, "minItems": 2, "maxItems": 3}}),
+# One value for all legs, or a list with one (or null) for each
+Bounded = Annotated[Number, Field(gt=-MAX_NUMBER, lt=MAX_NUMBER)]
+Positive = Annotated[Number, Field(gt=0.0, lt=MAX_NUMBER)]
+Point = Annotated[
+    list[Bounded],
+    Field(min_length=2, max_length=3),
+    AfterValidator(lambda row: [*row, 0.0][:3]),
+    _needed(f"three numbers below {MAX_NUMBER:g}, x y z (two in the plane)"),
 ]
-Directions = Annotated[
-    list[Any],
-    BeforeValidator(_directions),
-    _schema_per_leg({**_ROW, "minItems": 3, "maxItems": 3}),
+Direction = Annotated[
+    list[Bounded],
+    Field(min_length=3, max_length=3),
+    AfterValidator(_not_zero),
+    _needed("a direction of three numbers that are not all zero, or null for the default"),
 ]
 Lengths = Annotated[
-    Any,
-    _value_per_leg(
-        _is_number, f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg"
-    ),
-    _schema_per_leg(_NUMBER),
+    Bounded | list[Bounded | None],
+    _needed(f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg"),
 ]
+Pair = Annotated[list[Bounded], Field(min_length=2, max_length=2)]
+Ends = Annotated[Pair, _needed("[lowest, highest] reading"), AfterValidator(_lower_first)]
 Travel = Annotated[
-    Any,
-    BeforeValidator(_lower_first),  # validators run from the last to the first
-    _value_per_leg(_is_pair, "[lowest, highest] reading, or a list with that pair (or null) a leg"),
-    _schema_per_leg({**_ROW, "minItems": 2, "maxItems": 2}),
+    Pair | list[Pair | None],
+    _needed("[lowest, highest] reading, or a list with that pair (or null) a leg"),
+    AfterValidator(_lower_first),
 ]
+Kinds = Annotated[
+    LegKind | list[LegKind | None],
+    _needed(f"{', '.join(kind.value for kind in LegKind)}, one for all legs or a list"),
+]
+
+
+class Radii(FileSchema):
+    """The radii of the two parts of a leg."""
+
+    tube: Positive | None = None
+    rod: Positive | None = None
+
+
 Radius = Annotated[
-    Any,
-    _value_per_leg(
-        _is_radius,
-        "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
-    ),
-    _schema_per_leg(
-        {
-            "anyOf": [
-                _POSITIVE,
-                {
-                    "type": "object",
-                    "properties": {"tube": _POSITIVE, "rod": _POSITIVE},
-                    "additionalProperties": False,
-                    "minProperties": 1,
-                },
-            ]
-        }
+    Positive | Radii | list[Positive | Radii | None],
+    _needed(
+        "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg"
     ),
 ]
 
@@ -207,28 +157,6 @@ class HomeEntry(FileSchema):
     height: Number | None = None
     quat_xyzw: Quaternion | None = None
     rpy_deg: Vector | None = None
-
-
-def _ends(value: Any) -> Any:
-    if not _is_pair(value):
-        raise BadValue(describe(value), "[lowest, highest] reading", "correct it")
-    return _lower_first(value)
-
-
-def _direction(value: Any) -> Any:
-    return None if value is None else _directions([value])[0]
-
-
-Ends = Annotated[
-    list[float],
-    BeforeValidator(_ends),
-    WithJsonSchema({**_ROW, "minItems": 2, "maxItems": 2}),
-]
-Direction = Annotated[
-    list[float],
-    BeforeValidator(_direction),
-    WithJsonSchema({**_ROW, "minItems": 3, "maxItems": 3}),
-]
 
 
 class ActuatorEntry(FileSchema):
@@ -300,19 +228,17 @@ class TableFile(FileSchema):
     type: Annotated[str | None, BeforeValidator(_type)] = None
     types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
     legs: list[PlainName] | None = None
-    base_joints: Points
-    platform_joints: Points
-    offsets: Lengths = None
-    lengths: Lengths = None
-    min_length: Lengths = None
-    max_length: Lengths = None
-    travel: Travel = None
-    radius: Radius = None
-    kinds: Annotated[
-        Any, BeforeValidator(_kinds), _schema_per_leg({"enum": [kind.value for kind in LegKind]})
-    ] = None
-    base_axes: Directions | None = None
-    platform_axes: Directions | None = None
+    base_joints: list[Point]
+    platform_joints: list[Point]
+    offsets: Lengths | None = None
+    lengths: Lengths | None = None
+    min_length: Lengths | None = None
+    max_length: Lengths | None = None
+    travel: Travel | None = None
+    radius: Radius | None = None
+    kinds: Kinds | None = None
+    base_axes: list[Direction | None] | None = None
+    platform_axes: list[Direction | None] | None = None
     actuators: Annotated[dict[PlainName, ActuatorEntry], Field(min_length=1)] | None = None
     hangs_on: list[str | None] | None = None
     home: HomeEntry | None = None
@@ -322,17 +248,44 @@ class TableFile(FileSchema):
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
 
     @property
+    def n(self) -> int:
+        """The number of legs."""
+        return len(self.base_joints)
+
+    def per_leg(self, key: str) -> list[Any]:
+        """Return the entry of each leg under a key; one value is that of all legs."""
+        value = getattr(self, key)
+        return [value] * self.n if self.is_for_all(key) else value
+
+    def is_for_all(self, key: str) -> bool:
+        """Return whether an entry is one value for all legs."""
+        value = getattr(self, key)
+        return not isinstance(value, list) or (key == "travel" and _is_pair(value))
+
+    @property
     def leg_names(self) -> list[str]:
         """The names of the legs, their numbers by default."""
-        return self.legs or [f"leg{j + 1}" for j in range(len(self.base_joints))]
+        return self.legs or [f"leg{j + 1}" for j in range(self.n)]
 
     @property
     def motors_of_legs(self) -> list[str | None]:
         """The motor that carries each leg: as stated, or in the order of the motors."""
-        n, motors = len(self.base_joints), list(self.actuators or ())
-        if self.hangs_on is None:
-            return [*motors] if len(motors) == n else [None] * n
-        return self.hangs_on
+        if self.hangs_on is not None:
+            return self.hangs_on
+        motors = list(self.actuators or ())
+        return [*motors] if len(motors) == self.n else [None] * self.n
+
+    @property
+    def leg_types(self) -> list[LegType]:
+        """The types of the legs."""
+        texts = self.types or [(self.type or "").split("-")[-1]] * self.n
+        return [type_ for text in texts if (type_ := leg_type(text)) is not None]
+
+    def metres(self, value: Any) -> Any:
+        """Return a length, or a list of lengths and nulls, in metres."""
+        if isinstance(value, list | tuple):
+            return [self.metres(x) for x in value]
+        return None if value is None else in_metres(value, self.unit)
 
 
 OPTIONS = {
@@ -359,10 +312,7 @@ def read_description(
     them; ``effector`` is the radius of the joints on the effector of a printer, in that unit.
     """
     given = {} if given is None else given
-    try:
-        content = content_of(path, FILE_KIND).decode("utf-8-sig", errors="replace")
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+    content = content_of(path, FILE_KIND, ModelError).decode("utf-8-sig", errors="replace")
     if (of_firmware := firmware_table(path, content, unit, given, effector)) is not None:
         table, notes = of_firmware
         stated = {"name": name} if name is not None else {}
@@ -378,25 +328,25 @@ def read_description(
             f"{path}: --platform-radius could not be used: found a table of joints, needed the "
             "configuration of a printer, or --family; write the joints in the table."
         )
-    try:
-        if _is_csv(path, content):
+    if _is_csv(path, content):
+        try:
             table = read_columns(path, unit)
-            table["name"] = name or table["name"]
-            if not is_plain_name(table["name"]) and name is None:
-                raise DatasetError(
-                    f"{path}: the model could not be named after the file: found "
-                    f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
-                    "give it a name with --name NAME."
-                )
-        else:
-            table = read_yaml(path, FILE_KIND)
-            table = {key: value for key, value in table.items() if value is not None}
-            if name is not None:
-                table["name"] = name
-            if unit is not None:
-                table.setdefault("unit", unit)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+        except DatasetError as error:
+            raise ModelError(error.facts) from error
+        table["name"] = name or table["name"]
+        if not is_plain_name(table["name"]) and name is None:
+            raise ModelError(
+                f"{path}: the model could not be named after the file: found "
+                f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
+                "give it a name with --name NAME."
+            )
+    else:
+        table = read_yaml(path, FILE_KIND, ModelError)
+        table = {key: value for key, value in table.items() if value is not None}
+        if name is not None:
+            table["name"] = name
+        if unit is not None:
+            table.setdefault("unit", unit)
     _refuse_twice(path, table, given)
     if "version" in table and "legcal_table" not in table:
         raise ModelError(
@@ -429,10 +379,7 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     ModelError
         With one sentence for each entry that is impossible or contradicts others.
     """
-    try:
-        file = validate(TableFile, table, source)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+    file = validate(TableFile, table, source, kind=ModelError)
     problems = _conflicting_entries(file, str(source))
     if problems:
         raise ModelError(problems)
@@ -470,12 +417,6 @@ def in_metres(value: float, unit: str) -> float:
     return float(Decimal(repr(float(value))) * Decimal(repr(LENGTH[unit])))
 
 
-def _types(file: TableFile, n: int) -> list[LegType]:
-    """Return the types of the legs."""
-    texts = file.types or [(file.type or "").split("-")[-1]] * n
-    return [type_ for text in texts if (type_ := leg_type(text)) is not None]
-
-
 def _conflicting_entries(file: TableFile, source: str) -> list[str]:
     """Return the contradictions between counts, names and types of a table."""
     if (file.type is None) == (file.types is None):
@@ -484,20 +425,14 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             f"{source}: the legs could not be read: found {stated} of type and types, needed "
             "one: 'type: 6-UPS', or 'types' with one entry for each leg, or --type UPS."
         ]
-    n = len(file.base_joints)
-    problems = []
+    n, problems = file.n, []
     for key in (
         "platform_joints", "types", "legs", "offsets", "lengths", "min_length", "max_length",
         "travel", "radius", "kinds", "base_axes", "platform_axes", "hangs_on",
     ):  # fmt: skip
-        value = getattr(file, key)
-        if (
-            isinstance(value, list)
-            and not (key == "travel" and _is_pair(value))
-            and len(value) != n
-        ):
+        if getattr(file, key) is not None and (count := len(file.per_leg(key))) != n:
             problems.append(
-                f"{source}: {key} could not be used: found {len(value)} entries and {n} "
+                f"{source}: {key} could not be used: found {count} entries and {n} "
                 "base_joints, needed one for each leg; correct their number."
             )
     parts = (file.type or "").split("-")
@@ -545,7 +480,7 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
         for name, entry in actuators.items()
         if (problem := entry.problem(file.unit)) is not None
     ]
-    for leg, type_, motor in zip(names, _types(file, len(names)), motors, strict=False):
+    for leg, type_, motor in zip(names, file.leg_types, motors, strict=False):
         where = f"{source}: leg '{leg}' could not be used"
         if motor is not None and motor not in actuators:
             missing = f"'{motor}' in hangs_on, which is not among actuators; "
@@ -574,7 +509,7 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
         for name in actuators
         if name not in motors
     ]
-    lengths = _entries_per_leg(file.lengths, len(names))
+    lengths = file.per_leg("lengths")
     lacking = [
         leg
         for leg, motor, length in zip(names, motors, lengths, strict=False)
@@ -599,15 +534,14 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
             name,
             ActuatorKind.REVOLUTE if entry.turns else ActuatorKind.PRISMATIC,
             np.asarray(along / np.linalg.norm(along)),
-            np.array([in_metres(x, file.unit) for x in at]),
+            np.array(file.metres(at)),
             entry.travel_in_metres(file.unit),
             f"{name}_link",
             pulses=entry.pulses,
         )
         if entry.arm_radius is not None:
-            joints = np.array([[in_metres(x, file.unit) for x in joint] for joint in A])
-            radius = in_metres(entry.arm_radius, file.unit)
             first = file.leg_names[motors.index(name)]
+            joints, radius = np.array(file.metres(A)), file.metres(entry.arm_radius)
             actuators[name] = actuators[name].with_arm(joints, radius, first)
     return actuators
 
@@ -615,7 +549,7 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
 def _home_readings(file: TableFile) -> dict[str, float]:
     """Return the stated readings of motors at home [m or rad]."""
     return {
-        **{name: in_metres(q, file.unit) for name, q in (file.home_readings or {}).items()},
+        **{name: file.metres(q) for name, q in (file.home_readings or {}).items()},
         **{name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
     }
 
@@ -665,10 +599,8 @@ def _wrong_home(file: TableFile, source: str) -> list[str]:
 def _wrong_lengths(file: TableFile, source: str) -> list[str]:
     """Return the problems of shortest and longest lengths: missing, redundant or impossible."""
     problems = []
-    n = len(file.base_joints)
-    for name, low, high, _, travel in zip(
-        file.leg_names, *(_entries_per_leg(value, n) for value in _laws(file)), strict=False
-    ):
+    laws = map(file.per_leg, ("min_length", "max_length", "travel"))
+    for name, low, high, travel in zip(file.leg_names, *laws, strict=False):
         if low is None and high is None:
             continue
         conflict = ""
@@ -688,35 +620,19 @@ def _wrong_lengths(file: TableFile, source: str) -> list[str]:
     return problems
 
 
-def _laws(file: TableFile) -> tuple[Any, ...]:
-    """Return the entries of the length law: shortest, longest, at reading zero, travel."""
-    travel = [file.travel] * len(file.base_joints) if _is_pair(file.travel) else file.travel
-    return file.min_length, file.max_length, file.offsets, travel
-
-
-def _entries_per_leg(value: Any, n: int) -> list[Any]:
-    """Return a list with an entry for each leg."""
-    return value if isinstance(value, list) else [value] * n
-
-
 def _useless_entries(file: TableFile, source: str) -> list[str]:
     """Return the problems of entries for legs whose type does not have them."""
-    names = file.leg_names
-    has_slider = [leg.has_slider for leg in _types(file, len(names))]
-    problems = []
+    names, problems = file.leg_names, []
     for key, of_sliders in (
         ("lengths", False), ("offsets", True), ("travel", True),
         ("min_length", True), ("max_length", True),
     ):  # fmt: skip
-        value = getattr(file, key)
-        shared = not isinstance(value, list) or _is_pair(value)
-        entries = [value] * len(names) if shared else value
         useless = [
             leg
-            for leg, entry, slides in zip(names, entries, has_slider, strict=False)
-            if entry is not None and slides is not of_sliders
+            for leg, entry, type_ in zip(names, file.per_leg(key), file.leg_types, strict=False)
+            if entry is not None and type_.has_slider is not of_sliders
         ]
-        if useless and not (shared and len(useless) < len(names)):
+        if useless and not (file.is_for_all(key) and len(useless) < len(names)):
             with_p, without_p = ("with", "without") if of_sliders else ("without", "with")
             problems.append(
                 f"{source}: {key} could not be used: found an entry for leg '{useless[0]}', whose "
@@ -728,52 +644,40 @@ def _useless_entries(file: TableFile, source: str) -> list[str]:
 
 def _description(file: TableFile, source: str) -> Description:
     """Return the machine of a table, in metres."""
-    n = len(file.base_joints)
-
-    def metres(value: Any) -> Any:
-        if isinstance(value, list):
-            return [metres(x) for x in value]
-        return None if value is None else in_metres(value, file.unit)
-
-    def per_leg(value: Any) -> list[Any]:
-        return _entries_per_leg(value, n)
-
-    names, actuators, motors = file.leg_names, _actuators(file), file.motors_of_legs
-    laws = [_entries_per_leg(value, n) for value in _laws(file)]
+    actuators, per_leg = _actuators(file), file.per_leg
+    laws = map(per_leg, ("min_length", "max_length", "offsets", "lengths", "travel"))
     notes = list[str]()
     legs = []
-    for j, (name, kind_of_leg, kind, radius) in enumerate(
-        zip(names, _types(file, n), per_leg(file.kinds), per_leg(file.radius), strict=True)
-    ):
-        tube, rod = _radii(radius, file.unit)
-        constant = not kind_of_leg.has_slider
-        default = LegKind.CONSTANT if constant else LegKind.ACTUATED
-        kind = default if kind is None or constant else LegKind(kind)
-        low, high, offset, limits = (law[j] for law in laws)
-        if constant:
-            offset = per_leg(file.lengths)[j]
-        elif low is not None:
+    for j, (name, type_, kind, radius, motor, law) in enumerate(
+        zip(
+            file.leg_names, file.leg_types, per_leg("kinds"), per_leg("radius"),
+            file.motors_of_legs, zip(*laws, strict=True), strict=True,
+        )
+    ):  # fmt: skip
+        low, high, offset, length, limits = law
+        if not type_.has_slider:
+            kind, offset, limits = LegKind.CONSTANT, length, None
+        kind = kind or LegKind.ACTUATED
+        if type_.has_slider and low is not None:
             if offset is None and kind is LegKind.ACTUATED:
                 offset = low
                 notes = [
                     "Readings are assumed to be zero at the shortest length of a leg (min_length): "
                     "give offsets, the length at reading zero, if they are not."
                 ]
-            limits = [
-                _decimal_difference(low, offset or 0.0),
-                _decimal_difference(high, offset or 0.0),
-            ]
-        reads_length = kind is LegKind.PASSIVE and offset is None  # a single pair means readings
-        limits = metres(limits)
-        if constant or (reads_length and _is_pair(file.travel)):
-            limits = None
+            limits = [_decimal_difference(end, offset or 0.0) for end in (low, high)]
+        if kind is LegKind.PASSIVE and offset is None and _is_pair(file.travel):
+            limits = None  # a single pair means readings
+        tube, rod = (radius.tube, radius.rod) if isinstance(radius, Radii) else (radius, radius)
         legs.append(
             LegEntry(
-                name, kind_of_leg, kind,
-                np.array(metres(file.base_joints[j])), np.array(metres(file.platform_joints[j])),
-                metres(offset), None if limits is None else (limits[0], limits[1]), tube, rod,
+                name, type_, kind,
+                np.array(file.metres(file.base_joints[j])),
+                np.array(file.metres(file.platform_joints[j])),
+                file.metres(offset), None if limits is None else tuple(file.metres(limits)),
+                file.metres(tube), file.metres(rod),
                 _unit_axis(file.base_axes, j), _unit_axis(file.platform_axes, j),
-                None if (motor := motors[j]) is None else actuators[motor],
+                None if motor is None else actuators[motor],
             )
         )  # fmt: skip
     frame = None if file.base_frame is None else tuple(file.base_frame)
@@ -794,15 +698,6 @@ def _decimal_difference(minuend: float, subtrahend: float) -> float:
     return float(Decimal(repr(float(minuend))) - Decimal(repr(float(subtrahend))))
 
 
-def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
-    radii = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
-    tube, rod = (
-        None if radii.get(part) is None else in_metres(radii[part], unit)
-        for part in ("tube", "rod")
-    )
-    return tube, rod
-
-
 def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
     """Return the unit vector of one direction of a list, None if it has none."""
     if axes is None or axes[j] is None:
@@ -814,7 +709,7 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
 def _home(file: TableFile) -> Home | None:
     if file.home is None or file.home.xyz is None:
         return None
-    xyz = tuple(in_metres(x, file.unit) for x in file.home.xyz)
+    xyz = tuple(file.metres(file.home.xyz))
     if file.home.quat_xyzw is not None:
         return Home(xyz, file.home.quat_xyzw)
     return Home.of(xyz, _turn(file.home))

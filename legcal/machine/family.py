@@ -2,19 +2,25 @@
 
 The hexapod has its joints in pairs on two circles. The Delta has three arms, level at reading 0,
 that sink with the reading, and two parallel rods on each. For further numbers, edit the table that
-``legcal new --template`` writes.
+``legcal new --template`` writes: a family as commented YAML, a hexapod also as CSV.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
 
-from legcal.errors import UsageError
+from legcal.errors import OutOfResources, UsageError
+from legcal.files.folder import write_atomically
+from legcal.files.published import with_schema
 from legcal.files.quantity import LENGTH
+from legcal.files.schema import plain_name
 from legcal.geometry.types import Array
 from legcal.machine.description import Description, leg_type
 from legcal.machine.description_table import described_machine, read_description
@@ -279,6 +285,72 @@ FAMILIES = {
         _delta,
     ),
 }
+
+
+def write_template(folder: Path, given: Dimensions, *, force: bool = False) -> list[Path]:
+    """Write ``NAME.yaml``, and ``NAME.csv`` of a hexapod; existing files only with *force*.
+
+    The numbers are of a family with the given dimensions.
+    """
+    family = str(given.family or "hexapod").lower()
+    name = str(given.name or f"my-{family}")
+    try:
+        plain_name(name)
+    except ValueError as error:
+        raise UsageError(f"The name of the template could not be used: {error}") from error
+    table = family_table(replace(given, family=family, name=name))
+    tables = {folder / f"{name}.yaml": with_schema("table", _yaml(table))}
+    if "actuators" not in table:
+        tables[folder / f"{name}.csv"] = _csv(table)
+    there = [str(path) for path in tables if os.path.lexists(path)]
+    if there and not force:
+        raise UsageError(
+            f"{folder}: the template could not be written: found {' and '.join(there)} already "
+            "there, needed new files; give another --name or --output, or --force to replace them."
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, content in tables.items():
+            write_atomically(path, content.encode())
+    except OSError as error:
+        raise OutOfResources(
+            f"{folder}: the template could not be written: found '{error.strerror}', needed a "
+            "folder that takes it; free space, correct permissions, or give another --output."
+        ) from error
+    return list(tables)
+
+
+def _yaml(table: dict[str, Any]) -> str:
+    """Return a table of a family as commented YAML, from the text in ``templates``."""
+    shown = {key: _flow(value) for key, value in table.items()}
+    for key in ("base_joints", "platform_joints"):
+        shown[key] = "\n".join(f"  - {_flow(joint)}" for joint in table[key])
+    motors = table.get("actuators", {})
+    shown["actuators"] = "\n".join(f"  {key}: {_flow(entry)}" for key, entry in motors.items())
+    template = files("legcal.machine") / "templates" / f"{'delta' if motors else 'hexapod'}.yaml"
+    return Template(template.read_text(encoding="utf-8")).substitute(shown)
+
+
+def _csv(table: dict[str, Any]) -> str:
+    """Return the table of a hexapod as CSV."""
+    leg_type = table["type"].split("-")[-1]
+    lengths = [table.get("min_length", ""), table.get("max_length", "")]
+    radii = [table["radius"]["tube"], table["radius"]["rod"]]
+    lines = ["leg,type,bx,by,bz,px,py,pz,min_length,max_length,tube,rod,unit"]
+    joints = zip(table["base_joints"], table["platform_joints"], strict=True)
+    for j, (A, B) in enumerate(joints, start=1):
+        cells: Sequence[Any] = [f"leg{j}", leg_type, *A, *B, *lengths, *radii, table["unit"]]
+        lines.append(",".join(_flow(cell) for cell in cells))
+    return "\n".join(lines) + "\n"
+
+
+def _flow(value: Any) -> str:
+    """Return a value as YAML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_flow(x)}" for key, x in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_flow, value)) + "]"
+    return f"{value:.7g}" if isinstance(value, float) else str(value)
 
 
 def flag(name: str) -> str:

@@ -1,11 +1,30 @@
-"""Finding and reading the files of a mechanism, from a path, a folder or a shipped name."""
+"""The files of a mechanism: finding and reading them, and writing its YAML."""
 
 import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Any
 
-from legcal.errors import Code, DatasetError, ModelError, Problem
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from legcal.errors import BadValue, Code, ModelError, Problem, Problems
 from legcal.files.folder import RESULT
-from legcal.files.schema import content_of
+from legcal.files.motions import MotionEntry
+from legcal.files.published import with_schema
+from legcal.files.schema import (
+    FileSchema,
+    Number,
+    PlainName,
+    Version,
+    closest,
+    content_of,
+    parse_yaml,
+    validate,
+)
+from legcal.machine.actuator import Actuator
+from legcal.machine.tolerance import BuiltEntry
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -32,49 +51,48 @@ def find_model(model: str | Path) -> Path:
     """
     path = Path(model)
     names = shipped_names()
-    is_shipped = str(model) in names
-    if os.path.isdir(path) and not is_shipped:
-        if (path / FOLDER_YAML).is_file():
-            return path / FOLDER_YAML
-        if (path / RESULT_YAML).is_file():
-            if RESULT.is_in(path):
-                return path / RESULT_YAML
-            raise ModelError(
-                "the mechanism could not be read",
-                f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
-                "both",
-                f"copy the result folder again, or give {path / RESULT_YAML} if it is the "
-                "model that you mean",
-                path,
-            )
-        if (path / DATASET_YAML).is_file():
-            raise ModelError(what_a_dataset_is_for(path))
-        raise ModelError(
-            "the mechanism could not be read",
-            f"a folder without {FOLDER_YAML}",
-            "a folder with it, a result folder, or a YAML, URDF or MJCF file",
-            "give the file",
-            path,
-        )
-    if os.path.exists(path) and not os.path.isdir(path):
-        if path.suffix.lower() == ".csv":
-            raise ModelError(
-                "the mechanism could not be read: found a CSV file, needed a mechanism YAML, "
-                f"URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR",
-                file=path,
-            )
-        return path
-    if is_shipped:
-        return shipped_folder("models") / f"{model}.yaml"
-    raise ModelError(
-        Problem(
-            "the mechanism could not be read",
+    refused = "the mechanism could not be read"
+    if str(model) in names:
+        return path if os.path.isfile(path) else shipped_folder("models") / f"{model}.yaml"
+    if not os.path.exists(path):
+        bad = Problem(
+            refused,
             "no such file and no shipped model of that name",
             f"a mechanism YAML, its URDF, or one of {', '.join(names)}",
             "check the path",
             str(path),
             code=Code.MISSING_FILE,
         )
+        raise ModelError(bad)
+    if not os.path.isdir(path):
+        if path.suffix.lower() == ".csv":
+            raise dimensions_alone("a CSV file", path)
+        return path
+    if (path / FOLDER_YAML).is_file():
+        return path / FOLDER_YAML
+    if RESULT.is_in(path) and (path / RESULT_YAML).is_file():
+        return path / RESULT_YAML
+    if (path / RESULT_YAML).is_file():
+        raise ModelError(
+            refused,
+            f"{RESULT_YAML} and no whole {RESULT.marker} of a calibration",
+            "both",
+            f"copy the result folder again, or give {path / RESULT_YAML} if it is the model that "
+            "you mean",
+            path,
+        )
+    if (path / DATASET_YAML).is_file():
+        raise ModelError(what_a_dataset_is_for(path))
+    needed = "a folder with it, a result folder, or a YAML, URDF or MJCF file"
+    raise ModelError(refused, f"a folder without {FOLDER_YAML}", needed, "give the file", path)
+
+
+def dimensions_alone(kind: str, path: Path) -> ModelError:
+    """Return the refusal of a file that holds dimensions of a machine but is no model."""
+    return ModelError(
+        f"the mechanism could not be read: found {kind}, needed a mechanism YAML, URDF or MJCF "
+        f"file; make a model of its dimensions with: legcal new {path} -o DIR",
+        file=path,
     )
 
 
@@ -98,27 +116,20 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
     for path in near:
         if path.is_file():
             return path
-    raise ModelError(
-        Problem(
-            f"the URDF of the mechanism could not be found: looked for {near[0]} and "
-            f"{near[1]}, needed one of them; write its path in legcal.urdf.",
-            file=str(yaml_path),
-            code=Code.MISSING_FILE,
-        )
+    bad = Problem(
+        "the URDF of the mechanism could not be found",
+        f"neither {near[0]} nor {near[1]}",
+        "one of them",
+        "write its path in legcal.urdf",
+        str(yaml_path),
+        code=Code.MISSING_FILE,
     )
-
-
-def read_file(path: Path, kind: str) -> bytes:
-    """Return the bytes of a mechanism file."""
-    try:
-        return content_of(path, kind)
-    except DatasetError as error:
-        raise ModelError(error.facts) from error
+    raise ModelError(bad)
 
 
 def is_xml(path: Path) -> bool:
     """Return whether a file of a mechanism is XML, by its content."""
-    return read_file(path, "mechanism file").lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    return content_of(path, FILE_KIND, ModelError).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
 def yaml_of_urdf(path: Path) -> Path | None:
@@ -130,3 +141,157 @@ def yaml_of_urdf(path: Path) -> Path | None:
 def _sibling(path: Path, folder: str) -> Path:
     """Return the path of a file of the same name in a sibling folder."""
     return path.resolve().parent.parent / folder / path.name
+
+
+FILE_KIND = "mechanism file"
+MAX_LOOPS = 100
+GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a wrong unit
+MAX_GAIN_ERROR = 1e-12  # tolerance of a gain of 1
+
+
+class MotorEntry(FileSchema):
+    """Numbers of a motor that carries rods which have no place in a URDF."""
+
+    gain: Annotated[Number, Field(ge=GAINS[0], le=GAINS[1])] = 1.0  # motion over reading
+    centre_us: Number | None = None  # pulse at joint value 0 [us], of a hobby servo
+    us_per_deg: Number | None = None  # negative if longer pulses turn it backwards
+
+
+class LegcalBlock(BuiltEntry):
+    """The block ``legcal``: what belongs to base, platform and legs.
+
+    Missing entries are proposed, see :mod:`legcal.machine.topology`.
+    """
+
+    version: Version
+    urdf: str | None = None
+    base: str
+    platform: str
+    platform_joint: str | None = None
+    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+    home: MotionEntry | None = None
+    home_readings: dict[str, float] | None = None  # readings of actuators at home [m or rad]
+    motors: dict[str, MotorEntry] | None = None  # motors that carry rods, by joint
+    legs: Annotated[dict[PlainName, str], Field(min_length=1)]
+
+    @field_validator("base_frame")
+    @classmethod
+    def _different(cls, value: list[str] | None) -> list[str] | None:
+        if value is None:
+            return None
+        repeated = sorted({name for name in value if value.count(name) > 1})
+        if repeated:
+            raise BadValue(
+                f"the leg '{repeated[0]}' more than once", "different legs", "name each once"
+            )
+        return value
+
+
+class MechanismFile(BaseModel):
+    """A mechanism YAML; keys of other programs are ignored."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore")
+
+    closed_loop: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
+    type: list[str]
+    name_mot: list[str]
+    joint_name: list[str] = []
+    joint_type: list[str] = []
+    legcal: LegcalBlock | None = None
+
+    @field_validator("type")
+    @classmethod
+    def _small_letters(cls, value: list[str]) -> list[str]:
+        return [kind.lower() for kind in value]
+
+
+def read_mechanism_file(path: Path) -> MechanismFile:
+    """Return a mechanism YAML, checked in itself (names are checked against the URDF later)."""
+    content = content_of(path, FILE_KIND, ModelError)
+    lines = (line.strip() for line in content.splitlines())
+    first = next((line for line in lines if line and line[:1] not in b"#;"), b"")
+    for kind, pattern in _OTHER_TEXT.items():
+        if pattern.match(first):
+            raise dimensions_alone(kind, path)
+    document = parse_yaml(content, path, FILE_KIND, ModelError)
+    if "legcal_table" in document:
+        raise dimensions_alone("a table of legs (legcal_table)", path)
+    if path.name == DATASET_YAML:
+        raise ModelError(what_a_dataset_is_for(path))
+    optional = ("joint_name", "joint_type")  # YAML reads an empty list as null
+    stated = {k: v for k, v in document.items() if v is not None or k not in optional}
+    file = validate(MechanismFile, stated, path, kind=ModelError)
+    _check_contradictions(file, path)
+    return file
+
+
+_OTHER_TEXT = {  # kinds of files of other programs, by the first line that is no comment
+    "a HAL file of LinuxCNC": re.compile(rb"(loadrt|loadusr|setp|net|addf)\s"),
+    "a configuration with [sections]": re.compile(rb"\[[\w .:-]+\]\s*([#;].*)?$"),
+    "G-code": re.compile(rb"[GM]\d+(\s|$)"),
+}
+
+
+def _check_contradictions(file: MechanismFile, path: Path) -> None:
+    """Refuse contradictions within the file."""
+    problems, n_pairs = Problems(path), len(file.closed_loop)
+    refused = "the loops could not be closed"
+    if len(file.type) != n_pairs:
+        counts = f"{n_pairs} pairs in closed_loop and {len(file.type)} entries in type"
+        problems.add(refused, counts, "equal numbers", "write one type for each pair")
+    needed = "'3d' (points coincide) or '6d' (frames coincide)"
+    for i, kind in enumerate(file.type):
+        if kind not in ("3d", "6d"):
+            problems.add(f"type.{i} could not be used", f"'{kind}'", needed, "correct it")
+    if n_pairs > MAX_LOOPS:
+        at_most = f"at most {MAX_LOOPS}"
+        problems.add(refused, f"{n_pairs} pairs in closed_loop", at_most, "give one mechanism")
+    if not n_pairs:
+        problems.add(
+            "the mechanism could not be closed",
+            "no pair in closed_loop",
+            "the loops of a parallel mechanism",
+            "write the pairs of frames that coincide",
+        )
+    if len(file.joint_name) != len(file.joint_type):
+        counts = f"{len(file.joint_name)} names and {len(file.joint_type)} entries in joint_type"
+        refused, remedy = "joint_name could not be used", "write one type for each joint"
+        problems.add(refused, counts, "equal numbers", remedy)
+    for name in sorted({name for name in file.name_mot if file.name_mot.count(name) > 1}):
+        refused, remedy = "name_mot could not be used", "remove the repetition"
+        problems.add(refused, f"'{name}' more than once", "each motor once", remedy)
+    legs = file.legcal.legs if file.legcal else {}
+    for name in (file.legcal and file.legcal.base_frame) or ():
+        if name not in legs:
+            refused, remedy = "legcal.base_frame could not be used", closest(name, legs)
+            problems.add(refused, f"'{name}', which is not a leg", remedy=remedy)
+    problems.raise_if_any()
+
+
+def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
+    """Return the YAML entries of actuators that a URDF cannot hold, by joint."""
+    entries = dict[str, dict[str, float]]()
+    for actuator in actuators:
+        entry = {} if abs(actuator.gain - 1.0) <= MAX_GAIN_ERROR else {"gain": actuator.gain}
+        if actuator.pulses is not None:
+            entry["centre_us"] = actuator.pulses.centre
+            entry["us_per_deg"] = actuator.pulses.per_degree
+        if entry:
+            entries[actuator.joint] = entry
+    return entries
+
+
+def mechanism_yaml(
+    loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
+) -> str:
+    """Return the YAML of a mechanism from closures (two frames, kind), motors and block."""
+    document = {
+        "closed_loop": [[first, second] for first, second, _ in loops],
+        "type": [kind for *_, kind in loops],
+        "name_mot": motors,
+        "joint_name": [],
+        "joint_type": [],
+        "legcal": {"version": 1, **legcal},
+    }
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
+    return with_schema("mechanism", text)

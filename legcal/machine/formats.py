@@ -16,14 +16,22 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, OutOfClass, Problem, UsageError
-from legcal.files.schema import closest
+from legcal.errors import ModelError, OutOfClass, Problems, UsageError
+from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link, rigid_bodies
 from legcal.machine.drawn_state import completed, is_drawn_closed, with_held_joints
-from legcal.machine.files import find_model, find_urdf, is_xml, read_file, yaml_of_urdf
+from legcal.machine.files import (
+    FILE_KIND,
+    MAX_LOOPS,
+    MechanismFile,
+    find_model,
+    find_urdf,
+    is_xml,
+    read_mechanism_file,
+    yaml_of_urdf,
+)
 from legcal.machine.mjcf import read_mjcf_source
-from legcal.machine.schema import MAX_LOOPS, MechanismFile, read_mechanism_file
 from legcal.machine.spanning_tree import (
     Loop,
     LoopKind,
@@ -76,56 +84,42 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
         return source  # refused later, with the location of the name
     source = with_held_joints(source)
     if source.file.legcal is not None:
+        check_one_mechanism(source)
         is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
         return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
     if base is not None or platform is not None:
         source = with_held_joints(_of_stated(source))
-    check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    check_one_mechanism(source)
     if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
         source = _with_arms_as_motors(source)
     return completed(source)
 
 
 def _check_stated(source: Source, base: str | None, platform: str | None) -> None:
-    """Check the links that are stated for a file.
-
-    Raises
-    ------
-    UsageError
-        If the file names others itself, or has no such link.
-    """
+    """Refuse links stated for a file that names others itself, or has no such link."""
+    problems = Problems(source.path)
     for option, link in (("--base", base), ("--platform", platform)):
-        if link is None:
-            continue
-        if source.file.legcal is not None:
-            raise UsageError(
+        if link is not None and source.file.legcal is not None:
+            problems.add(
                 f"{option} could not be used",
                 "a file with a block legcal, which names base and platform",
                 "a file without it",
                 f"write '{link}' in legcal.{option.removeprefix('--')}",
-                source.path,
             )
-        if link not in source.urdf.links:
-            raise UsageError(
-                f"{option} could not be used",
-                f"the link '{link}', which is not in the file",
-                "",
-                closest(link, source.urdf.links),
-                source.path,
-            )
+        elif link is not None and link not in source.urdf.links:
+            absent = f"the link '{link}', which is not in the file"
+            remedy = closest(link, source.urdf.links)
+            problems.add(f"{option} could not be used", absent, remedy=remedy)
+    problems.raise_if_any(UsageError)
 
 
 def _of_stated(source: Source) -> Source:
     """Return a file with the loops of that mechanism alone whose platform or base is stated."""
-    loops = source.file.closed_loop
+    loops, kinds = source.file.closed_loop, source.file.type
+    groups = moving_groups(source.urdf, loops)
     stated = {source.base, source.platform}
-    mine = {
-        link
-        for links, _ in moving_groups(source.urdf, loops)
-        if stated & {*links}
-        for link in links
-    }
+    mine = {link for links, _ in groups if stated & {*links} for link in links}
     kept = [
         i
         for i, pair in enumerate(loops)
@@ -133,9 +127,8 @@ def _of_stated(source: Source) -> Source:
     ]
     if not kept:
         return source
-    update = {"closed_loop": [loops[i] for i in kept], "type": [source.file.type[i] for i in kept]}
-    file = source.file.model_copy(update=update)
-    return replace(source, file=file)
+    update = {"closed_loop": [loops[i] for i in kept], "type": [kinds[i] for i in kept]}
+    return replace(source, file=source.file.model_copy(update=update))
 
 
 def _with_arms_as_motors(source: Source) -> Source:
@@ -169,28 +162,21 @@ def _read_xml(path: Path) -> Source:
     beside = yaml_of_urdf(path)
     if beside is not None and path.suffix.lower() != ".mjcf":
         return read_yaml_source(beside)
-    content = read_file(path, "mechanism file")
+    content = content_of(path, FILE_KIND, ModelError)
     root = parse_xml(path, content, "mechanism file")
     if root.tag == "mujoco":
         return read_mjcf_source(path, content)
-    if root.tag == "sdf":
-        raise ModelError(
-            "the mechanism could not be read",
-            "an SDF file of Gazebo",
-            "a URDF or MJCF file",
-            "export the model as URDF or MJCF",
-            path,
-        )
     if root.tag != "robot":
-        raise ModelError(
-            Problem(
-                f"the mechanism could not be read: found <{root.tag}> "
-                "as the root element, needed <robot> (URDF) or <mujoco> (MJCF); give "
-                "one of them.",
-                file=str(path),
-                line=cast("int", root.sourceline),
-            )
+        sdf = "an SDF file of Gazebo"
+        problems = Problems(path)
+        problems.add(
+            "the mechanism could not be read",
+            sdf if root.tag == "sdf" else f"<{root.tag}> as the root element",
+            "<robot> (URDF) or <mujoco> (MJCF)",
+            "export the model as one of them",
+            cast("int", root.sourceline),
         )
+        problems.raise_if_any()
     if any(element.tag in LOOP_TAGS for element in root) or closing_frames(root, path):
         return read_loop_source(path, content)
     parse_urdf(path, content, travel_needed=False)  # a link with two parents closes a loop as well
@@ -221,77 +207,45 @@ def read_yaml_source(path: Path) -> Source:
 
 def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
     """Return a mechanism after replacing the stand-in joints of its URDF."""
-    robot = parse_robot(urdf.path, urdf.content)
+    robot, block = urdf.robot(), file.legcal
     frames = replace_stand_ins(robot, file, urdf)
-    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    travel_needed = file.legcal is not None
-    completed = parse_urdf(urdf.path, content, travel_needed=travel_needed)
     changes = {
         "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
         "joint_name": [],
         "joint_type": [],
     }
-    if file.legcal is not None:
-        on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
-        if on_replaced:
-            raise ModelError(
-                "legcal.legs could not be used",
-                f"'{on_replaced[0]}', which stands for another joint (joint_name)",
-                "another joint of that leg",
-                "name its prismatic joint",
-                path,
-            )
-    wording = NO_BLOCK if file.legcal is None else BLOCK
-    completed = replace(completed, wording=wording)
+    on_replaced = [joint for joint in (block.legs.values() if block else ()) if joint in frames]
+    if on_replaced:
+        raise ModelError(
+            "legcal.legs could not be used",
+            f"'{on_replaced[0]}', which stands for another joint (joint_name)",
+            "another joint of that leg",
+            "name its prismatic joint",
+            path,
+        )
+    completed = urdf.edited(robot, travel_needed=block is not None)
+    completed = replace(completed, wording=BLOCK if block else NO_BLOCK)
     return Source(path, file.model_copy(update=changes), completed)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     """Check that each stand-in joint occurs once and has a known type."""
-    problems = []
+    problems = Problems(path)
     for i, (name, kind) in enumerate(zip(file.joint_name, file.joint_type, strict=True)):
+        refused = f"joint_name.{i} could not be used"
         if name not in urdf.joints:
-            problems.append(
-                Problem(
-                    f"joint_name.{i} could not be used",
-                    f"the joint '{name}', which is not in {urdf.path.name}",
-                    "",
-                    closest(name, sorted(urdf.joints)),
-                    str(path),
-                )
-            )
+            absent = f"the joint '{name}', which is not in {urdf.path.name}"
+            problems.add(refused, absent, remedy=closest(name, sorted(urdf.joints)))
         elif file.joint_name.index(name) != i:
-            problems.append(
-                Problem(
-                    f"joint_name.{i} could not be used",
-                    f"'{name}' twice",
-                    "each joint once",
-                    "remove one",
-                    str(path),
-                )
-            )
+            problems.add(refused, f"'{name}' twice", "each joint once", "remove one")
         elif name in file.name_mot and kind != "FIXED":
-            problems.append(
-                Problem(
-                    "name_mot could not be used",
-                    f"'{name}', which stands for {kind} (joint_name.{i})",
-                    "a joint with one reading",
-                    "remove it",
-                    str(path),
-                )
-            )
+            stand_in = f"'{name}', which stands for {kind} (joint_name.{i})"
+            refused = "name_mot could not be used"
+            problems.add(refused, stand_in, "a joint with one reading", "remove it")
         if rotation_letters(kind) is None:
-            problems.append(
-                Problem(
-                    f"joint_type.{i} could not be used",
-                    f"'{kind}'",
-                    "SPHERICAL, FIXED, or UJOINT_ and two different letters of X, Y, Z",
-                    "correct it",
-                    str(path),
-                )
-            )
-    if problems:
-        raise ModelError(problems)
+            needed = "SPHERICAL, FIXED, or UJOINT_ and two different letters of X, Y, Z"
+            problems.add(f"joint_type.{i} could not be used", f"'{kind}'", needed, "correct it")
+    problems.raise_if_any()
 
 
 def rotation_letters(kind: str) -> str | None:
@@ -313,41 +267,21 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
             element.set("type", "fixed")
             continue
         replaced[name] = joint.child
-        letters = str(rotation_letters(kind))
-        parent = joint.parent
-        added = UrdfBuilder(dict(text.links), dict(text.joints))
-        for i, letter in enumerate(letters):
-            last = i == len(letters) - 1
-            child = joint.child if last else added.unused(f"{name}_{letter}_link")
-            if not last:
-                added.link(child)
-            T = joint.T_parent_origin if i == 0 else joint.T_parent_origin.identity()
-            added.joint(
-                added.unused(f"{name}_{letter}"), "revolute", parent, child, T, _AXES[letter]
-            )
-            parent = child
+        axes = {letter: _AXES[letter] for letter in str(rotation_letters(kind))}
+        there = len(text.links), len(text.joints)
+        text.turns(name, joint.parent, joint.child, joint.T_parent_origin, axes)
         at = robot.index(element)
         robot.remove(element)
-        lines = [
-            *(line for link, line in added.links.items() if link not in text.links),
-            *(line for other, line in added.joints.items() if other not in text.joints),
-        ]
+        lines = [*text.links.values()][there[0] :] + [*text.joints.values()][there[1] :]
         for line in reversed(lines):
             new = etree.fromstring(line)
             new.tail = "\n"
             robot.insert(at, new)
-        text = added
     return replaced
 
 
 def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
-    """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot.
-
-    Raises
-    ------
-    ModelError
-        If one of a pair is missing.
-    """
+    """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot."""
     ends: dict[str, dict[str, str]] = {}
     for element in robot.findall("link"):
         match = _CLOSING.fullmatch(element.get("name", ""))
@@ -356,10 +290,9 @@ def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
     for name, numbers in ends.items():
         if len(numbers) == 1:
             (number, link) = next(iter(numbers.items()))
-            other = f"closing_{name}_{3 - int(number)}"
             raise ModelError(
                 "the loops could not be closed",
-                f"the frame '{link}' and no '{other}'",
+                f"the frame '{link}' and no 'closing_{name}_{3 - int(number)}'",
                 "both ends of each loop",
                 f"export the model again with both parts of the mate closing_{name}, or "
                 f"remove '{link}'",
@@ -394,36 +327,30 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     poses = reference_poses(bare)
     text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
     pairs = [close_loop(loop, text, poses) for loop in loops]
-    for line in [*text.links.values(), *text.joints.values()]:
-        if line:
-            robot.append(etree.fromstring(line))
-            robot[-1].tail = "\n"
+    for line in filter(None, text.body().split("\n")):
+        robot.append(etree.fromstring(line))
+        robot[-1].tail = "\n"
     named = closing_frames(robot, path)
     if named:
         notes.append(
             f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
             "joints."
         )
-    written = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
     file = MechanismFile(
         closed_loop=[*(frames for frames, _ in pairs), *named],
         type=[*(kind for _, kind in pairs), *["3d"] * len(named)],
         name_mot=motors,
     )
-    urdf = replace(parse_urdf(path, written, travel_needed=False), wording=URDF_LOOPS)
-    return Source(path, file, urdf, tuple(notes))
+    return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
     """Return the valid loops of a URDF, and note the problems of the others."""
     loops = []
-    seen: set[str] = set()
+    problems.check_unique(elements)
     for i, element in enumerate(elements, start=1):
         n_before = len(problems)
         name = element.get("name", "").strip() or f"{element.tag}_{i}"
-        if name in seen:
-            problems.at(element, "has a name that another one has", "give each its own name")
-        seen.add(name)
         kind = element.get("type", "").strip().lower()
         if kind not in KINDS:
             problems.at(

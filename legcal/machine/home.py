@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, ModelError, Problem
+from legcal.errors import DidNotConverge, ModelError
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array
@@ -76,13 +76,11 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     projected, problem = project_pose(machine, home)
     if problem is not None:
         raise ModelError(
-            Problem(
-                f"{machine.urdf.wording.home} could not be used",
-                f"{problem} there",
-                "a closed pose",
-                machine.urdf.wording.correct_home,
-                str(machine.yaml_path),
-            )
+            f"{machine.urdf.wording.home} could not be used",
+            f"{problem} there",
+            "a closed pose",
+            machine.urdf.wording.correct_home,
+            machine.yaml_path,
         )
     return projected
 
@@ -131,12 +129,10 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             break
     if best is None:
         raise DidNotConverge(
-            Problem(
-                f"no home pose was found: with all legs at mid-travel the "
-                f"loops did not close from {TRIALS} starts, needed a closed pose; "
-                f"{machine.urdf.wording.state_home}.",
-                file=str(machine.yaml_path),
-            )
+            f"no home pose was found: with all legs at mid-travel the "
+            f"loops did not close from {TRIALS} starts, needed a closed pose; "
+            f"{machine.urdf.wording.state_home}.",
+            file=machine.yaml_path,
         )
     home = best[1]
     if machine.actuators:
@@ -148,14 +144,12 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
             poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
             wording = machine.urdf.wording
             raise ModelError(
-                Problem(
-                    "the assembly at home is ambiguous",
-                    f"that {wording.no_home}, and that at the same readings of the motors the "
-                    f"rods reach the platform at {poses}",
-                    "one",
-                    f"{wording.state_home}, as the machine is assembled",
-                    str(machine.yaml_path),
-                )
+                "the assembly at home is ambiguous",
+                f"that {wording.no_home}, and that at the same readings of the motors the "
+                f"rods reach the platform at {poses}",
+                "one",
+                f"{wording.state_home}, as the machine is assembled",
+                machine.yaml_path,
             )
     return home
 
@@ -305,14 +299,11 @@ def check_home_travel(machine: Machine) -> None:
         others = f" ({len(far) - 1} more {more} as far off)"
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
-        Problem(
-            "legcal.home could not be used",
-            f"{name} at {reading} there{others}",
-            f"a reading near its travel of {travel}",
-            "correct legcal.home or the limits of the "
-            f"{'slider' if leg.actuator is None else 'motor'}",
-            str(machine.yaml_path),
-        )
+        "legcal.home could not be used",
+        f"{name} at {reading} there{others}",
+        f"a reading near its travel of {travel}",
+        f"correct legcal.home or the limits of the {'slider' if leg.actuator is None else 'motor'}",
+        machine.yaml_path,
     )
 
 

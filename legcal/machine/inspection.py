@@ -9,9 +9,9 @@ from pydantic import model_validator
 
 from legcal.files.motions import Pose
 from legcal.files.schema import Document, Number, SparseDocument, Triple
+from legcal.machine.files import motor_entries
 from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.schema import motor_entries
 
 
 class ArmBlock(Document):

@@ -30,9 +30,9 @@ from legcal.machine.classification import (
 )
 from legcal.machine.cylinders import (
     at_visible_heights,
-    visual_cylinders,
     with_arms,
     with_cylinders,
+    with_mesh_cylinders,
 )
 from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import (
@@ -40,6 +40,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
+from legcal.machine.files import LegcalBlock, MechanismFile
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.leg import (
@@ -53,7 +54,6 @@ from legcal.machine.leg import (
     LegChain,
     redirected,
 )
-from legcal.machine.mesh_cylinders import with_mesh_cylinders
 from legcal.machine.mobility import (
     CONFIGURATIONS,
     generic_configurations,
@@ -65,7 +65,6 @@ from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
-from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
@@ -74,9 +73,8 @@ from legcal.machine.topology import (
     VIRTUAL,
     Normals,
     any_joint,
-    check_bodies,
     check_plane,
-    check_type,
+    check_virtual,
     distinct_joint,
     find_chains,
     normals_in_links,
@@ -156,7 +154,10 @@ def _load(source: Source) -> Machine:
     except OutOfClass:
         _check_plane_of_arms(urdf, source.path)
         raise
-    drawn, round_parts = with_mesh_cylinders(machine, source.leg_radius)
+    bodies = rigid_bodies(source.urdf, closures, block.platform_joint)
+    drawn, round_parts = with_mesh_cylinders(
+        source.urdf, bodies, machine.legs, machine.base, source.leg_radius
+    )
     if round_parts or drawn is not source.urdf:
         source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
         machine = _assemble(source, block, closures)
@@ -209,8 +210,8 @@ def _load(source: Source) -> Machine:
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
     """Return the mechanism, with its chain still open."""
     file, urdf, yaml_path = source.file, source.urdf, source.path
-    check_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
+    check_virtual(block, bodies, urdf, yaml_path)
     chains = _legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform, file.name_mot),
         bodies,
@@ -219,13 +220,13 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         yaml_path,
     )
     _check_motors(file, chains, urdf, yaml_path)
-    check_bodies(block, bodies, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     _check_legs(chains, spatial=normals is None, path=yaml_path)
     check_plane(block, bodies, urdf, normals, yaml_path)
     in_plane = None if normals is None else normals_in_links(normals, ends)
-    shown = visual_cylinders(urdf)
+    solids = visual_solids(urdf)
+    shown = [solid.cylinder for solid in solids if solid.cylinder is not None]
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
     chain = _closed_chain(urdf, closures, in_plane, block, chains)
@@ -250,7 +251,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     frame_legs = tuple(names.index(name) for name in base_frame)
     legs = redirected(legs, frame_legs) if normals is None else legs
     legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
-    solids = visual_solids(urdf)
     occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
     machine = Machine(
         name=urdf.name,

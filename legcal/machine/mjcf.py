@@ -22,7 +22,7 @@ from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
-from legcal.machine.schema import MAX_LOOPS, MechanismFile
+from legcal.machine.files import MAX_LOOPS, MechanismFile
 from legcal.machine.spanning_tree import (
     EYE,
     FULL_TURN,
@@ -145,9 +145,13 @@ class MjcfReader:
             self.problems.at(
                 element, "is not expanded", "save the compiled model with MuJoCo and give that file"
             )
-        for element in self.root.iterfind("worldbody//*[@name]"):
-            if element.tag in ("body", "joint", "freejoint"):
-                self._names.add(str(element.get("name")))
+        for tags in (("body",), ("joint", "freejoint"), ("site",)):
+            named = [e for top in self.root.findall("worldbody") for e in top.iter(*tags)]
+            self.problems.check_unique(named)
+            if tags != ("site",):
+                self._names |= {str(e.get("name")) for e in named if e.get("name")}
+        self.problems.check_unique(self.root.iterfind("equality/*"))
+        self.problems.check_unique(self.root.iterfind(".//default/default"), "class")
         visuals = ""
         pending: list[BodyElement] = []
         for world in self.root.findall("worldbody"):
@@ -186,10 +190,6 @@ class MjcfReader:
         """Write a body with its joints, and return its child bodies."""
         element = part.element
         name = element.get("name", "")
-        if name in self.poses:
-            self.problems.at(
-                element, f"has the name '{name}', which another body has", "give each its own name"
-            )
         if not name or name in self.poses:
             name = self._unused(f"body{len(self.poses)}")
         T_parent_body = part.T_body_frame * self._pose(element, _attributes_of(element))
@@ -229,10 +229,6 @@ class MjcfReader:
         element, attributes = part.element, self._attributes(part)
         kind = "free" if element.tag == "freejoint" else attributes.get("type", "hinge")
         name = attributes.get("name", "")
-        if name and name in self._joints:
-            self.problems.at(
-                element, f"has the name '{name}', which another joint has", "give each its own name"
-            )
         if not name or name in self._joints:
             name = self._unused(f"{part.body}_{kind}")
         self._joints[name] = kind
@@ -256,22 +252,13 @@ class MjcfReader:
         centred = not np.asarray(T_body_joint.translation).any()
         child = part.body if last and centred else self._unused(f"{name}_link")
         if kind == "ball":
-            self._ball(name, at, child, T_at_body * T_body_joint)
+            axes = dict(zip("xyz", np.eye(3), strict=True))
+            self.tree.turns(name, at, child, T_at_body * T_body_joint, axes, self._names)
         else:
             self._one_axis(part, attributes, name, kind, (at, child), T_at_body * T_body_joint)
         if child != part.body:
             self.tree.link(child)
         return child, EYE if child == part.body else T_body_joint.inv()
-
-    def _ball(self, name: str, at: str, child: str, T_at_joint: RigidTransform) -> None:
-        """Write a ball joint as three revolutes, perpendicular in the configuration of the file."""
-        for axis, letter in zip(np.eye(3), "xyz", strict=True):
-            after = child if letter == "z" else self._unused(f"{name}_{letter}_link")
-            if after != child:
-                self.tree.link(after)
-            joint = self._unused(f"{name}_{letter}")
-            self.tree.joint(joint, "revolute", at, after, T_at_joint, axis)
-            at, T_at_joint = after, EYE
 
     def _one_axis(
         self,
@@ -369,10 +356,6 @@ class MjcfReader:
     def _site(self, part: BodyElement) -> None:
         """Register a site by name."""
         element, name = part.element, str(part.element.get("name"))
-        if name in self.sites:
-            self.problems.at(
-                element, f"has the name '{name}', which another site has", "give each its own name"
-            )
         attributes = self._attributes(part)
         T, length = self._between(element, attributes)
         if T is None or length == 0.0:
@@ -401,7 +384,6 @@ class MjcfReader:
 
     def loops(self) -> Iterator[Loop]:
         """Yield the loops of all ``<equality>`` elements."""
-        names: set[str] = set()
         for i, element in enumerate(self.root.iterfind("equality/*"), start=1):
             name_of_class = element.get("class", "main")
             default = self._default(element, name_of_class).get("equality", {})
@@ -416,11 +398,6 @@ class MjcfReader:
                 self.problems.at(element, reason, remedy)
                 continue
             name = str(attributes.get("name") or f"{element.tag}{i}")
-            if name in names:
-                self.problems.at(
-                    element, "has a name that another one has", "give each its own name"
-                )
-            names.add(name)
             n_before = len(self.problems)
             by_site = "site1" in attributes or "site2" in attributes
             ends = self._joined_sites(element) if by_site else self._joined_bodies(element)
@@ -632,11 +609,7 @@ class MjcfReader:
             inner = part.get("class", "")
             if not inner:
                 self.problems.at(part, "is a default class without a name", "name it")
-            elif inner in self._defaults:
-                self.problems.at(
-                    part, f"is the default class '{inner}' again", "give each its own name"
-                )
-            else:
+            elif inner not in self._defaults:
                 self._read_defaults(part, inner, here)
 
     def _read_compiler(self, element: etree._Element) -> None:

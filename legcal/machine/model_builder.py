@@ -1,6 +1,7 @@
 """A new model of a described machine: its YAML and its URDF, written and loaded."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,16 +10,23 @@ import numpy as np
 from legcal.errors import LegcalError, OutOfResources, Problem, UsageError
 from legcal.files.folder import temporary_folder
 from legcal.files.published import write_schemas
-from legcal.geometry.lines import cross
+from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array
+from legcal.machine.actuator import Actuator
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
+from legcal.machine.files import mechanism_yaml, motor_entries
 from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.motor_visuals import motor_visuals
-from legcal.machine.schema import mechanism_yaml, motor_entries
-from legcal.machine.spanning_tree import UrdfBuilder, axis_xml, limit_xml, origin_xml_at, visual_xml
+from legcal.machine.spanning_tree import (
+    UrdfBuilder,
+    axis_xml,
+    box_xml,
+    limit_xml,
+    origin_xml_at,
+    visual_xml,
+)
 
 TURN = (-3.15, 3.15)  # limits of revolutes [rad]
 VISIBLE = 0.9  # length of tube and rod together, relative to the shortest leg
@@ -32,9 +40,9 @@ def urdf_text(machine: Assembled) -> str:
     tree.link("platform")
     if machine.planar:
         height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
-        _joint(tree, "platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
+        tree.connect("platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
     else:
-        _joint(tree, "platform_free", "floating", ("base", "platform"))
+        tree.connect("platform_free", "floating", ("base", "platform"))
     _add_actuators(tree, machine)
     for leg in machine.legs:
         _Branch(tree, machine, leg).write()
@@ -85,7 +93,7 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
         kind = actuator.kind.value
         moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
         links = "base", actuator.link
-        _joint(tree, actuator.joint, kind, links, actuator.point, moving=moving)
+        tree.connect(actuator.joint, kind, links, actuator.point, moving=moving)
     if on_base:
         tree.link("base", "".join(on_base))
 
@@ -103,22 +111,6 @@ def _joint_of(leg: AssembledLeg) -> str:
     if leg.kind is LegKind.CONSTANT:
         return f"{leg.name}_a1" if _hangs_from_base(leg) else f"{leg.name}_b1"
     return f"{leg.name}_prismatic"
-
-
-def _joint(
-    tree: UrdfBuilder,
-    name: str,
-    kind: str,
-    links: tuple[str, str],
-    xyz: Array | None = None,
-    rotation: Array | None = None,
-    moving: str = "",
-) -> None:
-    """Connect two links; their frames coincide if no numbers are given."""
-    at = origin_xml_at(
-        np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
-    )
-    tree.connect(name, kind, links, at + moving)
 
 
 class _Branch:
@@ -168,7 +160,7 @@ class _Branch:
         if joint is JointType.FIXED:
             root = f"{self._leg.name}_rod"
             self._tree.link(root)
-            _joint(self._tree, f"{root}_frame", "fixed", (self._link, root), at, along)
+            self._tree.connect(f"{root}_frame", "fixed", (self._link, root), at, along)
             self._link = root
             return along
         first = np.column_stack([axis, y, cross(axis, y)]) if joint.inner_is_across else along
@@ -200,11 +192,11 @@ class _Branch:
         end, seat = f"{leg.name}_end", f"{leg.name}_seat"
         tree.link(end)
         tree.link(seat)
-        _joint(tree, f"{end}_frame", "fixed", (self._link, end), self._along)
+        tree.connect(f"{end}_frame", "fixed", (self._link, end), self._along)
         at_base = self._carrier, self._A
         carrier, at = ("platform", leg.B_platform) if self._from_base else at_base
         turned = None if leg.type.has_sphere else self._R_base_platform.T @ R
-        _joint(tree, f"{seat}_frame", "fixed", (carrier, seat), at, turned)
+        tree.connect(f"{seat}_frame", "fixed", (carrier, seat), at, turned)
 
     def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
         """Add a revolute."""
@@ -224,7 +216,7 @@ class _Branch:
         """Add a joint and continue from its child."""
         self._tree.link(child)
         moving = _AXES[axis] + limit_xml(limits)
-        _joint(self._tree, joint, kind, (self._link, child), at, rotation, moving)
+        self._tree.connect(joint, kind, (self._link, child), at, rotation, moving)
         self._link, self._along = child, np.zeros(3)
 
     def _half(self, *, near: bool) -> None:
@@ -274,7 +266,7 @@ def create_model(described: Description, output: Path, *, force: bool = False) -
             "--output, or --force to replace them."
         )
     try:
-        return replace(_write(machine, described.source, output), notes=tuple(described.notes))
+        return _write(machine, output)
     except OSError as error:
         raise OutOfResources(
             f"{output}: the model could not be written: found '{error.strerror}', needed a folder "
@@ -287,7 +279,7 @@ def model_paths(name: str, output: Path) -> tuple[Path, Path]:
     return output / "models" / f"{name}.yaml", output / "urdf" / f"{name}.urdf"
 
 
-def _write(machine: Assembled, source: str, output: Path) -> Created:
+def _write(machine: Assembled, output: Path) -> Created:
     """Write and load the files in a temporary folder, then move them to their places."""
     made = [path for path in (output, *output.parents) if not path.exists()]
     output.mkdir(parents=True, exist_ok=True)
@@ -297,7 +289,7 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
             for path, text in zip(written, (yaml_text(machine), urdf_text(machine)), strict=True):
                 path.parent.mkdir()
                 path.write_bytes(text.encode())
-            _load(written[0], temporary, source)
+            _load(written[0], temporary, machine.source)
             places = model_paths(machine.name, output)
             for path in places:
                 if not path.parent.is_dir():
@@ -311,7 +303,7 @@ def _write(machine: Assembled, source: str, output: Path) -> Created:
             if folder.is_dir() and not os.listdir(folder):
                 folder.rmdir()
         raise
-    return Created(load_mechanism(places[0]), *places)
+    return Created(load_mechanism(places[0]), *places, machine.notes)
 
 
 def _load(path: Path, temporary: Path, source: str) -> None:
@@ -330,3 +322,93 @@ def _attributed_to_source(problem: Problem, temporary: Path, source: str) -> Pro
     if not file.is_relative_to(temporary):
         return problem
     return replace(problem, file=f"{source}: {file.relative_to(temporary)}")
+
+
+THICK, WIDE = 2.0, 3.0  # size of arms and rails, in radii of a rod
+MOTOR_RADIUS, MOTOR_LENGTH = 4.0, 8.0
+BEHIND = 2.5  # distance of rails and carriages from the joints, away from the rods
+_ROUND = 6  # decimals of sizes and positions [m], for display only
+
+
+def motor_visuals(actuator: Actuator, rods: Sequence[AssembledLeg]) -> tuple[list[str], list[str]]:
+    """Return the ``<visual>`` elements of a motor on the base, and on the link that it moves.
+
+    The first are in the base link, the others relative to the point of the actuator in base axes,
+    at reading 0. Without a visible rod there are none.
+    """
+    radii = [r for rod in rods for r in (rod.tube, rod.rod) if r is not None]
+    if not radii:
+        return [], []
+    make = _turning if actuator.turns else _sliding
+    return make(actuator, np.array([rod.A_base for rod in rods]), rods, max(radii))
+
+
+def _turning(
+    actuator: Actuator, A: Array, _rods: Sequence[AssembledLeg], r: float
+) -> tuple[list[str], list[str]]:
+    """Return a motor along the axis, an arm across it and a bar between the joints."""
+    w, middle = actuator.axis, A.mean(axis=0)
+    foot = actuator.point + ((middle - actuator.point) @ w) * w
+    x = (middle - foot) / np.linalg.norm(middle - foot)
+    frame = np.column_stack([x, cross(w, x), w])
+    motor = visual_xml(_at(foot, frame), _rounded(MOTOR_RADIUS * r), _rounded(MOTOR_LENGTH * r))
+    length = float(np.linalg.norm(middle - foot))
+    place = 0.5 * (foot + middle) - actuator.point
+    if actuator.arm is None:
+        arm = _box(place, np.array([length, WIDE * r, THICK * r]), frame)
+    else:
+        along = np.column_stack([frame[:, 1], frame[:, 2], x])
+        arm = visual_xml(_at(place, along), actuator.arm.radius, _rounded(length))
+    return [motor], [arm, *_bar(A - actuator.point, frame, r)]
+
+
+def _sliding(
+    actuator: Actuator, A: Array, rods: Sequence[AssembledLeg], r: float
+) -> tuple[list[str], list[str]]:
+    """Return a rail along the direction, a carriage on it and a bar between the joints."""
+    d, middle = actuator.axis, A.mean(axis=0)
+    towards = np.mean([rod.u for rod in rods], axis=0)
+    away = -(towards - (towards @ d) * d)
+    if np.linalg.norm(away) < 1e-3:  # rods in line with it are side by side
+        away = cross(d, A[-1] - A[0])
+    if np.linalg.norm(away) < 1e-6:
+        away = normal_basis(d)[0]
+    y = away / np.linalg.norm(away)
+    frame = np.column_stack([d, y, cross(d, y)])
+    low, high = actuator.travel
+    side = WIDE * r
+    rail = np.array([high - low + 2.0 * side, side, side])
+    on_rail = middle + (BEHIND * r + side) * y + 0.5 * (low + high) * d
+    carriage = middle - actuator.point + BEHIND * r * y
+    return [_box(on_rail, rail, frame)], [
+        _box(carriage, np.array([2.0 * side, side, 2.0 * side]), frame),
+        *_bar(A - actuator.point, frame, r),
+    ]
+
+
+def _bar(A: Array, frame: Array, r: float) -> list[str]:
+    """Return the bar between the joints of one link, if there are several."""
+    ends = A[[int(np.argmin(A @ frame[:, 2])), int(np.argmax(A @ frame[:, 2]))]]
+    along = ends[1] - ends[0]
+    length = float(np.linalg.norm(along))
+    if length < r:
+        return []
+    z = along / length
+    x = frame[:, 0] - (frame[:, 0] @ z) * z
+    x /= np.linalg.norm(x)
+    turned = np.column_stack([x, cross(z, x), z])
+    return [_box(ends.mean(axis=0), np.array([THICK * r, THICK * r, length + WIDE * r]), turned)]
+
+
+def _box(at: Array, sizes: Array, frame: Array) -> str:
+    """Return a box of sizes (3,) along the axes of a frame."""
+    return box_xml(_at(at, frame), np.round(sizes, _ROUND))
+
+
+def _at(place: Array, frame: Array) -> str:
+    return origin_xml_at(np.round(place, _ROUND), frame)
+
+
+def _rounded(size: float) -> float:
+    """Return a size, rounded for the file [m]."""
+    return round(size, _ROUND)

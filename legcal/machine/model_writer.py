@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 import yaml
-from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, OutOfResources, UsageError
+from legcal.errors import DidNotConverge, ModelError, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.schema import content_of
 from legcal.geometry.rotations import roll_pitch_yaw
-from legcal.machine.files import FOLDER_YAML, is_xml, read_file
+from legcal.machine.files import FILE_KIND, FOLDER_YAML, is_xml, mechanism_yaml, motor_entries
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -30,8 +30,7 @@ from legcal.machine.meshes import mesh_file
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
-from legcal.machine.schema import mechanism_yaml, motor_entries
-from legcal.machine.urdf import UrdfPatch, parse_robot
+from legcal.machine.urdf import UrdfPatch, written
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # strings without quotes in YAML
 CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
@@ -103,15 +102,13 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
 
 def _with_paths(machine: Machine, destination: Path) -> bytes:
     """Return the URDF of a mechanism; meshes not found from a destination get absolute paths."""
-    robot, changed = parse_robot(machine.urdf.path, machine.urdf.content), False
+    robot, changed = machine.urdf.robot(), False
     for mesh in robot.iterfind("link/*/geometry/mesh"):
         file = mesh_file(machine.urdf.path, mesh.get("filename", ""))
         if file is not None and mesh_file(destination, mesh.get("filename", "")) is None:
             mesh.set("filename", file.resolve().as_posix())
             changed = True
-    if not changed:
-        return machine.urdf.content
-    return etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    return written(robot) if changed else machine.urdf.content
 
 
 def _joint_of(machine: Machine, leg: Leg) -> str:
@@ -165,7 +162,7 @@ def write_calibrated_yaml(
         there = replace(there, legs=tuple(_with_gain(leg, gains) for leg in there.legs))
         destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
         return
-    text = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
+    text = content_of(machine.yaml_path, FILE_KIND, ModelError).decode("utf-8")
     if home is not None:
         text = _with_home(text, home)
     if any(a.gain != gains.get(a.joint, a.gain) for a in machine.actuators):
@@ -233,7 +230,7 @@ def _is_written_down(machine: Machine) -> bool:
     """Return whether a mechanism has a YAML of our format, for its URDF as it is."""
     if is_xml(machine.yaml_path):
         return False
-    content = read_file(machine.yaml_path, "mechanism file").decode("utf-8")
+    content = content_of(machine.yaml_path, FILE_KIND, ModelError).decode("utf-8")
     document = yaml.compose(content, Loader=yaml.SafeLoader)
     stand_ins = _entry(document, "joint_name")
     has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)

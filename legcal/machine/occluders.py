@@ -26,7 +26,7 @@ from legcal.machine.bodies import Bodies
 from legcal.machine.cylinders import Half, VisualCylinder, halves_of_leg, is_measured
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
 from legcal.machine.meshes import mesh_file, ray_caster, read_mesh
-from legcal.machine.urdf import Urdf, number_list, origins_of, parse_robot
+from legcal.machine.urdf import Urdf, number_list, origins_of
 
 SIDES = 24  # sides of the prism around a round solid
 THICKER = 1.2  # least radius of an enclosing solid, relative to the enclosed cylinder
@@ -286,7 +286,7 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
     """
     shown = [
         (link.get("name", ""), visual, shape)
-        for link in parse_robot(urdf.path, urdf.content).findall("link")
+        for link in urdf.robot().findall("link")
         for visual in link.findall("visual")
         for shape in visual.findall("geometry/*")
     ]

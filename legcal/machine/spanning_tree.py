@@ -22,7 +22,7 @@ from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
 from legcal.machine.chain import Closure
-from legcal.machine.schema import MechanismFile
+from legcal.machine.files import MechanismFile
 from legcal.machine.urdf import Urdf
 
 
@@ -85,18 +85,47 @@ class UrdfBuilder:
         limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
     ) -> None:
         """Add a joint; ``axis`` and ``limits`` [rad or m] apply to moving joints."""
-        moving = ""
-        if axis is not None:
-            moving = axis_xml(axis) + limit_xml(limits)
-        self.connect(name, kind, (parent, child), origin_xml(T_parent_origin) + moving)
+        moving = "" if axis is None else axis_xml(axis) + limit_xml(limits)
+        xyz, rotation = np.asarray(T_parent_origin.translation), T_parent_origin.rotation
+        self.connect(name, kind, (parent, child), xyz, rotation.as_matrix(), moving)
 
-    def connect(self, name: str, kind: str, links: tuple[str, str], inside: str) -> None:
-        """Add a joint between parent and child with its XML elements, the origin first."""
+    def connect(
+        self,
+        name: str,
+        kind: str,
+        links: tuple[str, str],
+        xyz: Array | None = None,
+        rotation: Array | None = None,
+        moving: str = "",
+    ) -> None:
+        """Connect two links, with XML for axis and limits; frames coincide without numbers."""
         parent, child = (_quoted(link) for link in links)
+        at = origin_xml_at(
+            np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
+        )
         self.joints[name] = (
             f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
-            f"<child link={child}/>{inside}</joint>"
+            f"<child link={child}/>{at}{moving}</joint>"
         )
+
+    def turns(
+        self,
+        name: str,
+        parent: str,
+        child: str,
+        T_parent_origin: RigidTransform,
+        axes: Mapping[str, Array],
+        taken: Set[str] = frozenset(),
+    ) -> None:
+        """Add a ball or universal joint as revolutes, by their letters, with links between them."""
+        last = [*axes][-1]
+        for letter, axis in axes.items():
+            after = child if letter == last else self.unused(f"{name}_{letter}_link", taken)
+            if after != child:
+                self.link(after)
+            joint = self.unused(f"{name}_{letter}", taken)
+            self.joint(joint, "revolute", parent, after, T_parent_origin, axis)
+            parent, T_parent_origin = after, EYE
 
     def body(self) -> str:
         """Return the lines of all links and joints."""
@@ -161,18 +190,19 @@ def _quoted(text: str) -> str:
     return f'"{escape(text)}"'
 
 
-def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Path) -> None:
+def check_one_mechanism(source: Source) -> None:
     """Check that a file holds one mechanism: all loops share a body other than the ground."""
-    groups = moving_groups(urdf, closures)
+    groups = moving_groups(source.urdf, source.file.closed_loop)
     closed = [links for links, is_closed in groups if is_closed]
-    if len(closed) > 1:
+    block = source.file.legcal  # a platform on the ground is refused later
+    if len(closed) > 1 and (block is None or any(block.platform in links for links in closed)):
         names = ", ".join(f"'{links[0]}'" for links in closed[:4])
         raise OutOfClass(
             "the mechanism could not be read",
             f"{len(closed)} mechanisms, which have no moving body in common (with {names})",
             "one",
             "write each to its own file",
-            path,
+            source.path,
         )
 
 

@@ -30,9 +30,9 @@ from legcal.machine.classification import (
     parallel,
     undirected,
 )
+from legcal.machine.files import LegcalBlock
 from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
-from legcal.machine.schema import LegcalBlock
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.urdf import Urdf
 
@@ -50,22 +50,15 @@ def find_chains(
     """Return the legs between two links, each classified as joint, slider or rod, joint.
 
     One of the *motors* on the base may carry several rods.
-
-    Raises
-    ------
-    OutOfClass
-        If the mechanism is not a platform on separate legs of this kind.
     """
     ends = bodies.body_of[base], bodies.body_of[platform]
     if ends[0] == ends[1]:
         raise OutOfClass(
-            Problem(
-                "this is not a parallel mechanism",
-                f"the platform '{platform}' fixed to the base '{base}'",
-                "legs between them",
-                urdf.wording.correct_ends,
-                str(urdf.path),
-            )
+            "this is not a parallel mechanism",
+            f"the platform '{platform}' fixed to the base '{base}'",
+            "legs between them",
+            urdf.wording.correct_ends,
+            urdf.path,
         )
     origin = bodies.T_body_link[platform][:3, 3]
     within = joint_tolerance(_joints_on(bodies, end) for end in ends)
@@ -89,7 +82,6 @@ def _paths(
     bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str], within: float
 ) -> list[list[Step]]:
     """Return the joints of every leg from base to platform."""
-    _refuse_second_mechanism(bodies, urdf, base, platform)
     _refuse_carried_bodies(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
@@ -117,14 +109,12 @@ def _paths(
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
-                    Problem(
-                        "this is not a platform on legs",
-                        f"a leg of more than {MAX_JOINTS_OF_LEG} joints from "
-                        f"{_name(steps[0].connection)}",
-                        "joint, slider, joint",
-                        "give the mechanism alone",
-                        str(urdf.path),
-                    )
+                    "this is not a platform on legs",
+                    f"a leg of more than {MAX_JOINTS_OF_LEG} joints from "
+                    f"{_name(steps[0].connection)}",
+                    "joint, slider, joint",
+                    "give the mechanism alone",
+                    urdf.path,
                 )
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
@@ -139,13 +129,11 @@ def _paths(
     stray = [c for c in bodies.connections if id(c) not in used]
     if stray:
         raise OutOfClass(
-            Problem(
-                "this is not a platform on legs",
-                f"{_name(stray[0])} on no chain from base to platform",
-                "every joint on a leg",
-                "fix it or remove it",
-                str(urdf.path),
-            )
+            "this is not a platform on legs",
+            f"{_name(stray[0])} on no chain from base to platform",
+            "every joint on a leg",
+            "fix it or remove it",
+            urdf.path,
         )
     return paths
 
@@ -154,11 +142,6 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
     """Return the default block ``legcal`` for a file without one.
 
     Without *motors* all revolute joints on the base may be motors of arms.
-
-    Raises
-    ------
-    OutOfClass
-        If no body is the platform of separate legs of the class.
     """
     urdf, closures, path = source.urdf, source.closures, source.path
     ends = source.base, source.platform
@@ -179,13 +162,11 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
     if len(blocks) > 1:
         pairs = " or ".join(f"'{b.base}' (platform '{b.platform}')" for b in blocks.values())
         raise OutOfClass(
-            Problem(
-                "no base could be proposed",
-                f"legs between several pairs of links, with the base {pairs}",
-                "one",
-                urdf.wording.state_ends,
-                str(path),
-            )
+            "no base could be proposed",
+            f"legs between several pairs of links, with the base {pairs}",
+            "one",
+            urdf.wording.state_ends,
+            path,
         )
     if not blocks:
         raise problems[0]
@@ -216,13 +197,7 @@ def _block_on(
     path: Path,
     ends: tuple[str | None, str | None],
 ) -> LegcalBlock:
-    """Return the default block ``legcal`` with a body as the base.
-
-    Raises
-    ------
-    OutOfClass
-        If no body is the platform of separate legs on it.
-    """
+    """Return the default block ``legcal`` with a body as the base."""
     virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
     bodies = rigid_bodies(urdf, closures, None)
     real = replace(bodies, connections=_without_virtual(bodies, urdf))
@@ -245,13 +220,11 @@ def _block_on(
     needed = n_frame_legs(spatial=plane_of_motion(chains) is None)
     if len(chains) < needed and base != root and ends[0] is None:
         raise OutOfClass(
-            Problem(
-                "this is not a platform on legs",
-                f"{len(chains)} legs on link '{base_link}'",
-                f"at least {needed}",
-                urdf.wording.state_ends,
-                str(path),
-            )
+            "this is not a platform on legs",
+            f"{len(chains)} legs on link '{base_link}'",
+            f"at least {needed}",
+            urdf.wording.state_ends,
+            path,
         )
     joints = [distinct_joint(chain) for chain in chains]
     names = _leg_names(joints)
@@ -378,73 +351,44 @@ def normals_of_closures(
     return [None, *normals[1:]] if floats else normals
 
 
-def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
-    """Check that the type of the virtual joint, if any, is supported.
-
-    Raises
-    ------
-    OutOfClass
-        If it is neither floating nor planar, or planar about another axis than its z.
-    """
+def check_virtual(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> None:
+    """Check that the virtual joint, if any, is of a supported type and carries the platform."""
     if block.platform_joint is None:
         return
     joint = urdf.joints[block.platform_joint]
-    if joint.type not in ("floating", "planar"):
+    refused = f"legcal.platform_joint '{joint.name}' is not supported"
+    if joint.type not in VIRTUAL:
         raise OutOfClass(
-            Problem(
-                f"legcal.platform_joint '{joint.name}' is not supported",
-                f"a {joint.type} joint",
-                "a floating or planar one, which only says where the platform is",
-                "correct it, or write null if a leg carries the platform",
-                str(path),
-            )
+            refused,
+            f"a {joint.type} joint",
+            "a floating or planar one, which only says where the platform is",
+            "correct it, or write null if a leg carries the platform",
+            path,
         )
     if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
         axis = ", ".join(f"{x:g}" for x in joint.axis)
         raise OutOfClass(
-            Problem(
-                f"legcal.platform_joint '{joint.name}' is not supported: found a planar joint "
-                f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
-                "plane of its frame; turn its origin rpy instead.",
-                file=str(path),
-            )
+            refused,
+            f"a planar joint with the axis ({axis})",
+            '<axis xyz="0 0 1"/>, because its plane is the xy plane of its frame',
+            "turn its origin rpy instead",
+            path,
         )
-
-
-def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> None:
-    """Check that the virtual joint carries the platform from the base.
-
-    Raises
-    ------
-    OutOfClass
-        If its links belong to other bodies.
-    """
-    if block.platform_joint is None:
-        return
-    joint = urdf.joints[block.platform_joint]
     carrying = bodies.body_of[joint.parent], bodies.body_of[joint.child]
     if carrying != (bodies.body_of[block.base], bodies.body_of[block.platform]):
         raise OutOfClass(
-            Problem(
-                f"legcal.platform_joint '{joint.name}' is not supported",
-                f"it between the parent '{joint.parent}' and the child '{joint.child}'",
-                f"'{block.base}' and '{block.platform}'",
-                "name the joint that carries the platform, or write null",
-                str(path),
-            )
+            refused,
+            f"it between the parent '{joint.parent}' and the child '{joint.child}'",
+            f"'{block.base}' and '{block.platform}'",
+            "name the joint that carries the platform, or write null",
+            path,
         )
 
 
 def check_plane(
     block: LegcalBlock, bodies: Bodies, urdf: Urdf, normals: Normals | None, path: Path
 ) -> None:
-    """Check that a planar virtual joint lets the platform move as its legs do.
-
-    Raises
-    ------
-    OutOfClass
-        If the mechanism moves in space or in another plane.
-    """
+    """Check that a planar virtual joint lets the platform move as its legs do."""
     if block.platform_joint is None:
         return
     joint = urdf.joints[block.platform_joint]
@@ -452,61 +396,24 @@ def check_plane(
         return
     if normals is None:
         raise OutOfClass(
-            Problem(
-                f"legcal.platform_joint '{joint.name}' is not supported",
-                "a planar joint",
-                "a floating one, because the axes of the legs do not let the platform "
-                "move in one plane",
-                "correct its type",
-                str(path),
-            )
+            f"legcal.platform_joint '{joint.name}' is not supported",
+            "a planar joint",
+            "a floating one, because the axes of the legs do not let the platform "
+            "move in one plane",
+            "correct its type",
+            path,
         )
     z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
     normal = bodies.T_body_link[joint.parent][:3, :3].T @ normals[0]
     if not parallel(z, normal):
         tilt = 90.0 - np.degrees(off_square(z, normal))
         raise OutOfClass(
-            Problem(
-                f"legcal.platform_joint '{joint.name}' is not supported",
-                f"its plane {tilt:.4g} deg from the plane in which the legs move",
-                "the same plane within 0.057 deg",
-                "correct its origin rpy",
-                str(path),
-            )
+            f"legcal.platform_joint '{joint.name}' is not supported",
+            f"its plane {tilt:.4g} deg from the plane in which the legs move",
+            "the same plane within 0.057 deg",
+            "correct its origin rpy",
+            path,
         )
-
-
-def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
-    """Refuse loops of bodies that are not connected with the platform."""
-    group = {body: body for body in bodies.body_of.values()}
-
-    def find(body: str) -> str:
-        while group[body] != body:
-            body = group[body]
-        return body
-
-    for connection in bodies.connections:
-        if base not in connection.bodies:
-            first, second = (find(body) for body in connection.bodies)
-            group[second] = first
-    others = [
-        next(find(body) for body in c.bodies if body != base)
-        for c in bodies.connections
-        if base in c.bodies and set(c.bodies) != {base}
-    ]
-    for other in others:
-        if other != find(platform) and others.count(other) > 1:
-            member = _most_joined(bodies, {body for body in group if find(body) == other})
-            raise OutOfClass(
-                Problem(
-                    "the mechanism could not be read",
-                    f"a second mechanism on the base, with link '{member}', that has no "
-                    f"moving body in common with the platform '{platform}'",
-                    "one",
-                    "write each to its own file",
-                    str(urdf.path),
-                )
-            )
 
 
 def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
@@ -527,12 +434,6 @@ def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str)
             raise OutOfClass(_platform_of_several_bodies(urdf, body, connection))
 
 
-def _most_joined(bodies: Bodies, members: set[str]) -> str:
-    """Return the body with the most joints."""
-    ends = [body for c in bodies.connections for body in c.bodies if body in members]
-    return max(sorted(members), key=ends.count)
-
-
 def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
     """Return a connection passed from one of its bodies to the other."""
     axis = urdf.joints[connection.joint].axis if connection.joint else np.zeros(3)
@@ -546,34 +447,27 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
         "planar",
     ):
         raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
-                "at most the virtual one that carries the platform",
-                "name that one in legcal.platform_joint",
-                str(urdf.path),
-            )
+            "this mechanism is not supported",
+            f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
+            "at most the virtual one that carries the platform",
+            "name that one in legcal.platform_joint",
+            urdf.path,
         )
     if connection.bodies[0] == connection.bodies[1]:
         raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                f"{_name(connection)} between two links that are rigidly connected",
-                "a joint that can move",
-                "remove it",
-                str(urdf.path),
-            )
+            "this mechanism is not supported",
+            f"{_name(connection)} between two links that are rigidly connected",
+            "a joint that can move",
+            "remove it",
+            urdf.path,
         )
     if set(connection.bodies) == {base, platform} and connection.type == "prismatic":
         raise OutOfClass(
-            Problem(
-                "this mechanism is not supported",
-                f"{_name(connection)} directly between base and platform",
-                "legs",
-                "name it in legcal.platform_joint if it is the virtual joint that "
-                "carries the platform",
-                str(urdf.path),
-            )
+            "this mechanism is not supported",
+            f"{_name(connection)} directly between base and platform",
+            "legs",
+            "name it in legcal.platform_joint if it is the virtual joint that carries the platform",
+            urdf.path,
         )
 
 
@@ -754,13 +648,11 @@ def _platform_body(
     if n_base < 2:
         joints = "1 joint" if n_base == 1 else "no joint"
         raise OutOfClass(
-            Problem(
-                "this is not a parallel mechanism",
-                f"{joints} on the base ({urdf.wording.root})",
-                "one for each leg",
-                f"{urdf.wording.state_ends} if another link is the base",
-                str(path),
-            )
+            "this is not a parallel mechanism",
+            f"{joints} on the base ({urdf.wording.root})",
+            "one for each leg",
+            f"{urdf.wording.state_ends} if another link is the base",
+            path,
         )
     meeting = [body for body in at if body != base and len(at[body]) > 2]
     candidates = meeting or [body for body in at if body != base]
@@ -778,26 +670,22 @@ def _platform_body(
         return platforms[0]
     if platforms:
         raise OutOfClass(
-            Problem(
-                "no platform could be proposed",
-                f"several links where legs could end ({', '.join(platforms)})",
-                "one",
-                urdf.wording.state_ends,
-                str(path),
-            )
+            "no platform could be proposed",
+            f"several links where legs could end ({', '.join(platforms)})",
+            "one",
+            urdf.wording.state_ends,
+            path,
         )
     if meeting:
         raise reasons[0]
     raise OutOfClass(
-        Problem(
-            "this mechanism is not supported",
-            "one closed chain in which no link is a platform on legs, because on "
-            "each side of any link more than a slider or a rod moves the joint at A; "
-            "needed legs of type joint, slider or rod, joint",
-            "",
-            "this machine cannot be calibrated with legcal",
-            str(path),
-        )
+        "this mechanism is not supported",
+        "one closed chain in which no link is a platform on legs, because on "
+        "each side of any link more than a slider or a rod moves the joint at A; "
+        "needed legs of type joint, slider or rod, joint",
+        "",
+        "this machine cannot be calibrated with legcal",
+        path,
     )
 
 

@@ -2,8 +2,7 @@
 
 import math
 import re
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -14,11 +13,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
 from legcal.errors import Code, ModelError, Problem, Problems
-from legcal.files.schema import NAME_NEEDED, describe, is_name
+from legcal.files.schema import NAME_NEEDED, content_of, describe, is_name
 from legcal.geometry.motions import matrix_of
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.files import read_file
 
 MAX_ELEMENTS = 50_000
 MAX_LINKS = 1000
@@ -113,6 +111,16 @@ class XmlProblems(Problems):
             )
         )
 
+    def check_unique(self, elements: Iterable[etree._Element], key: str = "name") -> None:
+        """Add a problem of each element with the name of an earlier one."""
+        seen: set[str] = set()
+        for element in elements:
+            name = element.get(key)
+            if name in seen:
+                mistake = f"has the name '{name}', which another {element.tag} has"
+                self.at(element, mistake, "give each its own name")
+            seen |= {name} if name else set()
+
 
 def number_list(text: str, count: int) -> list[float] | None:
     """Return ``count`` finite numbers of plausible size, separated by spaces, or None."""
@@ -190,21 +198,14 @@ def check_tree(
 
 def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
     """Check that every element has a name of its own."""
-    counts = Counter(e.get("name", "") for e in elements)
-    seen: set[str] = set()
     for element in elements:
         name = element.get("name", "")
         if not name.strip():
             problems.at(element, "has no name", "name it")
         elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
-            problems.at(
-                element, f"has a name that cannot be used, needed {NAME_NEEDED}", "rename it"
-            )
-        elif name in seen:
-            problems.at(
-                element, f"has a name that {counts[name]} of them share", "give each its own name"
-            )
-        seen.add(name)
+            mistake = f"has a name that cannot be used, needed {NAME_NEEDED}"
+            problems.at(element, mistake, "rename it")
+    problems.check_unique(elements)
 
 
 def _root(
@@ -336,7 +337,6 @@ class Urdf:
     links: tuple[str, ...]  # link names in the order of the file
     joints: dict[str, UrdfJoint]  # joints by name in the order of the file
     root: str  # the link without a parent
-    has_cylinders: bool  # whether any visual is a cylinder
     wording: Wording = BLOCK  # words for messages about the mechanism
 
     @property
@@ -361,7 +361,7 @@ def written(robot: etree._Element) -> bytes:
 
 def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
     """Return the tree of a URDF file."""
-    return parse_urdf(path, read_file(path, "URDF"), travel_needed=travel_needed)
+    return parse_urdf(path, content_of(path, "URDF", ModelError), travel_needed=travel_needed)
 
 
 def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
@@ -420,7 +420,6 @@ def checked_tree(
         links=tuple(str(e.get("name")) for e in links),
         joints=tree,
         root=root,
-        has_cylinders=any(e.find("visual/geometry/cylinder") is not None for e in links),
     )
 
 

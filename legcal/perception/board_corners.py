@@ -6,6 +6,7 @@ shows the board, :func:`require_board` says what they show instead.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -453,67 +454,63 @@ def _search(board: Board, load: Load, row: int) -> tuple[IntArray, Array, Array]
 
 
 _MIN_MARKERS = 3  # of another dictionary that are no chance
+_MIN_TAGS = 6  # of an image that says how tags are laid out
+_MISLAID = 0.2  # of the step from a tag to the nearest, by which they are off (rms): wrong,
+_BETTER = 0.5  # where otherwise laid out it is less than this part
 
 
 def shown_board(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
     """Return the board that images show, and a note on it, "" for none.
 
     Of a chessboard squares are stated, and most people count its inner corners: it is the reading
-    that more images show. None where they show a larger one: which one goes after "found".
+    that more images show. None where they show another one: which one goes after "found".
     """
-    if board.kind != "chessboard":
-        return _shown_by_tags(board, seen)
-    extents = [one.extent for one in seen if one.extent[1] >= _MIN_SIDE]
-    if not extents:
-        return board, ""
-    counted = replace(board, columns=board.columns + 1, rows=board.rows + 1)
-    shown = max(board, counted, key=lambda one: extents.count(_extent(one)))
-    most = _extent(shown)
-    larger = [one for one in extents if one[0] > most[0] or one[1] > most[1]]
     in_all = f"of its {len(seen)} image{'s' * (len(seen) != 1)}"
-    if len(larger) > extents.count(most):
-        usual = max(larger, key=larger.count)
-        return None, f"{_squares(board, usual)} in {larger.count(usual)} {in_all}"
-    if shown is counted:
+    if board.kind != "chessboard":
+        return _shown_by_tags(board, seen, in_all)
+    extents = Counter(one.extent for one in seen if one.extent[1] >= _MIN_SIDE)
+    counted = replace(board, columns=board.columns + 1, rows=board.rows + 1)
+    shown = max(board, counted, key=lambda one: extents[_extent(one)])
+    most = _extent(shown)
+    larger = Counter({e: n for e, n in extents.items() if e[0] > most[0] or e[1] > most[1]})
+    if larger.total() > extents[most]:
+        usual, n = larger.most_common(1)[0]
+        return None, f"{_squares(board, usual)} in {n} {in_all}"
+    if shown is counted and extents:
         word = f"{shown.columns}x{shown.rows}"
         return shown, (
             f"The board has {word} squares ({board.columns}x{board.rows} inner corners); write "
             f"--board chessboard:{word}:{1e3 * board.side:g}mm."
         )
-    usual = max(extents, key=extents.count)
-    if most not in extents and 2 * extents.count(usual) > len(seen):
-        # Turned by half a turn it has its black squares where its images have them.
-        fits = sum(usual) % 2 == 1
-        fits &= all(one[0] <= usual[0] and one[1] <= usual[1] for one in extents)
-        x, y = _turned_as(board, usual)
-        taken = ": the board was taken for the smaller one" if fits else ""
-        n_usual = f"{extents.count(usual)} {in_all}"
-        said = _smaller(board, _squares(board, usual), n_usual, taken)
-        return replace(board, columns=x + 1, rows=y + 1) if fits else shown, said
-    return shown, ""
+    usual, n = extents.most_common(1)[0] if extents else (most, 0)
+    if not extents[most] and 2 * n > len(seen):
+        return board, _smaller(board, _squares(board, usual), f"{n} {in_all}")
+    return board, ""
 
 
-def _smaller(board: Board, seen: str, n_images: str, taken: str = "") -> str:
+def _smaller(board: Board, seen: str, n_images: str) -> str:
     """Return a note for a detected board that is smaller than stated."""
     return (
         f"{seen[0].upper()}{seen[1:]} or that part of one is seen in {n_images}, and the whole "
-        f"of {board_in_words(board)} in none{taken}; correct --board, or uncover the board."
+        f"of {board_in_words(board)} in none; correct --board, or uncover the board."
     )
 
 
-_MIN_TAGS = 6  # of an image that says how tags are laid out
-_MISLAID = 0.2  # of the step from a tag to the nearest, by which they are off (rms): wrong,
-_BETTER = 0.5  # where otherwise laid out it is less than this part
-
-
-def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
+def _shown_by_tags(
+    board: Board, seen: Sequence[SeenBoard], in_all: str
+) -> tuple[Board | None, str]:
     """Return the board with tags or markers that images show, by how their numbers lie.
 
-    Arguments and result are those of :func:`shown_board`.
+    The result is that of :func:`shown_board`.
     """
+    for one in seen:
+        number, times = np.unique(one.tags, return_counts=True)
+        if len(number) < times.max(initial=0) >= _MIN_TAGS:
+            thing, k = _things(board)[:-1], number[int(np.argmax(times))]
+            return None, f"the same {thing} (number {k}) {times.max()} times in an image"
     telling = [one for one in seen if len(np.unique(one.tags)) >= _MIN_TAGS]
     if not telling:
-        return _repeated_tag(board, seen)
+        return board, ""
     # Markers of a ChArUco board are on white squares; in the older pattern the first may be one.
     usual = 0 if board.kind == "charuco" and board.legacy and board.rows % 2 == 0 else 1
     stated = np.array([_mislaid(board, board.columns, usual, one) for one in telling])
@@ -536,26 +533,9 @@ def _shown_by_tags(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | Non
     what = board_in_words(replace(board, columns=columns, rows=rows))
     if parity != usual:
         what += " of the older pattern (:legacy)" if parity == 0 else " without :legacy"
-    in_all = f"{n_agree} of its {len(seen)} image{'s' * (len(seen) != 1)}"
     if (columns, parity) != (board.columns, usual) or rows > board.rows:
-        return None, f"{what} in {in_all}"
-    return board, _smaller(board, what, in_all) if rows < board.rows else ""
-
-
-def _repeated_tag(board: Board, seen: Sequence[SeenBoard]) -> tuple[Board | None, str]:
-    """Return no board if one tag fills an image, which is described; else the board."""
-    for one in seen:
-        number, times = np.unique(one.tags, return_counts=True)
-        if len(number) and times.max() >= _MIN_TAGS:
-            thing, k = _things(board)[:-1], number[int(np.argmax(times))]
-            return None, f"the same {thing} (number {k}) {times.max()} times in an image"
-    return board, ""
-
-
-def _n_tags(board: Board) -> int:
-    """Return the number of tags or markers of a board."""
-    count = board.columns * board.rows
-    return count if board.kind == "aprilgrid" else count // 2
+        return None, f"{what} in {n_agree} {in_all}"
+    return board, _smaller(board, what, f"{n_agree} {in_all}") if rows < board.rows else ""
 
 
 def _middles(board: Board, columns: int, parity: int, tags: IntArray) -> Array:
@@ -589,18 +569,13 @@ def _extent(board: Board) -> tuple[int, int]:
     return max(board.grid), min(board.grid)
 
 
-def _turned_as(board: Board, extent: tuple[int, int]) -> tuple[int, int]:
-    """Return columns and rows of corners, turned as the board is."""
-    (a, b), (nx, ny) = extent, board.grid
-    return min(
-        ((b, a), (a, b)),
-        key=lambda side: (abs(side[0] - nx) + abs(side[1] - ny), abs(side[0] - nx)),
-    )
-
-
 def _squares(board: Board, extent: tuple[int, int]) -> str:
     """Return the chessboard with these numbers of corners, turned as the board is."""
-    x, y = _turned_as(board, extent)
+    nx, ny = board.grid
+    x, y = min(
+        (extent[::-1], extent),
+        key=lambda side: (abs(side[0] - nx) + abs(side[1] - ny), abs(side[0] - nx)),
+    )
     return f"a chessboard of {x + 1} x {y + 1} squares"
 
 
@@ -612,14 +587,13 @@ def describe_image(
     grey = np.ascontiguousarray(image, dtype=np.float32)
     if board.kind != "chessboard" and (markers := _other_markers(board, grey)):
         return markers
-    seen = search_board(replace(board, kind="chessboard"), grey)
-    extent, most = seen.extent, _extent(board)
+    extent, most = search_board(replace(board, kind="chessboard"), grey).extent, _extent(board)
     if extent[1] < _MIN_SIDE:
         return None
     if board.kind != "chessboard":
         return f"{_squares(board, extent)} without such {_things(board)}"
-    part = extent[0] <= most[0] and extent[1] <= most[1]
-    return _squares(board, extent) + (" or that part of one" if part else "")
+    is_part = extent[0] <= most[0] and extent[1] <= most[1]
+    return _squares(board, extent) + " or that part of one" * is_part
 
 
 def _things(board: Board) -> str:
@@ -637,29 +611,27 @@ def tags_are_mirrored(
 
 
 def _other_markers(board: Board, grey: Grey) -> str | None:
-    """Return the numbers of the detected markers or tags."""
-    thing = _things(board)
-    own = _n_tags(board)
+    """Describe markers or tags that are not those of a board, or too few of them."""
+    thing, count = _things(board), board.columns * board.rows
+    n_tags = count if board.kind == "aprilgrid" else count // 2
     scale = possible_scale(grey, 1.0, _MAX_PIXELS)
-    numbers, _ = _search_tags(board, grey, scale)
+    numbers, places = _search_tags(board, grey, scale)
     if len(numbers) < _MIN_MARKERS and tags_are_mirrored(board, grey):
         return f"its {thing} mirrored (left and right exchanged)"
-    beyond = np.unique(numbers[numbers >= own])
-    if len(beyond):
+    none = np.zeros((0, 2))
+    seen = SeenBoard(board.kind, none.astype(np.intp), none, none[:, 0], none[:, 0].astype(np.intp),
+                     numbers, places.mean(axis=1))  # fmt: skip
+    if (layout := _shown_by_tags(board, [seen], ""))[0] is None:
+        return layout[1].removesuffix(" in 1 ")
+    if (numbers >= n_tags).any():
         return (
-            f"{thing} with numbers up to {int(beyond.max())}, and such a board has 0 to {own - 1}"
+            f"{thing} with numbers up to {int(numbers.max())}, and such a board has 0 to "
+            f"{n_tags - 1}"
         )
-    if len(numbers) and board.kind == "charuco":
-        for turned, what in (
-            (replace(board, columns=board.rows, rows=board.columns), "squares_x and squares_y"),
-            (replace(board, legacy=not board.legacy), "legacy_pattern"),
-        ):
-            if len(_tags_and_corners(turned, grey)[0][0]) > 3:
-                return f"its {thing}, as of a board with another {what}"
     if len(numbers):
-        return f"only {len(numbers)} of its {own} {thing}"
+        return f"only {len(numbers)} of its {n_tags} {thing}"
     for other in DICTIONARIES:
-        seen = _search_tags(replace(board, dictionary=other), grey, scale)[0]
-        if other != board.dictionary and len(seen) >= _MIN_MARKERS:
+        others = _search_tags(replace(board, dictionary=other), grey, scale)[0]
+        if other != board.dictionary and len(others) >= _MIN_MARKERS:
             return f"markers of {other}"
     return None

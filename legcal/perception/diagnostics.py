@@ -16,9 +16,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.causes import Cause, by_cause
-from legcal.data.image_causes import images_in_words
 from legcal.data.landmarks import LANDMARKS_NAME
-from legcal.data.measurements import Measurements, few_views
+from legcal.data.measurements import Measurements, few_views, images_in_words
 from legcal.data.outlines import Outlines, is_edited
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.motions import pose_distance

@@ -18,8 +18,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.image_causes import images_in_words
-from legcal.data.measurements import Measurements
+from legcal.data.measurements import Measurements, images_in_words
 from legcal.data.outlines import Outlines, is_edited, join_outlines, merge_edited, no_outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, IntArray

@@ -17,8 +17,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from legcal.causes import Cause, by_cause
-from legcal.data.image_causes import image_notes
-from legcal.data.measurements import Measurements, few_views
+from legcal.data.measurements import Measurements, few_views, image_notes
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm

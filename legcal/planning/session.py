@@ -35,7 +35,7 @@ from legcal.machine.model_writer import write_model
 from legcal.planning.order import HOME
 from legcal.planning.planned_session import Plan
 from legcal.vision.board_file import board_document
-from legcal.vision.camera_file import camera_info
+from legcal.vision.camera_export import camera_info
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
 HAND = "hand"  # the view of a hand-held camera

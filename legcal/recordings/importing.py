@@ -28,8 +28,15 @@ from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.progress import Report, no_progress
-from legcal.recordings.bag import Bag, is_bag, split_topic
-from legcal.recordings.frames import VIDEOS, ImageFolder, Recording, Video
+from legcal.recordings.frames import (
+    VIDEOS,
+    Bag,
+    ImageFolder,
+    Recording,
+    Video,
+    is_bag,
+    split_topic,
+)
 from legcal.recordings.series import Series, read_series
 from legcal.recordings.stillness import (
     NoOffset,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.text import Text
 
+from legcal.calibration.detection_folder import DETECTION_PAGE, tables_of
 from legcal.calibration.examination import Examination
-from legcal.calibration.examination_page import DETECTION_PAGE, tables_of
 from legcal.errors import printable
 from legcal.pages.document import Table
 from legcal.report.render import Report, heading, report

@@ -31,7 +31,7 @@ from legcal.simulation.board import documents
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
-from legcal.vision.camera_file import camera_info
+from legcal.vision.camera_export import camera_info
 
 TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"

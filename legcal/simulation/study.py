@@ -22,11 +22,10 @@ from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
 from legcal.files.schema import SparseDocument
-from legcal.processors import processors
 from legcal.progress import Progress, shown_progress
 from legcal.signals import raise_if_stopped
 from legcal.version import __version__
-from legcal.workers import Workers, is_number, worker_pool
+from legcal.workers import Workers, is_number, processors, worker_pool
 
 CHECKPOINT_NAME = "runs.jsonl"
 DOCUMENT_NAME = "study.json"

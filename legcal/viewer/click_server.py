@@ -19,8 +19,8 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from legcal.calibration.detection import Detection
+from legcal.calibration.detection_folder import DETECTION_PAGE, edges_seen_from, examination_page
 from legcal.calibration.examination import Examination
-from legcal.calibration.examination_page import DETECTION_PAGE, edges_seen_from, examination_page
 from legcal.data.landmarks import (
     LANDMARKS_NAME,
     Landmarks,

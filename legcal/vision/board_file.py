@@ -15,6 +15,7 @@ from legcal.errors import DatasetError, UsageError
 from legcal.files.motions import MotionEntry
 from legcal.files.quantity import LENGTH, parse_quantity
 from legcal.files.schema import FileSchema, Number, closest, describe, read_yaml, validate
+from legcal.files.table import is_number
 from legcal.vision.board import (
     APRIL_TAGS,
     DICTIONARIES,
@@ -38,24 +39,12 @@ def _in_metres(side: float) -> float:
     return side
 
 
-def _count(number: int) -> int:
-    """Refuse a number of squares or tags that no board has."""
-    if not 1 <= number <= MAX_COUNT:
-        raise ValueError(f"found {number}, needed 1 to {MAX_COUNT}; correct the number.")
-    return number
-
-
 Side = Annotated[
     Number,
     AfterValidator(_in_metres),
     Field(json_schema_extra={"minimum": SIDES[0], "maximum": SIDES[1]}),
 ]
-Count = Annotated[
-    int,
-    Strict(),
-    AfterValidator(_count),
-    Field(json_schema_extra={"minimum": 1, "maximum": MAX_COUNT}),
-]
+Count = Annotated[int, Strict(), Field(ge=1, le=MAX_COUNT)]
 
 
 class _BoardEntry(FileSchema):
@@ -85,18 +74,11 @@ class ChessboardEntry(_BoardEntry):
     square: Side
 
     @model_validator(mode="after")
-    def _looks_different_from_each_side(self) -> Self:
-        x, y = self.squares_x, self.squares_y
-        if min(x, y) < 4:
+    def _has_enough_corners(self) -> Self:
+        if min(self.squares_x, self.squares_y) < 4:
             raise ValueError(
-                f"found {x} x {y} squares, needed 4 or more each way, of which black and white "
-                "ones are counted; correct them or use another board."
-            )
-        if x % 2 == y % 2:
-            raise ValueError(
-                f"found a chessboard of {x} x {y} squares, which looks the same after half a turn, "
-                "needed an odd number of squares one way and an even one the other; cover a row "
-                "of squares, or use another board, such as ChArUco."
+                f"found {self.squares_x} x {self.squares_y} squares, needed 4 or more each way, of "
+                "which black and white ones are counted; correct them or use another board."
             )
         return self
 
@@ -281,7 +263,22 @@ def _markers(board: Board) -> str:
 
 
 def parse_board(mapping: Any, path: Path) -> FixedBoard:
-    """Return the board that one mapping describes."""
+    """Return the board that one mapping describes; it may not look like itself turned."""
+    entry = _entry(mapping, path)
+    board = entry.board()
+    if board.kind == "chessboard" and board.columns % 2 == board.rows % 2:
+        raise DatasetError(
+            f"{path}: board could not be used: found a chessboard of {board.columns} x "
+            f"{board.rows} squares, which looks the same after half a turn, needed an odd number "
+            "of squares one way and an even one the other; cover a row of squares, or use another "
+            "board, such as ChArUco."
+        )
+    pose = entry.T_base_board if entry.on == "base" else entry.T_platform_board
+    return FixedBoard(board, entry.on, None if pose is None else pose.motion())
+
+
+def _entry(mapping: Any, path: Path) -> ChessboardEntry | CharucoEntry | AprilgridEntry:
+    """Return the checked block of a board."""
     if not isinstance(mapping, Mapping):
         raise DatasetError(
             f"{path}: board could not be read: found {describe(mapping)}, needed a mapping with "
@@ -301,9 +298,7 @@ def parse_board(mapping: Any, path: Path) -> FixedBoard:
             f"{path}: board.kind could not be read: found {kind_in_words}, needed "
             f"{', '.join(_KINDS)}; name the kind of the board."
         )
-    entry = validate(_KINDS[kind], mapping, path, "board")
-    pose = entry.T_base_board if entry.on == "base" else entry.T_platform_board
-    return FixedBoard(entry.board(), entry.on, None if pose is None else pose.motion())
+    return validate(_KINDS[kind], mapping, path, "board")
 
 
 def board_document(board: Board) -> dict[str, Any]:
@@ -324,56 +319,48 @@ FORMS = {
     "charuco": "charuco:7x5:40mm:29mm:DICT_4X4_50 (squares, side, marker, dictionary)",
     "aprilgrid": "aprilgrid:6x6:88mm:0.3 (tags, side, gap as a part of it)",
 }
-_MIN_SQUARES = 4  # minimum number of squares along a side of a chessboard
+# The keys of a block in the order of the words of --board
+_KEYS = {
+    "chessboard": ("squares_x", "squares_y", "square"),
+    "charuco": ("squares_x", "squares_y", "square", "marker", "dictionary", "legacy_pattern"),
+    "aprilgrid": ("tags_x", "tags_y", "tag_size", "tag_spacing"),
+}
+_USUAL_SQUARE = 0.025  # [m]: the size does not matter to a camera
 _COUNTS = re.compile(r"(\d{1,4})[xX](\d{1,4})", re.ASCII)
 _OPTION = "--board"
 
 
 def board_of(spec: str | Path | Board) -> Board:
-    """Return the board that a word or a file describes."""
+    """Return the board that a word or a file describes; the orientation of a chessboard is open."""
     if isinstance(spec, Board):
         return spec
     kind, *words = str(spec).split(":")
     if kind not in FORMS:
         return read_board_file(Path(spec))
-    counts = _COUNTS.fullmatch(words[0]) if words else None
-    expected = {"chessboard": (1, 2), "charuco": (4, 5), "aprilgrid": (3,)}[kind]
-    if counts is None or len(words) not in expected:
+    counts, keys = _COUNTS.fullmatch(words[0]) if words else None, _KEYS[kind]
+    n_optional = 0 if kind == "aprilgrid" else 1
+    if counts is None or not 0 <= len(keys) - 1 - len(words) <= n_optional:
         raise _refused(str(spec), describe(str(spec)), FORMS[kind])
-    x, y = int(counts[1]), int(counts[2])
+    block: dict[str, Any] = {"kind": kind, keys[0]: int(counts[1]), keys[1]: int(counts[2])}
+    for key, word in zip(keys[2:], words[1:], strict=False):
+        if key == "dictionary":
+            block[key] = word
+        elif key == "legacy_pattern":
+            if word != "legacy":
+                raise _refused(str(spec), describe(word), "legacy, or nothing, at the end")
+            block[key] = True
+        elif key == "tag_spacing":
+            if not is_number(word):
+                raise _refused(str(spec), describe(word), "the gap as a number, 0.3")
+            block[key] = float(word)
+        else:
+            block[key] = parse_quantity(word, LENGTH, _OPTION)
     if kind == "chessboard":
-        return _chessboard(str(spec), x, y, words[1:])
-    side = parse_quantity(words[1], LENGTH, _OPTION)
-    if kind == "aprilgrid":
-        try:
-            spacing = float(words[2])
-        except ValueError as error:
-            raise _refused(str(spec), describe(words[2]), "the gap as a number, 0.3") from error
-        entries = {"tags_x": x, "tags_y": y, "tag_size": side, "tag_spacing": spacing}
-    else:
-        marker = parse_quantity(words[2], LENGTH, _OPTION)
-        entries = {"squares_x": x, "squares_y": y, "square": side, "marker": marker}
-        entries["dictionary"] = words[3]  # type: ignore[assignment]
-        if words[4:]:
-            if words[4] != "legacy":
-                raise _refused(str(spec), describe(words[4]), "legacy, or nothing, at the end")
-            entries["legacy_pattern"] = True
+        block.setdefault("square", _USUAL_SQUARE)
     try:
-        return parse_board({"kind": kind, **entries}, Path(_OPTION)).board
+        return _entry(block, Path(_OPTION)).board()
     except DatasetError as error:
         raise UsageError(error.facts) from error
-
-
-def _chessboard(spec: str, x: int, y: int, words: list[str]) -> Board:
-    """Return a chessboard; its orientation does not matter to a camera."""
-    side = parse_quantity(words[0], LENGTH, _OPTION) if words else 0.025
-    if not _MIN_SQUARES <= min(x, y) <= max(x, y) <= MAX_COUNT:
-        needed = f"{_MIN_SQUARES} to {MAX_COUNT} squares each way, black and white ones counted"
-        raise _refused(spec, f"{x} x {y} squares", needed)
-    if not SIDES[0] <= side <= SIDES[1]:
-        needed = f"a side of {1e3 * SIDES[0]:g} to {1e3 * SIDES[1]:g} mm"
-        raise _refused(spec, f"squares of {1e3 * side:g} mm", needed)
-    return Board("chessboard", x, y, side)
 
 
 def read_board_file(path: Path) -> Board:
@@ -384,7 +371,7 @@ def read_board_file(path: Path) -> Board:
     document = read_yaml(path, "board file")
     block = document.get("board")
     if isinstance(block, dict):
-        return parse_board(block, path).board
+        return _entry(block, path).board()
     if "target_type" in document or "tagCols" in document:
         return _kalibr_target(document, path)
     raise DatasetError(
@@ -400,7 +387,7 @@ def _kalibr_target(document: Mapping[str, Any], path: Path) -> Board:
         grid = validate(KalibrAprilgrid, document, path)
         sides = {"tag_size": grid.tagSize, "tag_spacing": grid.tagSpacing}
         numbers = {"tags_x": grid.tagCols, "tags_y": grid.tagRows, **sides}
-        return parse_board({"kind": kind, **numbers}, path).board
+        return _entry({"kind": kind, **numbers}, path).board()
     if kind != "checkerboard":
         raise DatasetError(
             f"{path}: target_type could not be used: found {describe(kind)}, needed aprilgrid or "

@@ -1,4 +1,4 @@
-"""Camera files written for other programs."""
+"""Camera files written: for datasets as ROS has them, and for other programs."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import yaml
 
 from legcal.errors import UsageError
 from legcal.files.folder import OutputFile
-from legcal.vision.camera import Camera
+from legcal.files.published import with_schema
+from legcal.vision.camera import Camera, intrinsic_names
 from legcal.vision.camera_file import (
     CALIBRATED,
     PARAMETERS,
     calibrated_block,
-    camera_info,
     read_camera,
 )
 from legcal.vision.distortion import CameraProgram
@@ -26,6 +26,46 @@ _MARK = "# camera converted by legcal\n"
 CONVERTED = OutputFile(
     "the camera", "camera file", "", "a new file or one that this command wrote", _MARK.encode()
 )
+
+
+def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None) -> str:
+    """Return the text of a ROS camera_info file that reads back as the same camera."""
+    distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
+    projection = np.column_stack([camera.K, np.zeros(3)])
+    document = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": camera.K.ravel().tolist()},
+        # ROS passes on any number of coefficients of this name to OpenCV.
+        "distortion_model": (
+            "rational_polynomial" if camera.model == "thin_prism" else camera.model
+        ),
+        "distortion_coefficients": {
+            "rows": 1,
+            "cols": len(distortion),
+            "data": distortion.tolist(),
+        },
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": projection.ravel().tolist()},
+        **(more or {}),
+    }
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    return with_schema("camera", text)
+
+
+def rough_camera_info(camera: Camera, name: str) -> str:
+    """Return the text of the camera file of a rough camera, with its covariance."""
+    names = intrinsic_names(camera)
+    C = np.zeros((len(names), len(names))) if camera.covariance is None else camera.covariance
+    inexact = [i for i in range(len(names)) if C[i, i] > 0.0]
+    stated = {
+        "version": 1,
+        "sigma": {names[i]: float(np.sqrt(C[i, i])) for i in inexact},
+        "names": [names[i] for i in inexact],
+        "covariance": C[np.ix_(inexact, inexact)].tolist(),
+    }
+    return camera_info(camera, name, {CALIBRATED: stated})
 
 
 def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Camera files of ROS, OpenCV, Kalibr, mrcal, COLMAP, Basalt and MATLAB read; ROS written.
+"""Camera files of ROS, OpenCV, Kalibr, mrcal, COLMAP, Basalt and MATLAB, read.
 
 ``_FORMATS`` lists the forms of mappings, ``PARAMETERS`` the lens models of programs that list all
 numbers of a camera in one row.
@@ -14,11 +14,9 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import BadValue, DatasetError
-from legcal.files.published import with_schema
 from legcal.files.schema import FileSchema, content_of, describe, parse_yaml, validate
 from legcal.geometry.types import Array
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
@@ -189,24 +187,14 @@ def _as_3x3(rows: object) -> object:
 _Rows = Annotated[list[list[float]], BeforeValidator(_as_3x3)]
 
 
-class _MatlabLens(_OpenSchema):
-    """The image and the lens in the struct of MATLAB's camera parameters."""
+class MatlabEntry(_OpenSchema):
+    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
 
     ImageSize: Size  # rows, columns
     RadialDistortion: Annotated[list[float], Field(min_length=2, max_length=3)]
     TangentialDistortion: Annotated[list[float], Field(min_length=2, max_length=2)]
-
-
-class MatlabEntry(_MatlabLens):
-    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
-
-    K: _Rows
-
-
-class OldMatlabEntry(_MatlabLens):
-    """The struct of MATLAB before R2022b: with the transpose of K."""
-
-    IntrinsicMatrix: _Rows
+    K: _Rows | None = None
+    IntrinsicMatrix: _Rows | None = None  # the transpose of K, before R2022b
 
 
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
@@ -355,70 +343,49 @@ def _from_ros(document: Mapping[str, Any], path: Path) -> Camera:
 
 def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | None:
     """Return the covariance of all intrinsics, None where only standard deviations are stated."""
-    intrinsics, names, rows = intrinsic_names(camera), entry.names, entry.covariance
-    for key, listed in (("sigma", list(entry.sigma)), ("names", names or [])):
-        unknown = [name for name in listed if name not in intrinsics]
-        twice = sorted({name for name in listed if listed.count(name) > 1})
-        if unknown or twice:
-            wrong_names = ", ".join(unknown) or f"{', '.join(twice)} twice"
-            raise DatasetError(
-                f"{path}: legcal_camera.{key} could not be used: found {wrong_names}, needed "
-                f"names of {camera.model}: {', '.join(intrinsics)}; calibrate the camera again."
-            )
-    if names is None and rows is None:
-        return None
-    problem = _covariance_problem(names, rows, entry.sigma)
-    if problem:
+    intrinsics, names = intrinsic_names(camera), entry.names or []
+    unknown = [name for name in (*entry.sigma, *names) if name not in intrinsics]
+    if unknown:
         raise DatasetError(
-            f"{path}: legcal_camera.covariance could not be used: found {problem}; calibrate the "
-            "camera again."
+            f"{path}: {CALIBRATED} could not be used: found {', '.join(unknown)}, needed names of "
+            f"{camera.model}: {', '.join(intrinsics)}; calibrate the camera again."
         )
-    covariance, indices = (
-        np.zeros((len(intrinsics), len(intrinsics))),
-        [intrinsics.index(n) for n in names or ()],
-    )
-    C = np.array(rows).reshape(len(indices), len(indices))
+    if entry.names is None and entry.covariance is None:
+        return None
+    rows = entry.covariance or []
+    is_square = [len(row) for row in rows] == len(names) * [len(names)]
+    are_distinct = bool(names) and len(set(names)) == len(names)
+    C = np.array(rows if is_square and are_distinct else np.zeros((0, 0)))
+    if not len(C) or not _is_covariance(C, names, entry.sigma):
+        raise DatasetError(
+            f"{path}: {CALIBRATED}.covariance could not be used: found numbers that are no "
+            f"covariance of {', '.join(names) or 'any names'} with the stated standard deviations, "
+            "needed the block as legcal camera writes it; calibrate the camera again."
+        )
+    indices = [intrinsics.index(name) for name in names]
+    covariance = np.zeros((len(intrinsics), len(intrinsics)))
     covariance[np.ix_(indices, indices)] = 0.5 * (C + C.T)
     return covariance
 
 
-def _covariance_problem(
-    names: Sequence[str] | None, rows: Sequence[Sequence[float]] | None, sigma: Mapping[str, float]
-) -> str:
-    """Return the actual and the needed content of an invalid covariance, in words; "" if valid."""
-    if names is None or rows is None:
-        missing, present = ("names", "covariance") if names is None else ("covariance", "names")
-        return f"{present} without {missing}, needed both"
-    n = len(names)
-    if len(rows) != n or any(len(row) != n for row in rows):
-        lengths = "rows of other lengths" if len(rows) == n else f"{len(rows)} rows"
-        return f"{lengths}, needed {n} rows of {n} numbers for {', '.join(names)}"
-    C = np.array(rows).reshape(n, n)
-    if not np.all(np.isfinite(C)):
-        return "a number that is not finite, needed variances and covariances"
-    variance = np.diagonal(C)
-    least, most = _SIGMAS
-    possible = (variance == 0.0) | ((variance >= least**2) & (variance <= most**2))
-    if not possible.all():
-        i = int(np.argmin(possible))
-        return (
-            f"the variance {variance[i]:g} of {names[i]}, needed zero or the square of a standard "
-            f"deviation of {least:g} to {most:g}"
-        )
-    root = np.sqrt(np.where(variance > 0.0, variance, 1.0))
-    if np.any(np.abs(C) > (1.0 + _ROUNDING) * np.outer(root, root)):
-        return "a matrix that is not positive semidefinite, needed one that is"
-    correlation = C / np.outer(root, root)
-    if np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
-        return "a matrix that is not symmetric, needed one that is"
-    exact = variance == 0.0
-    least_value = float(np.linalg.eigvalsh(correlation)[0]) if n else 0.0
-    if correlation[exact].any() or least_value < -_ROUNDING:
-        return "a matrix that is not positive semidefinite, needed one that is"
-    for name, s in zip(names, np.sqrt(variance).tolist(), strict=True):
-        if name in sigma and abs(sigma[name] - s) > _SIGMA_DIGITS * s:
-            return f"a standard deviation {s:g} of {name} in it, needed {sigma[name]:g} as in sigma"
-    return ""
+def _is_covariance(C: Array, names: Sequence[str], sigma: Mapping[str, float]) -> bool:
+    """Return whether a matrix is a covariance with plausible standard deviations, stated or not."""
+    variance, (least, most) = np.diagonal(C), _SIGMAS
+    is_exact = variance == 0.0
+    if not np.all(np.isfinite(C)) or not np.all(is_exact | (variance >= least**2)):
+        return False
+    deviation = np.sqrt(variance)
+    if np.any(np.abs(C) > (1.0 + _ROUNDING) * np.outer(deviation, deviation)):
+        return False
+    scale = np.where(is_exact, 1.0, deviation)
+    correlation = C / np.outer(scale, scale)
+    stated = np.array([sigma.get(name, s) for name, s in zip(names, deviation, strict=True)])
+    return bool(
+        np.all(deviation <= most)
+        and np.abs(correlation - correlation.T).max(initial=0.0) <= _ROUNDING
+        and np.linalg.eigvalsh(correlation).min(initial=0.0) >= -_ROUNDING
+        and np.all(np.abs(stated - deviation) <= _SIGMA_DIGITS * deviation)
+    )
 
 
 def _from_message(document: Mapping[str, Any], path: Path) -> Camera:
@@ -523,13 +490,16 @@ def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
 
 def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of MATLAB's struct: its first pixel is (1, 1)."""
-    entry: MatlabEntry | OldMatlabEntry
-    if "K" not in document and "IntrinsicMatrix" in document:
-        entry = validate(OldMatlabEntry, document, path)
-        by_rows = np.transpose(entry.IntrinsicMatrix)
-    else:
-        entry = validate(MatlabEntry, document, path)
-        by_rows = np.array(entry.K)
+    entry = validate(MatlabEntry, document, path)
+    transposed = None if entry.IntrinsicMatrix is None else np.transpose(entry.IntrinsicMatrix)
+    by_rows = transposed if entry.K is None else np.array(entry.K)
+    if by_rows is None:
+        raise DatasetError(
+            f"{path}: K could not be read: found no such key, needed it; add 'K: ...' to the file."
+        )
+    by_rows = np.array(
+        entry.K if entry.K is not None else np.transpose(entry.IntrinsicMatrix or [])
+    )
     K = by_rows - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     height, width = entry.ImageSize
     k1, k2, *k3 = entry.RadialDistortion
@@ -729,15 +699,10 @@ def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
             "row by row, divided by its last element."
         )
     for name, focal, extent in (("fx", K[0, 0], size[0]), ("fy", K[1, 1], size[1])):
-        if focal == 0.0 or abs(focal) < _SINGULAR * extent:
-            problems.append(
-                f"{start} {name} = {focal:g}, so that it is singular, needed a focal length above "
-                "0 px; copy it from the calibration."
-            )
-        elif focal < 0.0:
+        if focal < _SINGULAR * extent or focal == 0.0:
             problems.append(
                 f"{start} {name} = {focal:g}, needed a focal length above 0 px; write the matrix "
-                "for x to the right and y down."
+                "of the calibration, for x to the right and y down."
             )
     for name, centre, extent in (("cx", K[0, 2], size[0]), ("cy", K[1, 2], size[1])):
         if not -0.5 <= centre <= extent - 0.5:
@@ -770,29 +735,3 @@ _FORMATS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], _Reader], ...] =
         _from_ros,
     ),
 )
-
-
-def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None) -> str:
-    """Return the text of a ROS camera_info file that reads back as the same camera."""
-    distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
-    projection = np.column_stack([camera.K, np.zeros(3)])
-    document = {
-        "image_width": camera.width,
-        "image_height": camera.height,
-        "camera_name": name,
-        "camera_matrix": {"rows": 3, "cols": 3, "data": camera.K.ravel().tolist()},
-        # ROS passes on any number of coefficients of this name to OpenCV.
-        "distortion_model": (
-            "rational_polynomial" if camera.model == "thin_prism" else camera.model
-        ),
-        "distortion_coefficients": {
-            "rows": 1,
-            "cols": len(distortion),
-            "data": distortion.tolist(),
-        },
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": projection.ravel().tolist()},
-        **(more or {}),
-    }
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    return with_schema("camera", text)

@@ -22,23 +22,22 @@ from legcal.errors import BadValue, Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
-from legcal.vision.heic import (
-    HEIC_SUFFIXES,
-    UnreadableError,
-    can_read_heic,
-    heic_pixels,
-    heic_size,
-    is_heic,
-)
 from legcal.vision.image_facts import (
+    HEIC_SUFFIXES,
     JPEG_SIGNATURE,
     PILLOW_ERRORS,
     PNG_SIGNATURE,
     TIFF_SIGNATURES,
     ImageFacts,
+    UnreadableError,
+    can_read_heic,
     exif_tags,
+    heic_pixels,
+    heic_size,
+    is_heic,
     quiet_pillow,
     read_facts,
+    size_change,
 )
 
 _Level = TypeVar("_Level", np.uint8, np.float32)
@@ -260,23 +259,15 @@ def size_problem(width: int, height: int) -> tuple[str, str] | None:
 
 def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
     """Return in brackets the likely cause of an image size unlike the camera's, "" if unknown."""
-    causes = []
-    if size == ImageSize(needed.height, needed.width) and (facts.orientation or 1) >= _SIDEWAYS:
-        causes.append(
-            f"turned by a quarter turn, as programs show it by its EXIF orientation "
-            f"{facts.orientation}; pixels are taken as they are stored"
+    change = size_change((needed.width, needed.height), (size.width, size.height))
+    causes = [change] if change else []
+    if change == "cropped":
+        causes = ["cropped, or taken in another mode of the camera"]
+    elif change.startswith("turned by") and (facts.orientation or 1) >= _SIDEWAYS:
+        causes[0] += (
+            f", as programs show it by its EXIF orientation {facts.orientation}; pixels are taken "
+            "as they are stored"
         )
-    elif size == ImageSize(needed.height, needed.width):
-        causes.append("turned by a quarter turn")
-    else:
-        for turned, word in ((size, ""), (ImageSize(size.height, size.width), "turned and ")):
-            factor = turned.width / needed.width
-            if abs(turned.height - factor * needed.height) <= max(1.0, factor):
-                causes.append(f"{word}rescaled by {factor:.4g}")
-                break
-        else:
-            if size.width <= needed.width and size.height <= needed.height:
-                causes.append("cropped, or taken in another mode of the camera")
     if facts.taken_size not in (None, (size.width, size.height)):
         width, height = facts.taken_size
         causes.append(f"taken with {width} x {height} px, as its EXIF data say")

@@ -31,6 +31,7 @@ from legcal.calibration.camera_calibration.document import (
 )
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.data.measurements import few
+from legcal.data.photograph_notes import differences, recorded
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import describe
@@ -59,7 +60,6 @@ from legcal.vision.image_file import (
     likely_cause,
     read_image,
 )
-from legcal.vision.photograph_comparison import differences, recorded
 from legcal.workers import Run, Workers, worker_pool
 
 _STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
@@ -447,12 +447,9 @@ def _of_one_size(paths: Sequence[Path]) -> _Photographs:
 def _changes(paths: Sequence[Path], facts: Sequence[ImageFacts], size: ImageSize) -> Iterator[str]:
     """Yield a warning for each fact that photographs of a camera must share."""
     named = list(zip([path.name for path in paths], facts, strict=True))
-    for difference in differences(named, (size.width, size.height), None):
-        groups = " and ".join(
-            f"images {condition} ({few(names)})" for condition, names in difference.images.items()
-        )
+    for difference in differences(named, (size.width, size.height), {}):
         yield (
-            f"No one camera may hold for all images: found {groups}, needed one "
+            f"No one camera may hold for all images: found {difference.groups}, needed one "
             f"{difference.fact.what}; leave out those that differ, and photograph the machine like "
             "the others."
         )

@@ -1,6 +1,5 @@
 """What a session can identify: conditions (10)-(17), ranks, weak directions, remedies.
 
 `session` has images and poses before a fit, `ranks` judges the information of the joint fit at
-them, `scale` and `intrinsics` ask it more, `remedies` says what to change, `identifiability` is the
-job, and `report` what it returns.
+them, `remedies` says what to change, `identifiability` is the job, and `report` what it returns.
 """

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.identify.intrinsics import expected_intrinsics
-from legcal.calibration.identify.ranks import Analysis, undetermined, weak_directions
+from legcal.calibration.identify.ranks import (
+    Analysis,
+    expected_intrinsics,
+    is_scale_open,
+    n_open_with_radii,
+    refusal_of_scale,
+    scale_sources,
+    undetermined,
+    weak_directions,
+)
 from legcal.calibration.identify.remedies import (
-    ENOUGH_IMAGES,
-    Replanner,
     find_remedies,
     judge_board,
     recommend,
 )
 from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
-from legcal.calibration.identify.scale import (
-    is_scale_open,
-    n_open_with_radii,
-    refusal_of_scale,
-    scale_sources,
-)
 from legcal.calibration.identify.session import (
     THIN,
     Session,
@@ -171,22 +171,27 @@ def identifiability(
     multiple.
     """
     legs = read_views(views, mechanism.leg_names, images)
-    if hand_held:
-        return _report_on_hand_held(
-            mechanism, legs, images, board=board, platform_board=platform_board, noise=noise
-        )
     recommendation = None
     boards = {"board": board, "platform_board": platform_board}
-    if not legs:
+    if hand_held:
+        if not board or not legs:
+            missing = "no board" if not board else "no views"
+            raise UsageError(
+                f"Hand-held images could not be judged: found {missing}; the camera poses come "
+                "from a calibration board on the base in every image, and the visible legs from "
+                "the views; give --board and --view."
+            )
+        legs, images = tuple(view for view in legs for _ in range(images)), 1
+    elif not legs:
         recommendation = recommend(mechanism, images, noise, **boards)
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
-    session = planned_session(mechanism, legs, images, **boards)
-    replanning = Replanner(
-        lambda more: planned_session(mechanism, legs, more, **boards),
-        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), noise, **boards),
-    )
-    return _report_on(mechanism, Analysis(session, noise=noise), recommendation, replanning)
+
+    def planned(images: int) -> Session:
+        return planned_session(mechanism, legs, images, **boards, hand_held=hand_held)
+
+    analysis = Analysis(planned(images), noise=noise)
+    return _report_on(mechanism, analysis, recommendation, None if hand_held else planned)
 
 
 def identifiability_of_dataset(
@@ -257,35 +262,11 @@ def check_identifiable(
     return tuple(notes)
 
 
-def _report_on_hand_held(
-    machine: Machine,
-    legs: tuple[tuple[int, ...], ...],
-    images: int,
-    *,
-    board: bool,
-    platform_board: bool,
-    noise: PredictedNoise,
-) -> Identifiability:
-    """Report on hand-held images, each with its own camera pose."""
-    if not board or not legs:
-        missing = "no board" if not board else "no views"
-        raise UsageError(
-            f"Hand-held images could not be judged: found {missing}; the camera poses come from a "
-            "calibration board on the base in every image, and the visible legs from the views; "
-            "give --board and --view."
-        )
-    views = tuple(view for view in legs for _ in range(images))
-    session = planned_session(
-        machine, views, 1, board=True, platform_board=platform_board, hand_held=True
-    )
-    return _report_on(machine, Analysis(session, noise=noise), None, None)
-
-
 def _report_on(
     machine: Machine,
     analysis: Analysis,
     recommendation: tuple[Recommendation, ...] | None,
-    replanning: Replanner | None,
+    replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
     """Report on a session."""
     session = analysis.session
@@ -320,7 +301,7 @@ def _report_on(
         board=board,
         platform_board=platform_board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
-        remedies=() if full.complete else find_remedies(analysis, replanning),
+        remedies=() if full.complete else find_remedies(analysis, replanned),
         recommendation=recommendation,
         notes=tuple(notes),
         scale=scale_sources(analysis),
@@ -423,14 +404,7 @@ def read_views(
                 "names; pass one list of names a view."
             )
             continue
-        unnamed = [name for name in view if not isinstance(name, str)]
-        if unnamed:
-            problems.append(
-                f"View {v} could not be used: found {unnamed[0]!r}, needed names of legs; pass "
-                "texts."
-            )
-            continue
-        names = [name.strip() for name in view]
+        names = [str(name).strip() for name in view]
         if not any(names):
             problems.append(
                 f"View {v} could not be used: found no leg, needed at least one; name its legs, "

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -20,7 +19,6 @@ from legcal.calibration.identify.report import (
     Recommendation,
     Remedy,
     WeakDirection,
-    views_in_words,
 )
 from legcal.calibration.identify.session import (
     Session,
@@ -28,7 +26,6 @@ from legcal.calibration.identify.session import (
     legs_around,
     neighbours,
     planned_session,
-    ring_distance,
 )
 from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, PredictedNoise
 from legcal.geometry.types import Array
@@ -44,9 +41,8 @@ _COMPLEMENT = 1e-6  # least component outside the open space
 _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
-ENOUGH_IMAGES = 15  # a view
+_ENOUGH_IMAGES = 15  # a view
 _KNOWN = 4e11  # 1 / mean leg length
-_ORDINAL = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 
 
 def recommend(
@@ -196,11 +192,11 @@ def judge_board(
     if with_boards.full.complete and not without_board.full.complete:
         needed.append("full")
     return BoardReport(
-        is_present,
-        tuple(needed),
-        _ranks(without_board),
-        _ranks(with_boards),
-        _determined_by_board(without_board, with_boards),
+        present=is_present,
+        needed_for=tuple(needed),
+        without=_ranks(without_board),
+        with_board=_ranks(with_boards),
+        mends=_determined_by_board(without_board, with_boards),
     )
 
 
@@ -225,18 +221,10 @@ def _complement(space: Array, part: Array) -> Array:
     return np.asarray(basis[singular > _COMPLEMENT])
 
 
-@dataclass(frozen=True)
-class Replanner:
-    """Planners of other sessions of the same machine."""
-
-    images: Callable[[int], Session]  # with another number of images a view
-    # the smallest sufficient sets of views
-    views: Callable[[], tuple[Recommendation, ...]]
-
-
 def find_remedies(
     analysis: Analysis,  # of the session
-    replanning: Replanner | None,  # None for a recorded session
+    # plans the session with another number of images a view; None for a recorded one
+    replanned: Callable[[int], Session] | None,
 ) -> tuple[Remedy, ...]:
     """Return remedies for undetermined directions.
 
@@ -245,15 +233,14 @@ def find_remedies(
     """
     n_parameters = analysis.full.of
     before = _score(analysis)
-    kinds: list[Iterable[tuple[str, Callable[[], _Score]]]] = [
-        _more_images(analysis, replanning),
-        _wider_views(analysis),
+    kinds: list[Iterable[_Candidate]] = [
+        _more_images(analysis, replanned),
         _further_cameras(analysis),
         _board(analysis),
         _known_parameters(analysis),
     ]
     helpful = tuple(r for kind in kinds for r in _try_kind(kind, before, n_parameters))
-    sufficient = tuple(r for r in helpful if r.enough) or _other_views(analysis, replanning)
+    sufficient = tuple(r for r in helpful if r.enough)
     everything = tuple(r for r in sufficient if r.full_rank == n_parameters)
     return everything or sufficient or helpful
 
@@ -266,6 +253,10 @@ class _Score:
     harmful: int
 
 
+# What to do, the analysis with that, and parameters that are known then
+_Candidate = tuple[str, Analysis, Sequence[int]]
+
+
 def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     """Count the open directions with some parameters *known*."""
     session, motion = analysis.session, analysis.motion
@@ -275,13 +266,11 @@ def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
     return _Score(len(undetermined(session, rows)), missing(session, rows, motion))
 
 
-def _try_kind(
-    kind: Iterable[tuple[str, Callable[[], _Score]]], before: _Score, n_parameters: int
-) -> list[Remedy]:
+def _try_kind(kind: Iterable[_Candidate], before: _Score, n_parameters: int) -> list[Remedy]:
     """Return the first few sufficient candidates of a kind, else the most helpful one."""
     sufficient, helpful = list[Remedy](), list[tuple[int, Remedy]]()
-    for tried, (text, score) in enumerate(kind):
-        after = score()
+    for tried, (text, changed, known) in enumerate(kind):
+        after = _score(changed, known)
         gain = before.harmful - after.harmful
         if gain <= 0:
             continue
@@ -297,62 +286,40 @@ def _try_kind(
 
 
 def _more_images(
-    analysis: Analysis, replanning: Replanner | None
-) -> Iterator[tuple[str, Callable[[], _Score]]]:
+    analysis: Analysis, replanned: Callable[[int], Session] | None
+) -> Iterator[_Candidate]:
     """Yield a session with more images a view."""
     images = int(np.bincount(analysis.session.view).min())
-    if replanning is not None and images < ENOUGH_IMAGES:
-        yield (
-            f"take {ENOUGH_IMAGES} images a view instead of {images}",
-            lambda: _score(analysis.elsewhere(replanning.images(ENOUGH_IMAGES))),
-        )
+    if replanned is not None and images < _ENOUGH_IMAGES:
+        text = f"take {_ENOUGH_IMAGES} images a view instead of {images}"
+        yield text, analysis.elsewhere(replanned(_ENOUGH_IMAGES)), ()
 
 
-def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
-    """Yield views with one or two more legs, including a weak one."""
-    session, weak = analysis.session, _weak_legs(analysis)
-    ring = legs_around(session)
-    for more in (1, 2):
-        choices = [
-            (sum(ring_distance(ring, j, view) for j in added), v, added)
-            for v, view in enumerate(session.views)
-            for added in combinations([j for j in ring if j not in view], more)
-            if set(weak) & {*view, *added}
-        ]
-        for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
-            legs = tuple(sorted((*session.views[v], *added)))
-            text = f"show {legs_in_words(legs, session.leg_names)} together in view {v + 1}"
-            wider = _widened(session, v, legs)
-            yield text, partial(_score_elsewhere, analysis, wider)
-
-
-def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield further camera positions that show weak legs and their neighbours."""
     session, weak = analysis.session, _weak_legs(analysis)
     ring = legs_around(session)
     largest = max(len(view) for view in session.views)
-    which = _ORDINAL[session.n_views] if session.n_views < len(_ORDINAL) else "further"
-    article = "an" if which == "eighth" else "a"
     for size in sorted({min(k, session.n_legs) for k in (3, 4, largest)}):
         groups = [legs for legs in neighbours(ring, size) if set(weak) & set(legs)]
         groups.sort(key=lambda legs: -len(set(weak) & set(legs)))
         for legs in groups:
             named = legs_in_words(legs, session.leg_names)
-            text = f"add {article} {which} camera position ({named})"
-            yield text, partial(_score_elsewhere, analysis, _extended(session, legs))
+            more = analysis.elsewhere(_extended(session, legs))
+            yield f"add a camera position ({named})", more, ()
 
 
-def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+def _board(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield a calibration board on the base, and one on the platform."""
     if len(set(analysis.session.frame.tolist())) > 1:
         text = "put a calibration board on the base, visible to every camera"
-        yield text, lambda: _score(analysis.with_board())
+        yield text, analysis.with_board(), ()
     if not analysis.session.platform_board.any():
         text = "put a calibration board on the platform, visible to every camera"
-        yield text, lambda: _score(analysis.with_board(link="platform"))
+        yield text, analysis.with_board(link="platform"), ()
 
 
-def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield parameters to measure otherwise and fix: one of each direction, or all of them."""
     names = analysis.session.parametrization.names
     first = list(dict.fromkeys(d.parameters[0] for d in _harmful(analysis)))
@@ -361,23 +328,7 @@ def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _S
         choices.append(tuple(first))
     for which in choices:
         known = [names.index(name) for name in which]
-        yield f"fix {list_in_words(which)}", partial(_score, analysis, known)
-
-
-def _other_views(analysis: Analysis, replanning: Replanner | None) -> tuple[Remedy, ...]:
-    """Recommend the smallest sufficient set of views in place of the given ones."""
-    sets = () if replanning is None else replanning.views()
-    if not sets:
-        return ()
-    names = analysis.session.leg_names
-    views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
-    n_p = analysis.full.of
-    return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, True),)
-
-
-def _score_elsewhere(analysis: Analysis, session: Session) -> _Score:
-    """Count the open directions in a session with other observations."""
-    return _score(analysis.elsewhere(session))
+        yield f"fix {list_in_words(which)}", analysis, known
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:
@@ -390,14 +341,6 @@ def _weak_legs(analysis: Analysis) -> list[int]:
 def _harmful(analysis: Analysis) -> list[WeakDirection]:
     """Return the open directions that move the platform."""
     return [d for d in analysis.full.weak if not d.harmless]
-
-
-def _widened(session: Session, v: int, legs: Sequence[int]) -> Session:
-    """Change the legs of a view."""
-    seen = session.seen.copy()
-    seen[v] = False
-    seen[v, list(legs)] = True
-    return replace(session, seen=seen)
 
 
 def _extended(session: Session, legs: Sequence[int]) -> Session:

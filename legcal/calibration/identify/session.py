@@ -549,10 +549,3 @@ def neighbours(ring: Sequence[int], size: int) -> list[tuple[int, ...]]:
         tuple(sorted(ring[(start + k) % n] for k in range(min(size, n)))) for start in range(n)
     )
     return list(dict.fromkeys(groups))
-
-
-def ring_distance(ring: Sequence[int], leg: int, others: Sequence[int]) -> int:
-    """Return the number of steps around the base from a leg to the nearest of others."""
-    place = {j: k for k, j in enumerate(ring)}
-    steps = (abs(place[leg] - place[other]) for other in others)
-    return min((min(s, len(ring) - s) for s in steps), default=0)

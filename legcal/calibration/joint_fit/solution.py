@@ -43,7 +43,7 @@ from legcal.calibration.joint_fit.sensitivity import (
 from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.notes import Note, Topic
 from legcal.data.dataset import Dataset
-from legcal.data.image_tables import Order, canonical_order, inverse, reorder_measurements
+from legcal.data.image_tables import Order, inverse, reorder_measurements
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.estimation.problem import linearize
@@ -490,35 +490,3 @@ def _pose_order(order: Order, dataset: Dataset) -> IntArray:
     work_pose = np.empty(dataset.measurements.n_poses, dtype=np.intp)
     work_pose[pose] = pose_in_work_order
     return work_pose
-
-
-@brief
-@dataclass(frozen=True, eq=False)
-class OutlineResiduals:
-    """Residuals of the outlines in the fit, including those it rejected."""
-
-    index: IntArray  # (n,): rows of the table of outlines
-    # (n, 2): distance of each end from the predicted outline, common-mode edge biases removed [px]
-    offset: Array
-    whitened: Array  # (n, 2): the same, uncorrelated and in standard deviations
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-
-def outline_residuals(
-    posterior: Posterior, dataset: Dataset, outlines: Outlines
-) -> OutlineResiduals:
-    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
-    problem = posterior.problem
-    offset = problem.offsets(posterior.state)
-    covariance = posterior.noise.covariance(problem.outlines.covariance)
-    L = np.linalg.cholesky(covariance) if len(offset) else covariance
-    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
-    # The fit numbers outlines as they stand in canonical order.
-    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
-    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
-    number = order.reorder(numbered).contrast.astype(np.intp)
-    index = number[problem.outlines.index]
-    back = np.argsort(index, kind="stable")
-    return OutlineResiduals(index[back], offset[back], whitened[back])
