@@ -20,8 +20,7 @@ from legcal.machine.leg import Cylinder
 from legcal.machine.parameters import parametrize
 from legcal.paper.conditions import count_conditions, enough_readings
 from legcal.paper.four_steps import run_base_steps
-from legcal.report.identify import _verdict
-from legcal.report.page.verdicts import identify_verdict
+from legcal.report.identify import _verdict, identify_verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
 TURNING = ("6-rss", "delta")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +13,8 @@ from legcal.files.schema import Document, Number
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
+from legcal.pages.svg import Bars, Canvas, log_bars, stacked
 from legcal.simulation.study import Record
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 INITIAL, BOUND = "initial", "bound"
 SCALARS = ("dX", "dE", "angle", "of_bound_squared")
@@ -68,10 +65,7 @@ READINGS = (
 )
 
 _DRAWN = {"literal": "steps as printed", "default": "weighted steps", "fit": "joint fit"}
-_BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#8a8a8a"
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
-_ERROR_AXIS, _TRUTH_AXIS = "mean error [mm]", "true value [mm]"
-_BARS, _MARKS, _TRUE = "mean error", "expected at the Cramer-Rao bound", "true value (right)"
 
 
 class Means:
@@ -198,8 +192,33 @@ class PaperSummary:
         ).document()
 
     def files(self) -> dict[str, bytes]:
-        """Return figure 4 as a picture, and as a drawing to enlarge."""
-        return {"fig4.svg": _figure(self, "svg"), "fig4.png": _figure(self, "png")}
+        """Return figure 4."""
+        return {"fig4.svg": self._figure().markup().encode()}
+
+    def _figure(self) -> Canvas:
+        """Draw figure 4: a chart of each machine, and of each estimator on it."""
+        by_name = {(means.machine, means.estimator): means for means in self.means}
+        names = list(map(_label, self.names))
+        charts = []
+        for estimator, label in _DRAWN.items():
+            for machine in self.truths:
+                if (machine, estimator) not in by_name:
+                    continue
+                means = by_name[machine, estimator]
+                errors = [
+                    Bars(words, (1e3 * by_name[machine, name].parameters).tolist())
+                    for words, name in (
+                        ("initial model", INITIAL),
+                        (label, estimator),
+                        ("expected at the Cramer-Rao bound", BOUND),
+                    )
+                ]
+                failed = f", {means.n_failed} of {means.n + means.n_failed} runs failed"
+                title = f"{label}, {JOINTS[machine]} joints{failed * bool(means.n_failed)}"
+                charts.append(log_bars(title, "mm", names, *errors))
+        n_runs = self.means[0].n + self.means[0].n_failed
+        title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
+        return stacked(title, charts, len(self.truths))
 
 
 class EstimatorRow(Document):
@@ -231,108 +250,7 @@ class PaperDocument(Document):
     readings: list[str]  # interpretations of the paper where its text leaves a choice
 
 
-# Figure 4
-
-
-class _Panel(NamedTuple):
-    """One panel: an estimator on a machine [mm]."""
-
-    title: str
-    errors: Array
-    limit: Array
-    truth: Array
-
-
-def _panels(summary: PaperSummary) -> list[list[_Panel]]:
-    """Return the panels: a row for each estimator, a column for each machine."""
-    by_name = {(means.machine, means.estimator): means for means in summary.means}
-    compared = {estimator for _, estimator in by_name}
-
-    def panel(machine: str, estimator: str) -> _Panel:
-        means, limit = by_name[machine, estimator], by_name[machine, BOUND]
-        failed = f" ({means.n_failed} of {means.n + means.n_failed} runs failed)"
-        return _Panel(
-            f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed * bool(means.n_failed)}",
-            1e3 * means.parameters,
-            1e3 * limit.parameters,
-            1e3 * summary.truths[machine],
-        )
-
-    return [
-        [panel(machine, estimator) for machine in summary.truths]
-        for estimator in _DRAWN
-        if estimator in compared
-    ]
-
-
-def _limits(grid: Sequence[Sequence[_Panel]]) -> tuple[float, float]:
-    """Return the ends of the scale of errors that all panels share [mm]."""
-    values = np.concatenate(
-        [[1e-2, 1.0], *(x for row in grid for p in row for x in (p.errors, p.limit))]
-    )
-    shown = values[values > 0.0]
-    return 0.7 * float(shown.min()), 1.4 * float(shown.max())
-
-
-def _title(summary: PaperSummary) -> str:
-    """Return the title of the figure."""
-    n_runs = summary.means[0].n + summary.means[0].n_failed
-    return f"Fig. 4 of the paper: {len(summary.names)} parameters, means over {n_runs} calibrations"
-
-
 def _label(name: str) -> str:
     """Return a short label of a parameter: A2x for leg2.base.x."""
     leg, kind, *axis = name.split(".")
     return f"{_LETTERS[kind]}{leg.removeprefix('leg')}{''.join(axis)}"
-
-
-def _figure(summary: PaperSummary, kind: str) -> bytes:
-    """Return the figure as a file of a kind: svg or png."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    grid, names = _panels(summary), list(map(_label, summary.names))
-    n_rows, n_columns = len(grid), len(grid[0])
-    width, height = 7.0 * n_columns, 2.9 * n_rows + 0.6
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    place = {  # in inches; automatic layout in matplotlib takes as long as everything else
-        "left": 0.8 / width,
-        "right": 1.0 - 0.75 / width,
-        "bottom": 0.95 / height,
-        "top": 1.0 - 0.65 / height,
-        "wspace": 0.27,
-        "hspace": 0.4,
-    }
-    axes = figure.subplots(n_rows, n_columns, squeeze=False, gridspec_kw=place)
-    for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
-        handles = _draw(axis, panel, names)
-        axis.set_ylim(_limits(grid))
-    figure.suptitle(_title(summary), fontsize=11, y=1.0 - 0.15 / height)
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9)
-    content = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
-        figure.savefig(content, format=kind, dpi=110, metadata=metadata)
-    return content.getvalue()
-
-
-def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
-    """Draw a panel with Matplotlib and return the handles of its legend."""
-    place = range(len(names))
-    bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
-    marks = axis.scatter(place, panel.limit, marker="_", s=70, lw=2.0, color=_LIMIT, label=_MARKS)
-    marks.set_zorder(3)
-    right = axis.twinx()
-    line = right.plot(place, panel.truth, color=_LINE, lw=0.8, marker=".", ms=3, label=_TRUE)
-    axis.set_title(panel.title, fontsize=10)
-    axis.set_xticks(place, names, rotation=90, fontsize=7)
-    axis.set_xlim(-0.7, len(names) - 0.3)
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.set_ylabel(_ERROR_AXIS, fontsize=8)
-    right.set_ylabel(_TRUTH_AXIS, fontsize=8)
-    for side in (axis, right):
-        side.tick_params(axis="y", labelsize=8)
-    return [bars, marks, *line]
