@@ -93,7 +93,7 @@ PUBLIC: dict[str, set[str]] = {
         "measurements",
         "new_dataset",
         "outlines",
-        "overrides",
+        "dataset_file",
         "photograph_matching",
         "photograph_notes",
         "reading_units",
@@ -124,7 +124,7 @@ PUBLIC: dict[str, set[str]] = {
         "photographs",
         "placement",
     },
-    "paper": {"conditions", "criteria", "four_steps", "nominal"},
+    "paper": {"conditions", "criteria", "four_steps", "unknowns"},
     "calibration": {
         "camera_calibration.calibration",
         "camera_calibration.document",
@@ -157,7 +157,7 @@ PUBLIC: dict[str, set[str]] = {
         "verification",
         "workspace_errors",
     },
-    "planning": {"laid_board", "places", "planned_session", "request", "session"},
+    "planning": {"places", "request", "session"},
     "exports": {"formats", "subject"},
     "scene": {"motions"},
     "report": {
@@ -171,7 +171,7 @@ PUBLIC: dict[str, set[str]] = {
     },
     "viewer": {"address", "click_server", "source", "window"},
     "cli": set(),
-    "simulation": {"dataset", "observe", "paper", "previews", "request", "study"},
+    "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }
 OUTSIDE = {
     "__main__",

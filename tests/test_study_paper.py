@@ -21,6 +21,8 @@ from legcal.simulation.paper import (
     ESTIMATORS,
     MACHINES,
     PAPER_VIEWS,
+    SCALARS,
+    Means,
     PaperStudy,
     expected_errors,
     expected_norm,
@@ -28,7 +30,6 @@ from legcal.simulation.paper import (
     paper_machine,
     platform_errors,
 )
-from legcal.simulation.paper_report import SCALARS, Means
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.study import StudyResult, run_study
@@ -173,10 +174,11 @@ def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bou
 
 
 def test_means_have_their_standard_deviations() -> None:
-    rng, means = np.random.default_rng(0), Means("coplanar", "fit", 1)
-    drawn = rng.uniform(1.0, 2.0, (7, len(SCALARS)))
-    for row in drawn:
-        means.add({**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]})
+    drawn = np.random.default_rng(0).uniform(1.0, 2.0, (7, len(SCALARS)))
+    means = Means.of("coplanar", "fit", [
+        {**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]}
+        for row in drawn
+    ])  # fmt: skip
     row, sigma = means.row().document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
     assert row["dX_mm"] == pytest.approx(1e3 * drawn[:, 0].mean())
     assert row["dE_deg"] == pytest.approx(np.rad2deg(drawn[:, 1].mean()))

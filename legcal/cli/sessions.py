@@ -36,7 +36,7 @@ from legcal.vision.distortion import CameraProgram, DistortionModel
 if TYPE_CHECKING:
     from legcal.calibration.detection import Detection
     from legcal.calibration.examination import Examination
-    from legcal.planning.planned_session import Plan
+    from legcal.planning.session import Plan
 
 
 def camera(
@@ -218,7 +218,7 @@ def plan(
 
 def _previews(plan: Plan) -> dict[str, bytes]:
     """Return a small rendered photograph of each view, by its name."""
-    from legcal.simulation.previews import preview
+    from legcal.simulation.session import preview
 
     views = plan.views[:1] if plan.hand_held else plan.views
     return {

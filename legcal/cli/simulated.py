@@ -109,7 +109,7 @@ def simulate(
     from legcal.report.session import simulation_table
     from legcal.simulation.dataset import simulate as run
     from legcal.simulation.dataset import summary_document
-    from legcal.simulation.request import requested
+    from legcal.simulation.settings import requested
 
     nominal = load_mechanism(model)
     settings = requested(

@@ -29,7 +29,6 @@ CONDITIONS = {
     "eq17": "platform joints (17)",
     "every_leg_seen": "every leg seen",
     "two_directions": "two directions of every leg",
-    "enough_readings": "readings of every carried joint (6')",
     "three_legs_at_once": "three legs at once (18, 19)",
 }
 _LEGEND = "length known: leg with an encoder (length = reading + offset), or of constant length"

@@ -17,8 +17,8 @@ from legcal.machine.configurations import poses_at
 from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Drawing, Items, Picture, Row, page_html
 from legcal.pages.svg import Canvas, Points, scatter
-from legcal.planning.laid_board import LaidBoard
-from legcal.planning.planned_session import Plan, views_in_words
+from legcal.planning.places import LaidBoard
+from legcal.planning.session import Plan, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
 from legcal.scene.motions import pyramid

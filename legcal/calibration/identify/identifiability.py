@@ -62,7 +62,6 @@ from legcal.machine.ties import ties_in_words
 from legcal.paper.conditions import (
     Condition,
     count_conditions,
-    enough_readings,
     three_legs_at_once,
     two_directions,
 )
@@ -367,9 +366,7 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
         actuators=session.on_actuators,
     )
     frame, pose = session.frame[session.view[image]], session.pose[image]
-    moves = session.carried_by[leg] >= 0
-    still, rods = np.flatnonzero(~moves), np.flatnonzero(moves)
-    q = session.q[pose[rods], session.carried_by[leg[rods]]]
+    still = np.flatnonzero(session.carried_by[leg] < 0)
     directions = two_directions(
         frame[still], leg[still], session.u[pose[still], leg[still]], session.n_legs
     )
@@ -377,7 +374,6 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
     return (
         *counts,
         replace(directions, ok=not standing, legs=standing),
-        *enough_readings(frame[rods], leg[rods], q, session.legs),
         three_legs_at_once(session.views, geometries(machine), spatial=session.spatial),
     )
 
