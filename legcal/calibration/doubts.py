@@ -47,7 +47,7 @@ from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.kinematics import pose_differences
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 from legcal.machine.parameters import geometries, vector_of
 from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.closing import close_at, closure_equations
+from legcal.machine.closing import ROUNDING, TOLERANCE, close_at, closure_equations, project_pose
 from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
@@ -34,14 +34,14 @@ from legcal.machine.mobility import (
 )
 from legcal.machine.model import (
     Machine,
+    Pose,
     platform_pose,
+    pose_of,
     readings_at,
     readings_at_poses,
     slider_columns,
 )
-from legcal.machine.pose_input import Pose, pose_of
 from legcal.machine.redundancy import contradictions
-from legcal.machine.solved_poses import ROUNDING, TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 from legcal.machine.ties import machine_ties
 

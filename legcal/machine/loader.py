@@ -28,6 +28,7 @@ from legcal.machine.classification import (
     leg_of,
     parallel,
 )
+from legcal.machine.closing import MAX_POSE_ERROR
 from legcal.machine.cylinders import (
     at_visible_heights,
     with_arms,
@@ -65,7 +66,6 @@ from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
-from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED

@@ -20,9 +20,8 @@ from legcal.machine.configurations import (
     poses_at,
 )
 from legcal.machine.kinematics import follow, platforms_in_base
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import ARMS, Leg, LegKind, ParameterId
 from legcal.machine.model import Machine, platform_pose, slider_columns
-from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, moved_legs
 from legcal.machine.rods import ends_at_poses, first_rods
 from legcal.planning.places import USUAL_LENGTH, Setting

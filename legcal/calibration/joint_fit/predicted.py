@@ -43,9 +43,8 @@ from legcal.data.reasons import USED
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.square_root import marginal_rows
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
