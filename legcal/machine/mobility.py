@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.equations import is_constrained, machine_equations
+from legcal.machine.equations import machine_equations
 from legcal.machine.model import (
     B_at,
     Machine,
@@ -193,20 +193,12 @@ def dimensionless(
     Poses are matrices T_base_platform (k, 3 or 4, 4). *motors* limits the motors, all by default.
     """
     motors = list(machine.motors if motors is None else motors)
-    R, t = poses[:, :3, :3], poses[:, :3, 3]
-    turned = B_at(machine, poses) - t[:, None]
-    vectors = vectors_at(machine, poses)
-    lengths = np.linalg.norm(vectors, axis=2)
-    scale = lengths.mean(axis=1)[:, None, None]
-    centre = turned.mean(axis=1, keepdims=True)
-    if is_constrained(machine):
-        equations = machine_equations(machine, R, t)
-        counts = ~equations.measured | np.isin(equations.leg, motors)
-        jacobian = equations.by_pose[:, counts]
-        gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
-        return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
-    u = (vectors / lengths[..., None])[:, motors]  # plain lengths; one rod for each actuator
-    return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
+    equations = machine_equations(machine, poses[:, :3, :3], poses[:, :3, 3])
+    counts = ~equations.measured | np.isin(equations.leg, motors)
+    gradient, moment = equations.by_pose[:, counts, 3:], equations.by_pose[:, counts, :3]
+    scale = np.linalg.norm(vectors_at(machine, poses), axis=2).mean(axis=1)[:, None, None]
+    centre = (B_at(machine, poses) - poses[:, None, :3, 3]).mean(axis=1, keepdims=True)
+    return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
 
 
 def is_on_same_side(reference: Array, jacobian: Array) -> bool:
