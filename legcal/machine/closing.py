@@ -30,7 +30,7 @@ from legcal.machine.equations import (
 from legcal.machine.leg import Leg, mean_length
 from legcal.machine.mobility import CLOSED, leg_scale
 from legcal.machine.model import Machine, readings_at, slider_columns
-from legcal.machine.solver import Equations, Retraction, poses_after, solve
+from legcal.machine.solver import Equations, Retraction, poses_after, postures_after, solve
 
 # Tolerances [rad], and lengths relative to the leg length.
 POSE_TOLERANCE = 2.5e-11  # pose error of the platform of a closed chain
@@ -296,15 +296,11 @@ def solve_postures(
         jacobian[:, :, fixed] = 0.0
         return rows.values, jacobian
 
-    def retract(points: Array, step: Array) -> Array:
-        poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
-        return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + step[:, 6:]], axis=1)
-
     points = np.concatenate([R, t[..., None]], axis=2).reshape(-1, 12)
     points = np.concatenate([points, q], axis=1)
     length = mean_length(legs, points[0, :12].reshape(3, 4)) if len(points) else 1.0
     solution = solve(
-        equations, retract, points, tolerance=ROUNDING * length, unit=scale, rank=DEPENDENT
+        equations, postures_after, points, tolerance=ROUNDING * length, unit=scale, rank=DEPENDENT
     )
     poses = solution.points[:, :12].reshape(-1, 3, 4)
     solved = SolvedPoses(poses[:, :, :3], poses[:, :, 3], solution.worst, solution.size)

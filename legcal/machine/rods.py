@@ -67,6 +67,13 @@ def ends_at_poses(
     return joints_at(legs, q), _platform_joints(legs, R, t)
 
 
+def length_errors(legs: Sequence[Leg], R: Array, t: Array, q: Array) -> Array:
+    """Return |AB| minus the lengths at readings q (k, n_legs) of legs at poses, (k, n_legs) [m]."""
+    A, B = ends_at_poses(legs, R, t, q[:, first_rods(legs)])
+    sign = [0 if leg.actuator is not None else leg.sign for leg in legs]
+    return np.asarray(np.linalg.norm(B - A, axis=2) - [leg.q0 for leg in legs] - q * sign)
+
+
 def _platform_joints(legs: Sequence[Leg], R: Array, t: Array) -> Array:
     """Return B of legs (k, n_legs, 3) [m] in the base frame at poses R, t."""
     B = np.array([leg.B for leg in legs]).reshape(-1, 3)
