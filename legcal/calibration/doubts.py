@@ -49,8 +49,7 @@ from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
-from legcal.machine.leg import Leg
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.parameters import geometries, vector_of
 from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable

@@ -69,7 +69,7 @@ from legcal.errors import (
 from legcal.files.folder import check_destination, output_path
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes
 from legcal.perception.outline import measure_in_brief

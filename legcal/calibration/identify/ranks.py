@@ -33,10 +33,9 @@ from legcal.data.dataset import Dataset
 from legcal.errors import NotIdentifiable
 from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.geometry.types import Array
-from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.machine.equations import pose_sensitivity
-from legcal.machine.leg import SIGMA_LENGTH, LegColumns
-from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.leg import ARMS, SIGMA_LENGTH, LegColumns, ParameterId
+from legcal.machine.parameters import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.vision.board import Link
 from legcal.vision.camera import shared_cameras
 

@@ -29,9 +29,8 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.directions import list_in_words
-from legcal.machine.leg import Leg, radius_name
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import Leg, ParameterId, radius_name
+from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import actuators_of
 from legcal.vision.board import LINKS
 from legcal.vision.camera import intrinsic_names, intrinsic_unit

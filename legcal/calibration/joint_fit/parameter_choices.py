@@ -15,9 +15,8 @@ from legcal.data.measurements import View
 from legcal.errors import DatasetError, UsageError
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegKind, radius_name
+from legcal.machine.leg import LegKind, ParameterId, radius_name
 from legcal.machine.model import Machine
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
     geometries,
     is_held_by_default,

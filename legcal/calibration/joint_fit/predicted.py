@@ -51,9 +51,8 @@ from legcal.estimation.uncertainty import marginal_rows
 from legcal.files.reading import read_json
 from legcal.files.table import read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
