@@ -18,7 +18,7 @@ from legcal.calibration.documents import (
     Result,
 )
 from legcal.calibration.examination import ExaminationDocument
-from legcal.calibration.identify.report import IdentifyDocument
+from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.location.document import LocationFile
 from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
@@ -105,7 +105,7 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "error": _ErrorDocument,
     "inspect": Inspection,
     "new": _NewDocument,
-    "identify": IdentifyDocument,
+    "identify": Identifiability,
     "plan": PlanDocument,
     "init": NewDatasetDocument,
     "import": ImportDocument,

@@ -12,8 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 import legcal
 from legcal.geometry.types import Array
 from legcal.machine.description_table import described_machine
-from legcal.machine.dimensions import Dimensions
-from legcal.machine.family import description_of
+from legcal.machine.family import Dimensions, description_of
 from legcal.machine.leg import LegKind, main_cylinders
 from legcal.machine.model import Machine
 from legcal.machine.model_builder import Created, create_model

@@ -19,8 +19,7 @@ from legcal.exports.subject import Subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
 from legcal.machine.description_table import described_machine
-from legcal.machine.dimensions import Dimensions
-from legcal.machine.family import description_of
+from legcal.machine.family import Dimensions, description_of
 from legcal.machine.home import home_of_legs
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.loader import load_mechanism

@@ -15,8 +15,7 @@ from legcal.exports.formats import export
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_poses
 from legcal.machine.description_table import described_machine
-from legcal.machine.dimensions import Dimensions
-from legcal.machine.family import description_of
+from legcal.machine.family import Dimensions, description_of
 from legcal.machine.firmware_files import firmware_table, read_delta
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.model import Machine

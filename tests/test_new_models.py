@@ -13,8 +13,7 @@ from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
-from legcal.machine.dimensions import Dimensions
-from legcal.machine.family import description_of, write_template
+from legcal.machine.family import Dimensions, description_of, write_template
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind

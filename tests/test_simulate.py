@@ -22,7 +22,7 @@ from legcal.data.outlines import read_observations
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.loader import load_mechanism
-from legcal.report.images import simulation_table
+from legcal.report.session import simulation_table
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset, simulate, summary_document
 from legcal.simulation.observe import OutlineNoise, TableNoise

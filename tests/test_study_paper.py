@@ -2,10 +2,8 @@
 
 import io
 import json
-import sys
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
 from rich.console import Console
@@ -18,7 +16,7 @@ from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, point_like_legs
 from legcal.machine.model import Machine
 from legcal.machine.parameters import from_vector, geometries, to_vector
-from legcal.report.study import study_table
+from legcal.report.session import study_table
 from legcal.simulation.paper import (
     ESTIMATORS,
     MACHINES,
@@ -42,12 +40,9 @@ STUDY = PaperStudy(n_poses=8)
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]:
-    """Run the study once, with a few runs of few poses; its figure needs no display."""
+    """Run the study once, with a few runs of few poses."""
     output = tmp_path_factory.mktemp("study") / "paper"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "matplotlib.pyplot", None)
-        patch.delattr(matplotlib, "pyplot", raising=False)
-        return run_study(STUDY, N_RUNS, output=output), output
+    return run_study(STUDY, N_RUNS, output=output), output
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:

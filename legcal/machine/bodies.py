@@ -105,7 +105,6 @@ def _merge(
     join: str,
     T_keep_join: Array,
 ) -> None:
-    """Merge the body of one link into the body of another."""
     into, gone = body_of[keep], body_of[join]
     T_into_gone = matrix_product(T_body_link[keep], T_keep_join, matrix_inverse(T_body_link[join]))
     for link, body in body_of.items():

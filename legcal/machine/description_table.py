@@ -54,6 +54,7 @@ from legcal.machine.description import (
     look_like_base,
 )
 from legcal.machine.description_csv import FILE_KIND, MAX_NUMBER, MOTIONS, read_columns
+from legcal.machine.files import FrameLegs
 from legcal.machine.firmware_files import firmware_table
 from legcal.machine.leg import MAX_LEGS, LegKind
 
@@ -228,7 +229,7 @@ class TableFile(FileSchema):
     type: Annotated[str | None, BeforeValidator(_type)] = None
     types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
     legs: list[PlainName] | None = None
-    base_joints: list[Point]
+    base_joints: Annotated[list[Point], Field(min_length=2, max_length=MAX_LEGS)]
     platform_joints: list[Point]
     offsets: Lengths | None = None
     lengths: Lengths | None = None
@@ -245,7 +246,7 @@ class TableFile(FileSchema):
     home_readings: dict[PlainName, Number] | None = None  # of carriages, in the unit
     home_readings_deg: dict[PlainName, Number] | None = None  # of arms
     platform_in: Literal["base", "platform"] | None = None
-    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+    base_frame: FrameLegs | None = None
 
     @property
     def n(self) -> int:
@@ -288,12 +289,12 @@ class TableFile(FileSchema):
         return None if value is None else in_metres(value, self.unit)
 
 
-OPTIONS = {
-    "type": "--type",
-    "min_length": "--min-length",
-    "max_length": "--max-length",
-    "radius": "--leg-radius",
-    "home": "--height",
+BESIDE = {  # options that may be given beside a table, and their entries in it
+    "type": "type",
+    "min_length": "min_length",
+    "max_length": "max_length",
+    "leg_radius": "radius",
+    "height": "home",
 }
 _TRAVELS = ("travel", "travel_deg", "travel_us")
 _SAME = 1e-6  # largest distance of coincident joints, relative to the span of the joints
@@ -348,12 +349,6 @@ def read_description(
         if unit is not None:
             table.setdefault("unit", unit)
     _refuse_twice(path, table, given)
-    if "version" in table and "legcal_table" not in table:
-        raise ModelError(
-            f"{path}: the table could not be read: found version: {table['version']}, needed "
-            "the key legcal_table for the version of a table; write 'legcal_table: 1' in its "
-            "place."
-        )
     if unit is not None and table.get("unit", unit) != unit:
         raise ModelError(
             f"{path}: the unit could not be decided: found --unit {unit} and "
@@ -394,8 +389,9 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
 
 def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     """Refuse entries that are both in the table and on the command line."""
+    options = {entry: f"--{option.replace('_', '-')}" for option, entry in BESIDE.items()}
     twice = [
-        f"{OPTIONS[key]} beside {key if key in table else other}"
+        f"{options[key]} beside {key if key in table else other}"
         for key in given
         for other in (key, *("types" for _ in [0] if key == "type"))
         if _is_given(table.get(other))
@@ -441,30 +437,18 @@ def _conflicting_entries(file: TableFile, source: str) -> list[str]:
             f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
             f"{int(parts[0])}; correct the type or the rows."
         )
-    if not 2 <= n <= MAX_LEGS:
-        remedy = "add rows" if n < 2 else "leave out passive legs"
-        problems.append(
-            f"{source}: base_joints could not be used: found {n} {'leg' if n == 1 else 'legs'}, "
-            f"needed 2 to {MAX_LEGS}; {remedy}."
-        )
     names = file.leg_names
     problems += [
         f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
         for leg in sorted({leg for leg in names if names.count(leg) > 1})
     ]
     problems += _useless_entries(file, source)
-    frame = file.base_frame or []
     problems += [
         f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
         f"{closest(leg, names)}"
-        for leg in frame
+        for leg in file.base_frame or ()
         if leg not in names
     ]
-    if len(set(frame)) != len(frame):
-        problems.append(
-            f"{source}: base_frame could not be used: found a leg twice, needed different legs; "
-            "correct it."
-        )
     problems += _wrong_home(file, source)
     problems += _wrong_actuators(file, source)
     problems += _wrong_home_readings(file, source)

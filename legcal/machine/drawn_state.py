@@ -135,7 +135,6 @@ def _refuse_open_leg(
 
 
 def _note(names: Sequence[str]) -> str:
-    """Return the note on held joints."""
     shown = ", ".join(f"'{name}'" for name in names[:_SHOWN])
     more = f" and {len(names) - _SHOWN} more" * (len(names) > _SHOWN)
     if len(names) == 1:
@@ -320,7 +319,6 @@ def is_drawn_closed(source: Source) -> bool:
 
 
 def _closed_chain(source: Source) -> ClosedChain:
-    """Return the tree of a mechanism with its closures."""
     try:
         return ClosedChain(source.urdf.text, source.closures)
     except ModelError as error:

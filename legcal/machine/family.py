@@ -23,8 +23,7 @@ from legcal.files.quantity import LENGTH
 from legcal.files.schema import plain_name
 from legcal.geometry.types import Array
 from legcal.machine.description import Description, leg_type
-from legcal.machine.description_table import described_machine, read_description
-from legcal.machine.dimensions import Dimensions
+from legcal.machine.description_table import BESIDE, described_machine, read_description
 from legcal.machine.model_builder import Created, create_model
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
@@ -34,13 +33,32 @@ RADIUS_OF_ROD = 0.0125  # radius of rods of a Delta, relative to their length
 SPACING = 1.2  # distance of the two rods of an arm, in platform radii
 TRAVEL = (-30.0, 70.0)  # travel of arms [deg]
 DIGITS = 12  # decimals of a length in metres
-_BESIDE = {  # options that may be given beside a table, and their entries in it
-    "type": "type",
-    "min_length": "min_length",
-    "max_length": "max_length",
-    "leg_radius": "radius",
-    "height": "home",
-}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dimensions:
+    """Numbers given beside a table, or a family and its dimensions; None if not given.
+
+    Lengths are in ``unit``.
+    """
+
+    family: str | None = None  # hexapod or delta, in place of a table
+    unit: str | None = None
+    name: str | None = None  # of the model and its files
+    type: str | None = None  # of the legs: UPS
+    min_length: float | None = None  # of a leg, where readings are zero
+    max_length: float | None = None
+    leg_radius: float | None = None  # of tube and rod
+    height: float | None = None  # of the platform above the base at home
+    base_radius: float | None = None  # of the circle of base joints, or motors
+    platform_radius: float | None = None  # of the circle of platform joints
+    arm_length: float | None = None  # of a delta
+    rod_length: float | None = None  # of a delta
+
+    def stated(self) -> dict[str, Any]:
+        """Return the given dimensions by name."""
+        dimensions = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in dimensions.items() if value is not None}
 
 
 def new(
@@ -101,11 +119,11 @@ def description_of(table: Path | None, given: Dimensions) -> Description:
     if table is None:
         return described_machine(family_table(given), Path(f"--family {given.family}"))
     entries = {
-        _BESIDE[key]: {"height": value} if key == "height" else value
+        BESIDE[key]: {"height": value} if key == "height" else value
         for key, value in stated.items()
-        if key in _BESIDE
+        if key in BESIDE
     }
-    beside = (*_BESIDE, "unit", "name", "platform_radius")
+    beside = (*BESIDE, "unit", "name", "platform_radius")
     if of_family := [flag(key) for key in stated if key not in beside]:
         raise UsageError(
             f"The model could not be written: found {', '.join(of_family)} beside a table, needed "
@@ -175,7 +193,6 @@ def family_table(given: Dimensions) -> dict[str, Any]:
 
 
 def _no_family(family: str) -> str:
-    """Return the message for an unknown family."""
     remedy = (
         "write the joints of any other machine in a table, for which legcal new --template -o DIR "
         "makes one to start from"
@@ -189,7 +206,6 @@ def _no_family(family: str) -> str:
 
 
 def _decimals(unit: str) -> int:
-    """Return the decimals of lengths in a unit."""
     return DIGITS + round(math.log10(LENGTH[unit]))
 
 
@@ -332,7 +348,6 @@ def _yaml(table: dict[str, Any]) -> str:
 
 
 def _csv(table: dict[str, Any]) -> str:
-    """Return the table of a hexapod as CSV."""
     leg_type = table["type"].split("-")[-1]
     lengths = [table.get("min_length", ""), table.get("max_length", "")]
     radii = [table["radius"]["tube"], table["radius"]["rod"]]

@@ -4,10 +4,10 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from legcal.errors import BadValue, Code, ModelError, Problem, Problems
 from legcal.files.folder import RESULT
@@ -143,10 +143,21 @@ def _sibling(path: Path, folder: str) -> Path:
     return path.resolve().parent.parent / folder / path.name
 
 
+ClosureKind = Literal["3d", "6d"]  # points coincide, frames coincide
 FILE_KIND = "mechanism file"
 MAX_LOOPS = 100
 GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a wrong unit
 MAX_GAIN_ERROR = 1e-12  # tolerance of a gain of 1
+
+
+def _different(names: list[str]) -> list[str]:
+    for name in names:
+        if names.count(name) > 1:
+            raise BadValue(f"the leg '{name}' more than once", "different legs", "name each once")
+    return names
+
+
+FrameLegs = Annotated[list[str], Field(min_length=2, max_length=3), AfterValidator(_different)]
 
 
 class MotorEntry(FileSchema):
@@ -168,23 +179,15 @@ class LegcalBlock(BuiltEntry):
     base: str
     platform: str
     platform_joint: str | None = None
-    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+    base_frame: FrameLegs | None = None
     home: MotionEntry | None = None
     home_readings: dict[str, float] | None = None  # readings of actuators at home [m or rad]
     motors: dict[str, MotorEntry] | None = None  # motors that carry rods, by joint
     legs: Annotated[dict[PlainName, str], Field(min_length=1)]
 
-    @field_validator("base_frame")
-    @classmethod
-    def _different(cls, value: list[str] | None) -> list[str] | None:
-        if value is None:
-            return None
-        repeated = sorted({name for name in value if value.count(name) > 1})
-        if repeated:
-            raise BadValue(
-                f"the leg '{repeated[0]}' more than once", "different legs", "name each once"
-            )
-        return value
+
+def _small_letters(kind: object) -> object:
+    return kind.lower() if isinstance(kind, str) else kind
 
 
 class MechanismFile(BaseModel):
@@ -192,17 +195,14 @@ class MechanismFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore")
 
-    closed_loop: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
-    type: list[str]
+    closed_loop: Annotated[
+        list[Annotated[list[str], Field(min_length=2, max_length=2)]], Field(min_length=1)
+    ]
+    type: list[Annotated[ClosureKind, BeforeValidator(_small_letters)]]
     name_mot: list[str]
     joint_name: list[str] = []
     joint_type: list[str] = []
     legcal: LegcalBlock | None = None
-
-    @field_validator("type")
-    @classmethod
-    def _small_letters(cls, value: list[str]) -> list[str]:
-        return [kind.lower() for kind in value]
 
 
 def read_mechanism_file(path: Path) -> MechanismFile:
@@ -239,20 +239,9 @@ def _check_contradictions(file: MechanismFile, path: Path) -> None:
     if len(file.type) != n_pairs:
         counts = f"{n_pairs} pairs in closed_loop and {len(file.type)} entries in type"
         problems.add(refused, counts, "equal numbers", "write one type for each pair")
-    needed = "'3d' (points coincide) or '6d' (frames coincide)"
-    for i, kind in enumerate(file.type):
-        if kind not in ("3d", "6d"):
-            problems.add(f"type.{i} could not be used", f"'{kind}'", needed, "correct it")
     if n_pairs > MAX_LOOPS:
         at_most = f"at most {MAX_LOOPS}"
         problems.add(refused, f"{n_pairs} pairs in closed_loop", at_most, "give one mechanism")
-    if not n_pairs:
-        problems.add(
-            "the mechanism could not be closed",
-            "no pair in closed_loop",
-            "the loops of a parallel mechanism",
-            "write the pairs of frames that coincide",
-        )
     if len(file.joint_name) != len(file.joint_type):
         counts = f"{len(file.joint_name)} names and {len(file.joint_type)} entries in joint_type"
         refused, remedy = "joint_name could not be used", "write one type for each joint"

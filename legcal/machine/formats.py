@@ -23,7 +23,6 @@ from legcal.machine.bodies import frame_link, rigid_bodies
 from legcal.machine.drawn_state import completed, is_drawn_closed, with_held_joints
 from legcal.machine.files import (
     FILE_KIND,
-    MAX_LOOPS,
     MechanismFile,
     find_model,
     find_urdf,
@@ -38,7 +37,7 @@ from legcal.machine.spanning_tree import (
     Source,
     UrdfBuilder,
     check_one_mechanism,
-    close_loop,
+    close_loops,
     moving_groups,
     reference_poses,
 )
@@ -310,14 +309,6 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     robot = parse_robot(path, content)
     problems = XmlProblems(path)
     elements = [element for element in robot if element.tag in LOOP_TAGS]
-    if len(elements) > MAX_LOOPS:
-        raise ModelError(
-            "the loops could not be closed",
-            f"{len(elements)} of them",
-            f"at most {MAX_LOOPS}",
-            "give one mechanism",
-            path,
-        )
     bare = checked_tree(robot, path, content, problems, travel_needed=False)
     loops = _loops(elements, bare, problems)
     motors, notes = _motors(robot, bare, problems)
@@ -326,19 +317,20 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         robot.remove(element)
     poses = reference_poses(bare)
     text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
-    pairs = [close_loop(loop, text, poses) for loop in loops]
+    pairs, kinds = close_loops(loops, text, poses, path)
     for line in filter(None, text.body().split("\n")):
         robot.append(etree.fromstring(line))
         robot[-1].tail = "\n"
     named = closing_frames(robot, path)
     if named:
+        kinds.extend("3d" for _ in named)
         notes.append(
             f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
             "joints."
         )
     file = MechanismFile(
-        closed_loop=[*(frames for frames, _ in pairs), *named],
-        type=[*(kind for _, kind in pairs), *["3d"] * len(named)],
+        closed_loop=[*pairs, *named],
+        type=kinds,
         name_mot=motors,
     )
     return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))

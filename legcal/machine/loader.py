@@ -456,7 +456,6 @@ def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
 
 
 def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that all links and joints named in the YAML are in the URDF."""
     block = file.legcal
     links, joints = set(urdf.links), set(urdf.joints)
     named: list[tuple[str, str, str, set[str]]] = [

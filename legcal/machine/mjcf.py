@@ -22,7 +22,7 @@ from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
-from legcal.machine.files import MAX_LOOPS, MechanismFile
+from legcal.machine.files import MechanismFile
 from legcal.machine.spanning_tree import (
     EYE,
     FULL_TURN,
@@ -30,7 +30,7 @@ from legcal.machine.spanning_tree import (
     LoopKind,
     Source,
     UrdfBuilder,
-    close_loop,
+    close_loops,
     mesh_xml,
     moving_groups,
     origin_xml,
@@ -80,14 +80,6 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     loops = list(reader.loops())
     motors = reader.motors()
     reader.problems.raise_if_any()
-    if len(loops) > MAX_LOOPS:
-        raise ModelError(
-            "the loops could not be closed",
-            f"{len(loops)} of them",
-            f"at most {MAX_LOOPS}",
-            "give one mechanism",
-            path,
-        )
     if not loops:
         raise OutOfClass(
             "this is not a parallel mechanism",
@@ -97,14 +89,13 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
             "add them",
             path,
         )
-    pairs = [close_loop(loop, reader.tree, reader.poses) for loop in loops]
+    frames, kinds = close_loops(loops, reader.tree, reader.poses, path)
     name = root.get("model", "").strip() or path.stem
     urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
-    frames = [ends for ends, _ in pairs]
     urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)
     notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
     values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
-    file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
+    file = MechanismFile(closed_loop=frames, type=kinds, name_mot=motors)
     return Source(path, file, replace(urdf, wording=MJCF), notes * bool(dropped), values)
 
 
@@ -354,7 +345,6 @@ class MjcfReader:
         return mesh_xml(origin_xml(T), file, np.ones(3) if scale is None else scale)
 
     def _site(self, part: BodyElement) -> None:
-        """Register a site by name."""
         element, name = part.element, str(part.element.get("name"))
         attributes = self._attributes(part)
         T, length = self._between(element, attributes)
@@ -413,7 +403,6 @@ class MjcfReader:
             yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
 
     def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
-        """Return the two sites of a constraint."""
         sites = []
         for key in ("site1", "site2"):
             name = element.get(key, "")
@@ -488,7 +477,6 @@ class MjcfReader:
     def _unknown(
         self, element: etree._Element, reference: str, name: str, candidates: Mapping[str, object]
     ) -> None:
-        """Add the problem of an unknown name in an element."""
         remedy = closest(name, candidates).rstrip(".")
         self.problems.at(element, f"names {reference}, which is not in the file", remedy)
 
@@ -643,7 +631,6 @@ class MjcfReader:
 
 
 def _attributes_of(element: etree._Element) -> dict[str, str]:
-    """Return the attributes of an element itself."""
     return {str(key): str(value) for key, value in element.attrib.items()}
 
 

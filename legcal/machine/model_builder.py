@@ -199,7 +199,6 @@ class _Branch:
         tree.connect(f"{seat}_frame", "fixed", (carrier, seat), at, turned)
 
     def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
-        """Add a revolute."""
         name = f"{self._leg.name}_{joint}"
         self._to(name, "revolute", f"{name}_link", at, rotation, axis, TURN)
 
@@ -401,7 +400,6 @@ def _bar(A: Array, frame: Array, r: float) -> list[str]:
 
 
 def _box(at: Array, sizes: Array, frame: Array) -> str:
-    """Return a box of sizes (3,) along the axes of a frame."""
     return box_xml(_at(at, frame), np.round(sizes, _ROUND))
 
 
@@ -410,5 +408,4 @@ def _at(place: Array, frame: Array) -> str:
 
 
 def _rounded(size: float) -> float:
-    """Return a size, rounded for the file [m]."""
     return round(size, _ROUND)

@@ -275,7 +275,6 @@ def first_hits(mesh: Occluder, origin: Array, points: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def _caster(mesh: Occluder) -> Any:
-    """Return the ray caster of a mesh."""
     return ray_caster(mesh.corners, mesh.triangles)
 
 

@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import ModelError, OutOfClass
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
 from legcal.machine.chain import Closure
-from legcal.machine.files import MechanismFile
+from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
 from legcal.machine.urdf import Urdf
 
 
@@ -46,7 +46,7 @@ class Source:
     def closures(self) -> list[Closure]:
         """The closures in the order of the file."""
         pairs = zip(self.file.closed_loop, self.file.type, strict=True)
-        return [Closure("3d" if kind == "3d" else "6d", *ends) for ends, kind in pairs]
+        return [Closure(kind, *ends) for ends, kind in pairs]
 
 
 FULL_TURN = 2.0 * pi
@@ -186,7 +186,6 @@ def _numbers(values: Array) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a quoted attribute value."""
     return f'"{escape(text)}"'
 
 
@@ -264,9 +263,25 @@ class Loop:
     axes: tuple[Array, Array] = (_X, _X)  # unit axis in either frame
 
 
+def close_loops(
+    loops: Sequence[Loop], text: UrdfBuilder, poses: Mapping[str, RigidTransform], path: Path
+) -> tuple[list[list[str]], list[ClosureKind]]:
+    """Add the frames of all loops to a tree; return their pairs and kinds for the mechanism."""
+    if len(loops) > MAX_LOOPS:
+        raise ModelError(
+            "the loops could not be closed",
+            f"{len(loops)} of them",
+            f"at most {MAX_LOOPS}",
+            "give one mechanism",
+            path,
+        )
+    closures = [close_loop(loop, text, poses) for loop in loops]
+    return [frames for frames, _ in closures], [kind for _, kind in closures]
+
+
 def close_loop(
     loop: Loop, text: UrdfBuilder, poses: Mapping[str, RigidTransform]
-) -> tuple[list[str], str]:
+) -> tuple[list[str], ClosureKind]:
     """Add the frames of a loop to a tree and return the closure."""
     T_first_frame, T_second_frame = loop.T_link_frame
     if loop.kind in ("revolute", "universal"):

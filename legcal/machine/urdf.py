@@ -253,7 +253,6 @@ def _root(
 
 
 def _short(text: str) -> str:
-    """Return a value, shortened for a message."""
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -586,7 +585,6 @@ class UrdfPatch:
         self._write(origin, xyz=np.asarray(after.translation), rpy=rpy)
 
     def _cylinders(self, link: str) -> list[tuple[etree._Element, etree._Element]]:
-        """Return the visual cylinders of a link, as visual and shape."""
         return [
             (visual, shape)
             for element in self._robot.findall("link")

@@ -6,13 +6,11 @@ the paper, and its estimators.
 
 from __future__ import annotations
 
-import io
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +43,7 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
 from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.machine.solved_poses import solve_poses
+from legcal.pages.svg import Bars, Canvas, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
@@ -64,7 +63,7 @@ from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera, sample_camera
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 MACHINES = ("coplanar", "noncoplanar")
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs in each view
@@ -467,6 +466,16 @@ class Means:
             dict(sorted(failures.items())),
         )
 
+    @property
+    def n_failed(self) -> int:
+        """The number of failed runs."""
+        return sum(self.failures.values())
+
+    @property
+    def n_runs(self) -> int:
+        """The number of runs."""
+        return len(self.scalars) + self.n_failed
+
     def row(self) -> EstimatorRow:
         """Return a row of ``--json``; null where every run failed.
 
@@ -488,7 +497,7 @@ class Means:
             parameters_mm=(1e3 * self.errors).tolist(),
             **figures,
             runs=n,
-            failed=sum(self.failures.values()),
+            failed=self.n_failed,
             failures=self.failures,
         )
 
@@ -540,8 +549,39 @@ class PaperSummary:
         ).document()
 
     def files(self) -> dict[str, bytes]:
-        """Return figure 4 as a picture, and as a drawing to enlarge."""
-        return {f"fig4.{kind}": _figure(self, kind) for kind in ("svg", "png")}
+        """Return figure 4."""
+        return {"fig4.svg": self._figure().markup().encode()}
+
+    def _figure(self) -> Canvas:
+        """Draw figure 4: a chart of each machine, and of each estimator on it."""
+        by_name = {(means.machine, means.estimator): means for means in self.means}
+        names = []
+        for name in self.names:  # A2x for leg2.base.x
+            leg, parameter, *axis = name.split(".")
+            names.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
+        charts = []
+        for estimator, label in _DRAWN.items():
+            for machine in self.truths:
+                if (machine, estimator) not in by_name:
+                    continue
+                means = by_name[machine, estimator]
+                bars = [
+                    Bars(
+                        words,
+                        (1e3 * by_name[machine, shown].errors).tolist() or [None] * len(names),
+                    )
+                    for words, shown in (
+                        ("initial model", INITIAL),
+                        (label, estimator),
+                        ("expected at the Cramer-Rao bound", BOUND),
+                    )
+                ]
+                failed = f", {means.n_failed} of {means.n_runs} runs failed" * bool(means.n_failed)
+                title = f"{label}, {JOINTS[machine]} joints{failed}"
+                charts.append(log_bars(title, "mm", names, *bars))
+        n_runs = self.means[0].n_runs
+        title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
+        return stacked(title, charts, len(self.truths))
 
 
 class EstimatorRow(Document):
@@ -571,81 +611,3 @@ class PaperDocument(Document):
     true_values_mm: dict[str, list[Number]]  # by machine
     as_printed: dict[str, dict[str, Any] | str]  # in the paper
     readings: list[str]  # interpretations of the paper where its text leaves a choice
-
-
-# Figure 4
-
-
-def _figure(summary: PaperSummary, kind: str) -> bytes:
-    """Return the figure as a file of a kind, svg or png.
-
-    A row for each estimator, a column for each machine; all panels share the scale of errors.
-    """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    means = {(m.machine, m.estimator): m for m in summary.means}
-    machines = list(summary.truths)
-    estimators = [name for name in _DRAWN if (machines[0], name) in means]
-    labels = []
-    for name in summary.names:  # A2x for leg2.base.x
-        leg, parameter, *axis = name.split(".")
-        labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
-    drawn = [1e3 * m.errors for m in means.values() if m.estimator != INITIAL]
-    sizes = np.concatenate([[1e-2, 1.0], *drawn])
-    limits = 0.7 * float(sizes[sizes > 0.0].min()), 1.4 * float(sizes.max())
-    width, height = 7.0 * len(machines), 2.9 * len(estimators) + 0.6
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    place = {  # in inches; automatic layout in matplotlib takes as long as everything else
-        "left": 0.8 / width,
-        "right": 1.0 - 0.75 / width,
-        "bottom": 0.95 / height,
-        "top": 1.0 - 0.65 / height,
-        "wspace": 0.27,
-        "hspace": 0.4,
-    }
-    axes = figure.subplots(len(estimators), len(machines), squeeze=False, gridspec_kw=place)
-    handles = []
-    for axis, (estimator, machine) in zip(axes.flat, product(estimators, machines), strict=True):
-        shown = means[machine, estimator]
-        n_failed = sum(shown.failures.values())
-        failed = f" ({n_failed} of {len(shown.scalars) + n_failed} runs failed)" * bool(n_failed)
-        axis.set_title(f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{failed}", fontsize=10)
-        limit, truth = 1e3 * means[machine, BOUND].errors, 1e3 * summary.truths[machine]
-        handles = _draw(axis, 1e3 * shown.errors, limit, truth, labels)
-        axis.set_ylim(limits)
-    first = summary.means[0]
-    n_runs = len(first.scalars) + sum(first.failures.values())
-    title = f"Fig. 4 of the paper: {len(labels)} parameters, means over {n_runs} calibrations"
-    figure.suptitle(title, fontsize=11, y=1.0 - 0.15 / height)
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9)
-    content = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
-        figure.savefig(content, format=kind, dpi=110, metadata=metadata)
-    return content.getvalue()
-
-
-def _draw(axis: Axes, errors: Array, limit: Array, truth: Array, names: list[str]) -> list[Any]:
-    """Draw errors, their limit and true values [mm], and return the handles of the legend."""
-    place = range(len(names))
-    handles: list[Any] = []
-    if len(errors):
-        handles.append(axis.bar(place, errors, color="#4c78a8", label="mean error"))
-    expected = "expected at the Cramer-Rao bound"
-    handles.append(axis.scatter(place, limit, marker="_", s=70, lw=2.0, color="#e45756",
-                                label=expected, zorder=3))  # fmt: skip
-    right = axis.twinx()
-    handles += right.plot(place, truth, color="#8a8a8a", lw=0.8, marker=".", ms=3,
-                          label="true value (right)")  # fmt: skip
-    axis.set_xticks(place, names, rotation=90, fontsize=7)
-    axis.set_xlim(-0.7, len(names) - 0.3)
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.set_ylabel("mean error [mm]", fontsize=8)
-    right.set_ylabel("true value [mm]", fontsize=8)
-    for side in (axis, right):
-        side.tick_params(axis="y", labelsize=8)
-    return handles
