@@ -11,8 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -61,9 +62,6 @@ from legcal.simulation.study import Record, failure_of
 from legcal.simulation.truth import draw_errors, write_model_with
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera, sample_camera
-
-if TYPE_CHECKING:
-    pass
 
 MACHINES = ("coplanar", "noncoplanar")
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs in each view
@@ -466,16 +464,6 @@ class Means:
             dict(sorted(failures.items())),
         )
 
-    @property
-    def n_failed(self) -> int:
-        """The number of failed runs."""
-        return sum(self.failures.values())
-
-    @property
-    def n_runs(self) -> int:
-        """The number of runs."""
-        return len(self.scalars) + self.n_failed
-
     def row(self) -> EstimatorRow:
         """Return a row of ``--json``; null where every run failed.
 
@@ -497,7 +485,7 @@ class Means:
             parameters_mm=(1e3 * self.errors).tolist(),
             **figures,
             runs=n,
-            failed=self.n_failed,
+            failed=sum(self.failures.values()),
             failures=self.failures,
         )
 
@@ -553,33 +541,30 @@ class PaperSummary:
         return {"fig4.svg": self._figure().markup().encode()}
 
     def _figure(self) -> Canvas:
-        """Draw figure 4: a chart of each machine, and of each estimator on it."""
-        by_name = {(means.machine, means.estimator): means for means in self.means}
-        names = []
+        """Draw figure 4: a row for each estimator, a column for each machine."""
+        means = {(m.machine, m.estimator): m for m in self.means}
+        labels = []
         for name in self.names:  # A2x for leg2.base.x
             leg, parameter, *axis = name.split(".")
-            names.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
+            labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
         charts = []
-        for estimator, label in _DRAWN.items():
-            for machine in self.truths:
-                if (machine, estimator) not in by_name:
-                    continue
-                means = by_name[machine, estimator]
-                bars = [
-                    Bars(
-                        words,
-                        (1e3 * by_name[machine, shown].errors).tolist() or [None] * len(names),
-                    )
-                    for words, shown in (
-                        ("initial model", INITIAL),
-                        (label, estimator),
-                        ("expected at the Cramer-Rao bound", BOUND),
-                    )
-                ]
-                failed = f", {means.n_failed} of {means.n_runs} runs failed" * bool(means.n_failed)
-                title = f"{label}, {JOINTS[machine]} joints{failed}"
-                charts.append(log_bars(title, "mm", names, *bars))
-        n_runs = self.means[0].n_runs
+        for (estimator, words), machine in product(_DRAWN.items(), self.truths):
+            if (machine, estimator) not in means:
+                continue
+            shown = means[machine, estimator]
+            errors = [
+                Bars(label, (1e3 * means[machine, name].errors).tolist() or [None] * len(labels))
+                for label, name in (
+                    ("initial model", INITIAL),
+                    (words, estimator),
+                    ("expected at the Cramer-Rao bound", BOUND),
+                )
+            ]
+            n_failed = sum(shown.failures.values())
+            failed = f", {n_failed} of {len(shown.scalars) + n_failed} runs failed" * bool(n_failed)
+            title = f"{words}, {JOINTS[machine]} joints{failed}"
+            charts.append(log_bars(title, "mm", labels, *errors))
+        n_runs = len(self.means[0].scalars) + sum(self.means[0].failures.values())
         title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
         return stacked(title, charts, len(self.truths))
 
