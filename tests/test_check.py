@@ -129,6 +129,7 @@ def test_few_images_of_a_hexapod_show_an_encoder_that_slipped_and_else_raise_no_
         assert "offset of leg2" in [e.change.what for e in found.movement.explanations]
 
 
+@pytest.mark.system
 def test_another_machine_of_the_same_model_has_moved(result: Path, tmp_path: Path) -> None:
     found = check(_simulated(tmp_path / "set", views=2, seed=6), result)
     assert found.movement.moved

@@ -93,7 +93,7 @@ PUBLIC: dict[str, set[str]] = {
         "measurements",
         "new_dataset",
         "outlines",
-        "overrides",
+        "dataset_file",
         "photograph_matching",
         "photograph_notes",
         "reading_units",

@@ -48,10 +48,10 @@ from legcal.data.cache import (
     store_outlines,
 )
 from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset_file import Override, listed, overrides_of_call
 from legcal.data.image_choice import chosen_images, dataset_at, own_zeros, split_images
 from legcal.data.measurements import few_views, image_notes
 from legcal.data.outlines import reject_unused_legs
-from legcal.data.overrides import Override, listed, overrides_of_call
 from legcal.errors import (
     DatasetError,
     DidNotConverge,

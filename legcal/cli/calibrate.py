@@ -175,7 +175,7 @@ def calibrate(
         )
     from legcal.calibration import pipeline
     from legcal.calibration.result_folder import REPORT_NAME
-    from legcal.data.overrides import overrides_of_settings
+    from legcal.data.dataset_file import overrides_of_settings
     from legcal.pages.document import PAGE
     from legcal.report import calibration
     from legcal.report.calibration_page import write_report

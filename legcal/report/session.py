@@ -104,35 +104,30 @@ def import_table(recording_import: Import) -> Report:
     """Return the used frames of recordings, and the reasons for leaving out others."""
     blocks: list[Text | Table | list[str] | list[Text]] = []
     for view in recording_import.views:
-        stills = view.stills
-        unused = [still for still in stills if still.why_not]
+        block = view.block
+        stills, unused = block.stills, Counter(s.why_not for s in block.stills if s.why_not)
         rows = [
-            (f"{s.begin:.2f}", f"{s.end - s.begin:.2f}", s.why_not or f"frame {s.frame}")
+            (f"{s.begin_s:.2f}", f"{s.end_s - s.begin_s:.2f}", s.why_not or f"frame {s.frame}")
             for s in stills[:_MOST]
         ]
         if len(stills) > _MOST:
             rows.append(("...", "", f"{len(stills) - _MOST} more"))
-        offset = f"{view.offset.seconds:+.3f} s"
-        if view.offset.agreement is not None:
-            offset += (
-                f" (+-{view.offset.sigma:.3f} s, motion agrees to {view.offset.agreement:.0%})"
-            )
-        reasons = [
-            f"{sum(s.why_not == w for s in unused)} {w}" for w in {s.why_not: 0 for s in unused}
-        ]
+        offset = f"{block.offset_s:+.3f} s"
+        if block.agreement is not None:
+            offset += f" (+-{block.offset_sigma_s:.3f} s, motion agrees to {block.agreement:.0%})"
+        reasons = [f"{n} {why_not}" for why_not, n in unused.items()]
         blocks += [
             heading(
                 printable(view.name),
-                f": {len(view.used)} of {len(stills)} rests in {view.n_frames} frames are used",
+                f": {block.used} of {len(stills)} rests in {block.frames} frames are used",
             ),
             [
-                printable(f"Clock of {view.recording.path} less that of {view.series.source}: "
-                          f"{offset}."),
-                f"Unit of the readings: {view.series.unit}.",
+                printable(f"Clock of {block.recording} less that of {block.readings}: {offset}."),
+                f"Unit of the readings: {view.unit}.",
                 f"Not used: {', '.join(reasons)}." if reasons else "",
             ],
             table(">rest from [s]", ">for [s]", "used", rows=rows),
-            [Text(printable(f"note: {note}")) for note in view.notes],
+            [Text(printable(f"note: {note}")) for note in block.notes],
         ]  # fmt: skip
     sigma = recording_import.encoder_sigma
     scatter_in_words = (
