@@ -553,7 +553,7 @@ class PaperSummary:
                 continue
             shown = means[machine, estimator]
             errors = [
-                Bars(label, (1e3 * means[machine, name].errors).tolist())
+                Bars(label, (1e3 * means[machine, name].errors).tolist() or [None] * len(labels))
                 for label, name in (
                     ("initial model", INITIAL),
                     (words, estimator),
