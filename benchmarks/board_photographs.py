@@ -23,8 +23,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array
 from legcal.simulation.board import BoardPrint
 from legcal.simulation.cameras import mild_lens
-from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.pipeline import CAMERAS, CameraPipeline
+from legcal.simulation.rendering.appearance import CAMERAS, Appearance, CameraPipeline
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 

@@ -19,7 +19,7 @@ from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import KinematicParameters, point_like_legs
 from legcal.machine.parameters import to_vector
 from legcal.paper.four_steps import run_steps
-from legcal.paper.nominal import nominal_machine
+from legcal.paper.unknowns import nominal_machine
 
 ROOT = Path(__file__).parents[1]
 TRUTH = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"

@@ -49,7 +49,7 @@ from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import on_ties
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
-from legcal.paper.nominal import NominalMachine
+from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.cameras import cameras_around, mild_lens
 from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of
 from legcal.simulation.paper import nominal_start, noncoplanar_hexapod

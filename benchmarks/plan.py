@@ -38,12 +38,11 @@ from legcal.geometry.types import Array
 from legcal.machine.configurations import feasible_poses, poses_at
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.planning.goals import workspace_of
+from legcal.planning.exchange import workspace_of
 from legcal.planning.places import Place, all_points, default_setting, places_along
-from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance
 from legcal.planning.poses import surely_reached
-from legcal.planning.session import write_session
+from legcal.planning.session import Plan, write_session
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 from legcal.vision.camera import sample_camera

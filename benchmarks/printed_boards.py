@@ -33,8 +33,7 @@ from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages, Sheet
 from legcal.perception.board_corners import find_corners
 from legcal.simulation.cameras import mild_lens
-from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.pipeline import CAMERAS
+from legcal.simulation.rendering.appearance import CAMERAS, Appearance
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values
 from legcal.vision.image_file import ImageSize, read_image

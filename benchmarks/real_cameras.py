@@ -43,8 +43,7 @@ from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.cameras import mild_lens
 from legcal.simulation.dataset import simulate
-from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.pipeline import CAMERAS
+from legcal.simulation.rendering.appearance import CAMERAS, Appearance
 from legcal.simulation.settings import SimulationSettings
 from legcal.workers import worker_pool
 

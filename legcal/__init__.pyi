@@ -21,7 +21,6 @@ from .errors import LegcalError as LegcalError
 from .exports.formats import export as export
 from .exports.subject import ExportOptions as ExportOptions
 from .machine.configurations import random_configurations as random_configurations
-from .machine.drawing import plot_machine as plot_machine
 from .machine.family import new as new
 from .machine.kinematics import Follower as Follower
 from .machine.kinematics import forward_kinematics as forward_kinematics
@@ -29,8 +28,9 @@ from .machine.kinematics import inverse_kinematics as inverse_kinematics
 from .machine.loader import load_mechanism as load_mechanism
 from .machine.mobility import singularity as singularity
 from .machine.model import Machine as Machine
+from .machine.picture import plot_machine as plot_machine
 from .planning.request import plan as plan
-from .report.page.writing import write_report as write_report
+from .report.calibration_page import write_report as write_report
 from .simulation.dataset import simulate as simulate
 from .simulation.observe import TableNoise as TableNoise
 from .simulation.rendering.appearance import Appearance as Appearance

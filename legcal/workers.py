@@ -198,8 +198,6 @@ _ONE_THREAD = (  # variables for the number of threads, read when a process load
 
 
 class _Processes(ProcessPoolExecutor):
-    """Processes of this machine."""
-
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
         """Submit a call; new processes for it have one thread for each library."""
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
@@ -280,7 +278,6 @@ _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+/?")
 
 
 def _client(address: str, failure: str) -> Any:
-    """Return a client of the scheduler at an address."""
     try:
         from distributed import Client
         from tornado.websocket import WebSocketError

@@ -89,9 +89,9 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
 
     from legcal.machine import loader
     from legcal.machine.files import find_model
-    from legcal.machine.formats import read_source
+    from legcal.machine.formats import read_source as read
 
-    read, load = read_source, loader._load
+    load = loader._load
     sources: dict[bytes, Source] = {}
     machines: dict[tuple[str, ...], Machine] = {}
 

@@ -18,7 +18,7 @@ from legcal.calibration.documents import (
     Result,
 )
 from legcal.calibration.examination import ExaminationDocument
-from legcal.calibration.identify.report import IdentifyDocument
+from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.location.document import LocationFile
 from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
@@ -28,10 +28,10 @@ from legcal.files.schema import Document, SparseDocument
 from legcal.machine.description_table import TableFile
 from legcal.machine.files import MechanismFile
 from legcal.machine.inspection import Inspection
-from legcal.planning.planned_session import PlanDocument
+from legcal.planning.session import PlanDocument
 from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
-from legcal.simulation.paper_report import PaperDocument
+from legcal.simulation.paper import PaperDocument
 from legcal.simulation.study import StudyHeading
 from legcal.vision.board_file import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
@@ -105,7 +105,7 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "error": _ErrorDocument,
     "inspect": Inspection,
     "new": _NewDocument,
-    "identify": IdentifyDocument,
+    "identify": Identifiability,
     "plan": PlanDocument,
     "init": NewDatasetDocument,
     "import": ImportDocument,

@@ -18,7 +18,7 @@ from legcal.machine.leg import point_like_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import from_vector, to_vector
-from legcal.paper.nominal import NominalMachine
+from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import (
     OutlineNoise,
     Scene,

@@ -324,7 +324,7 @@ def _options() -> Iterable[Refusal]:
         ("error-kind", "--error joint=2mm", ("joint", "'joints'")),
         ("error-no-kind", "--error 2mm", ("2mm", "KIND=SIZE")),
         ("error-no-size", "--error joints", ("'joints'", "KIND=SIZE")),
-        ("error-size", "--error joints=2m", ("2m", "1m")),
+        ("error-size", "--error joints=2m", ("size 2.0", "0 to 1")),
         ("error-none-there", "--error twists=1deg", ("twists",)),
         ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
         ("error-number", "--error joints=2", ("joints", "a number and its unit")),
@@ -347,10 +347,8 @@ def _options() -> Iterable[Refusal]:
         ("tool-text", "-o {out} --tool-position 1,2,x", ("--tool-position", "'x'")),
         ("sigma", "-o {out} --position-sigma 0.02", ("--position-sigma", "0.02")),
         ("angle", "-o {out} --angle-sigma 3mm", ("--angle-sigma", "3mm")),
-        ("link", "-o {out} --world-link room", ("--urdf",)),
         ("folder", "-o none/a.yaml", ("none",)),
         ("no-output", "", ("--output",)),
-        ("links", "-o {out} --urdf {here}/u --world-link a --tool-link a", ("a",)),
     ]
     yield from _worded("locate", "locate hexapod {in}/hexapod.csv", locate, "tool-poses")
 

@@ -24,7 +24,7 @@ from legcal.machine.parameters import (
 )
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_steps
-from legcal.paper.nominal import NominalMachine
+from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import OutlineNoise, TableNoise, noisy_outlines
 from legcal.simulation.paper import PAPER_VIEWS
 

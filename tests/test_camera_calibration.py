@@ -122,7 +122,7 @@ def test_a_board_that_is_bent_and_printed_too_wide_gives_the_same_camera() -> No
     assert found.adjusted.residual.std() < 1.05 * NOISE_PX
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
     squares = []
     for seed in range(4):

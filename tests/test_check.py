@@ -91,7 +91,7 @@ def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path)
     found = check(images, result)
     assert not found.movement.moved
     assert found.movement.explanations == ()
-    assert found.at_platform.displacement < 4.0 * found.at_platform.expected_displacement
+    assert found.at_platform.dX_m < 4.0 * found.at_platform.sigma_dX_m
     assert files_of(images) == before
 
 
@@ -107,7 +107,7 @@ def test_an_encoder_that_slipped_is_found_with_its_size(
     assert best.change.what == "offset of leg2"
     assert best.values[0] == pytest.approx(3e-4, abs=4.0 * best.sigma[0])
     assert 0.0 < best.sigma[0] < 1e-4
-    assert found.at_platform.displacement > found.at_platform.expected_displacement
+    assert found.at_platform.dX_m > found.at_platform.sigma_dX_m
 
 
 @pytest.mark.system
@@ -129,13 +129,14 @@ def test_few_images_of_a_hexapod_show_an_encoder_that_slipped_and_else_raise_no_
         assert "offset of leg2" in [e.change.what for e in found.movement.explanations]
 
 
+@pytest.mark.system
 def test_another_machine_of_the_same_model_has_moved(result: Path, tmp_path: Path) -> None:
     found = check(_simulated(tmp_path / "set", views=2, seed=6), result)
     assert found.movement.moved
     best, *others = found.movement.explanations
     assert best.p_value < found.movement.significance
     assert all(best.remaining <= explanation.remaining for explanation in others)
-    assert found.at_platform.displacement > 1e-3
+    assert found.at_platform.dX_m > 1e-3
 
 
 def test_images_of_one_leg_are_refused_or_raise_no_alarm(

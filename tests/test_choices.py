@@ -16,8 +16,8 @@ from legcal.calibration.joint_fit.parameter_choices import (
     known_parameters,
     resolve,
 )
+from legcal.data.dataset_file import overrides_of_call
 from legcal.data.measurements import View
-from legcal.data.overrides import overrides_of_call
 from legcal.errors import UsageError
 from legcal.machine.parameters import parametrization_of
 from legcal.vision.camera import Camera

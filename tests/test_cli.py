@@ -26,7 +26,7 @@ from legcal.simulation.settings import ParameterErrors
         ),
         pytest.param(
             ["export", "hexapod", "--to", "correction", "-o", "missing.csv", "--json"],
-            {"casadi", "cv2", "trimesh", "scipy.stats", "jinja2", "matplotlib"},
+            {"casadi", "cv2", "trimesh", "scipy.stats", "jinja2"},
             "needed a result",
             marks=pytest.mark.system,
         ),

@@ -148,6 +148,7 @@ def two_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulated(folder, "hexapod", poses=6, seed=1).folder
 
 
+@pytest.mark.system
 def test_a_leg_that_no_view_shows_is_found_from_its_readings(
     two_views: Path, tmp_path: Path
 ) -> None:

@@ -272,6 +272,7 @@ def _of_few_poses(d: Dataset) -> Dataset:
     return dataset_at(d, np.flatnonzero(d.measurements.pose % 10 < 7))
 
 
+@pytest.mark.system
 def test_a_view_whose_camera_was_moved_is_named(
     outlines: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,7 +38,7 @@ from legcal.calibration.verdict import judge
 from legcal.errors import DatasetError
 from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
-from legcal.report.page.verdicts import next_steps
+from legcal.report.calibration_page import next_steps
 from legcal.simulation.settings import Level
 
 pytestmark = pytest.mark.usefixtures("without_steps")
@@ -295,8 +295,9 @@ def test_verdict_document_summary_and_next_step_follow_any_doubt(
         assert found.verdict.sentence.startswith(f"{heading}: the platform moves by ")
         assert "what is in doubt may add 0.001 mm" in found.verdict.sentence
         document = found.result.document()
+        names = ("code", "what", "sigma_dX_m", "sigma_dE_rad", "remedy")
         assert (document["trustworthy"], document["verdict"]) == (False, found.verdict.sentence)
-        assert document["doubts"] == [doubt.document().document()]
+        assert document["doubts"] == [{name: getattr(doubt, name) for name in names}]
         assert found.verdict.sentence in found.summary()
         first = next_steps(found, "out", "")[0]
         assert first == "Something is wrong. Mend it, and calibrate again."

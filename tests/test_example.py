@@ -6,6 +6,7 @@ import pytest
 from command_line import run
 
 from legcal import load_dataset
+from legcal.data import new_dataset
 
 EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"
 
@@ -35,7 +36,7 @@ def test_a_folder_with_files_is_left_alone(
 def test_an_installation_without_the_example_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("legcal.data.new_dataset._EXAMPLE", "examples/none")
+    monkeypatch.setattr(new_dataset, "_EXAMPLE", "examples/none")
     assert run(monkeypatch, "example", "-o", str(tmp_path / "copy")) == 1
     assert "install it again" in capsys.readouterr().err
     assert not (tmp_path / "copy").exists()

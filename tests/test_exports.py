@@ -30,8 +30,7 @@ import legcal
 from legcal import load_mechanism
 from legcal.errors import DatasetError, LegcalError, ModelError, OutOfClass, UsageError
 from legcal.exports.formats import export, formats_of
-from legcal.exports.identifiers import identifiers
-from legcal.exports.subject import ExportOptions, Subject, load_subject
+from legcal.exports.subject import ExportOptions, Subject, identifiers, load_subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_poses
 from legcal.machine.coordinates import COORDINATES, independent_coordinates

@@ -80,9 +80,9 @@ def test_the_true_model_predicts_images_to_their_noise(name: str) -> None:
     truth = _truth(name)
     found = _compared(truth, truth.posterior, truth.outlines)
     assert found.rms_px == pytest.approx(found.expected_px, rel=0.15)
-    assert (found.n_images, found.outlines) == (12, int(truth.outlines.used.sum()))
+    assert (found.images, found.outlines) == (12, int(truth.outlines.used.sum()))
     assert found.wrong <= 1
-    assert set(found.rms_px_of_view) == {"c1", "c2", "c3"}
+    assert set(found.views) == {"c1", "c2", "c3"}
     # What is left at the platform is the noise of the outlines alone.
     assert len(found.displacement) >= 7
     squares = (found.displacement / found.expected_displacement) ** 2
@@ -96,10 +96,10 @@ def test_a_wrong_model_does_not(name: str) -> None:
     first, *others = truth.posterior.state.legs
     moved = replace(first, B=first.B + np.array([1e-3, -1e-3, 0.0]))
     found = _compared(truth, truth.with_legs((moved, *others)), truth.outlines)
-    at_platform = found.at_platform
+    at_platform = found.platform
     assert found.wrong > 10
     assert at_platform is not None
-    assert at_platform.displacement > 2.0 * at_platform.expected_displacement
+    assert at_platform.dX_m > 2.0 * at_platform.expected_dX_m
 
 
 @pytest.mark.parametrize("name", thinned(MACHINES, ["6-spu-coplanar"]))
@@ -184,7 +184,7 @@ def _ratios(session: HexapodSession, level: float) -> Array:
         found = _held_out(session, level, seed)
         assert found.rms_px is not None
         assert found.expected_px is not None
-        assert len(found.displacement) == found.n_poses == 9
+        assert len(found.displacement) == found.poses == 9
         ratios += [
             (found.rms_px / found.expected_px, displacement, rotation)
             for displacement, rotation in zip(

@@ -106,7 +106,7 @@ def test_a_board_does_what_the_report_says(
     assert (board.present, given.board.present) == (False, True)
     assert board.needed_for == needed
     assert len(board.mends) == ranks[1] - ranks[0]
-    assert [c.needed for c in (without.conditions[0], given.conditions[0])] == [True, False]
+    assert [c.needed for c in (without.conditions[0], given.conditions[0])] == [None, False]
     assert not given.conditions[0].fails
 
 
@@ -210,7 +210,7 @@ def test_a_dataset_with_a_board_is_judged_with_it() -> None:
     np.testing.assert_array_equal(shown, [False, True, False])
     found = identifiability_of_dataset(with_board)
     assert found.board.present
-    assert not found.conditions[0].needed
+    assert found.conditions[0].needed is False
 
 
 def test_the_legs_of_a_datasets_views_count(

@@ -136,7 +136,7 @@ def test_errors_of_readings_move_the_tool_as_the_machine_does(name: str) -> None
 
 
 @pytest.mark.parametrize(
-    "case", thinned(["stated", "unknown", "model", "readings"], ["unknown", "model"])
+    "case", thinned(["stated", "unknown", "model", "readings"], ["unknown", "model"], "system")
 )
 def test_errors_are_as_large_as_the_covariance_says(case: str) -> None:
     """Monte Carlo: unknown scatter is estimated without bias, errors of the model are counted."""

@@ -1,13 +1,12 @@
-"""Joints at A that actuators move: the four steps by analogy, counts, ranks, and the scale."""
+"""Joints at A that actuators move: no four steps, counts, ranks, and the scale."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from actuated_sessions import MACHINES, session
-from staged_sessions import Observed, planned
+from staged_sessions import planned
 
 from legcal.calibration.identify import identifiability
 from legcal.calibration.identify.identifiability import check_identifiable
@@ -18,50 +17,17 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import NotIdentifiable
 from legcal.machine.leg import Cylinder
 from legcal.machine.parameters import parametrize
-from legcal.paper.conditions import count_conditions, enough_readings
-from legcal.paper.four_steps import run_base_steps
-from legcal.report.identify import _verdict
-from legcal.report.page.verdicts import identify_verdict
+from legcal.paper.conditions import count_conditions
+from legcal.report.identify import _verdict, identify_verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
 TURNING = ("6-rss", "delta")
 
 
-def seen(name: str, *, images: int = 6, noise: float = 0.0, seed: int = 0) -> Observed:
-    found = session(name, images=images)
-    return planned(found, noise=noise, seed=seed)
-
-
-# The four steps
-
-
-def test_too_few_readings_of_an_arm_are_refused_by_name() -> None:
-    observed = seen("delta")
-    m = observed.measurements
-    q = m.q.copy()
-    q[:, :2] = np.arange(m.n_rows)[:, None] % 4 * 0.1
-    few = replace(observed, measurements=replace(m, q=q))
-    with pytest.raises(NotIdentifiable, match=r"leg1 .* 5 different readings of motor1"):
-        few.run()
-
-
-def test_steps_of_planar_machines_with_arms_are_refused() -> None:
-    observed = seen("delta")
-    planar = replace(observed, nominal=replace(observed.nominal, frame_legs=(0, 2)))
-    with pytest.raises(NotIdentifiable, match="moves in a plane, needed a machine that moves in"):
-        planar.run()
-
-
-def test_readings_and_outlines_that_disagree_on_lengths_are_told() -> None:
-    observed = seen("linear-delta", noise=0.01)
-    m = observed.measurements
-    wrong = replace(observed, measurements=replace(m, q=1.1 * m.q))
-    base = run_base_steps(wrong.nominal, wrong.axes, wrong.measurements)
-    told = [text for text in base.diagnostics if "moving" in text]
-    assert len(told) == 3
-    for k, text in enumerate(told):
-        assert f"'motor{k + 1}' moving 0." in text
-        assert "check the unit of the readings" in text
+def test_steps_of_machines_whose_joints_at_A_move_are_left_out() -> None:
+    observed = planned(session("delta", images=6))
+    with pytest.raises(NotIdentifiable, match="joints at the base that motors move, needed joints"):
+        observed.run()
 
 
 # Counts and ranks
@@ -78,13 +44,6 @@ def test_counts_by_analogy_are_those_written_out() -> None:
     carriages = [((0, 1), False), ((2, 3), False), ((4, 5), False)]
     (eq12, *_) = count_conditions([(0, 1, 2, 3)], 6, actuators=carriages)
     assert (eq12.equations, eq12.unknowns) == (6 + 2 * 3 + 1, 3 + 9 + 3 * 2)
-    legs = session("delta").legs
-    view, leg = np.repeat(0, 8), np.repeat([0, 1], 4)
-    (few,) = enough_readings(view, leg, np.tile([0.1, 0.2, 0.3, 0.3], 2), legs)
-    assert few.legs == tuple(range(6))
-    assert few.by_analogy
-    at_rest = [replace(leg, actuator=None) for leg in legs]
-    assert enough_readings(view, leg, np.zeros(8), at_rest) == ()
 
 
 @pytest.mark.parametrize("name", MACHINES)

@@ -115,7 +115,7 @@ CASES = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize(("name", "which"), thinned(CASES, [CASES[2], CASES[4]]))
 def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     name: str, which: Callable[[MachineSession, np.random.Generator], BoolArray]
@@ -470,8 +470,10 @@ def gammas_tried(session: HexapodSession, lost: float, seed: int) -> tuple[Solut
     return first, trials
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("lost", [np.inf, 0.15])
+@pytest.mark.parametrize(
+    "lost",
+    [pytest.param(np.inf, marks=pytest.mark.slow), pytest.param(0.15, marks=pytest.mark.system)],
+)
 def test_the_most_likely_gamma_is_that_of_the_same_outlines(
     session: HexapodSession, lost: float
 ) -> None:

@@ -149,7 +149,7 @@ def test_a_bias_of_half_a_sigma_is_told_by_its_parameter_and_a_failed_run_is_cou
 # Designs, their bound and sessions
 
 
-@pytest.mark.parametrize("machine", thinned(MACHINES, ["3-rpr"]))
+@pytest.mark.parametrize("machine", thinned(MACHINES, ["3-rpr"], "system"))
 def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     design, bound, session = _design(machine), _bound(machine), _session(machine)
     solution = one_fit(session, NOISE.radius_sigma)
@@ -168,6 +168,16 @@ def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
         for legs in (session.legs.nominal, solution.legs, true)
     )
     assert np.linalg.norm(found - truth) < 0.05 * np.linalg.norm(start - truth)
+
+
+@pytest.mark.system
+def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> None:
+    design, relative = design_of("delta", 3, 6, Noise().sigma_px), 0.02
+    bound = bound_of(design, Noise().sigma_q, relative)
+    sigma = dict(zip(bound.names, np.sqrt(np.diagonal(bound.covariance)), strict=True))
+    wanted = relative / np.sqrt(len(design.parts))
+    for leg, name in zip(design.legs.nominal, design.legs.names, strict=True):
+        assert sigma[f"{name}.length"] / leg.q0 == pytest.approx(wanted, rel=1e-3)
 
 
 def test_noise_of_sessions_has_the_covariance_that_outlines_carry() -> None:

@@ -20,22 +20,20 @@ from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations
 from legcal.machine.leg import EquationKind, JointType
 from legcal.paper.equations import (
+    angles_of,
+    axis_frames,
+    axis_slope,
     change_of_distance,
     closure_of_leg,
     distance_of_ends,
     end_of_leg,
     end_on_axis,
     end_on_ray,
+    gibbs_of,
     joint_on_axis,
     leg_across_axis,
     mean_distance,
     point_on_ray,
-)
-from legcal.paper.gibbs import (
-    angles_of,
-    axis_frames,
-    axis_slope,
-    gibbs_of,
     turned_frame,
 )
 from legcal.paper.least_squares import (

@@ -180,7 +180,7 @@ def import_(
     assert left == []
 
 
-@pytest.mark.parametrize("kind", ["video", "folder", "bag"])
+@pytest.mark.parametrize("kind", ["video", "folder", pytest.param("bag", marks=pytest.mark.system)])
 def test_poses_that_were_held_become_rows(
     motion: Motion, tmp_path: Path, import_: Callable[..., tuple[int, Path]], kind: str
 ) -> None:

@@ -177,6 +177,7 @@ def test_what_is_held_stays_at_nominal() -> None:
     assert weak.isdisjoint(found.estimates.names)
 
 
+@pytest.mark.system
 def test_two_priors_that_contradict_each_other_are_refused() -> None:
     session = machine_session("3-upu", n_poses=4)
     found = [true_values(session)[n] for n in ("leg2.base.x", "leg3.base.y")]

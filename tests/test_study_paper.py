@@ -2,10 +2,8 @@
 
 import io
 import json
-import sys
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
 from rich.console import Console
@@ -18,11 +16,13 @@ from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, point_like_legs
 from legcal.machine.model import Machine
 from legcal.machine.parameters import from_vector, geometries, to_vector
-from legcal.report.study import study_table
+from legcal.report.session import study_table
 from legcal.simulation.paper import (
     ESTIMATORS,
     MACHINES,
     PAPER_VIEWS,
+    SCALARS,
+    Means,
     PaperStudy,
     expected_errors,
     expected_norm,
@@ -30,7 +30,6 @@ from legcal.simulation.paper import (
     paper_machine,
     platform_errors,
 )
-from legcal.simulation.paper_report import SCALARS, Means
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.session import SimulatedSession
 from legcal.simulation.study import StudyResult, run_study
@@ -41,12 +40,9 @@ STUDY = PaperStudy(n_poses=8)
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]:
-    """Run the study once, with a few runs of few poses; its figure needs no display."""
+    """Run the study once, with a few runs of few poses."""
     output = tmp_path_factory.mktemp("study") / "paper"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "matplotlib.pyplot", None)
-        patch.delattr(matplotlib, "pyplot", raising=False)
-        return run_study(STUDY, N_RUNS, output=output), output
+    return run_study(STUDY, N_RUNS, output=output), output
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:
@@ -178,10 +174,11 @@ def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bou
 
 
 def test_means_have_their_standard_deviations() -> None:
-    rng, means = np.random.default_rng(0), Means("coplanar", "fit", 1)
-    drawn = rng.uniform(1.0, 2.0, (7, len(SCALARS)))
-    for row in drawn:
-        means.add({**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]})
+    drawn = np.random.default_rng(0).uniform(1.0, 2.0, (7, len(SCALARS)))
+    means = Means.of("coplanar", "fit", [
+        {**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]}
+        for row in drawn
+    ])  # fmt: skip
     row, sigma = means.row().document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
     assert row["dX_mm"] == pytest.approx(1e3 * drawn[:, 0].mean())
     assert row["dE_deg"] == pytest.approx(np.rad2deg(drawn[:, 1].mean()))

@@ -17,8 +17,7 @@ from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.viewer.motion import Motion
-from legcal.viewer.photographs import Photographs
-from legcal.viewer.source import Source, open_source
+from legcal.viewer.source import Photographs, Source, open_source
 from legcal.viewer.stage import Stage
 
 MODELS = [name for name in shipped_names() if "hexapod-" not in name or name == "hexapod-rod"]

@@ -192,7 +192,7 @@ def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
     assert {"own at home", "R_b x", "R_e x", "100 mm"} <= set(texts)
     rings = [x for x in root.iter("{http://www.w3.org/2000/svg}circle") if x.get("fill") == "none"]
     assert len(rings) == 2 * 2 * 3  # views, ends, legs of the frame
-    hostile = draw_machine(replace(machine, name="<script>\x1b[2J&"))
+    hostile = draw_machine(replace(machine, name="<script>\x1b[2J&")).markup()
     assert "&lt;script&gt;" in hostile
     assert "\x1b" not in hostile
     assert run(monkeypatch, "inspect", model, "--picture", svg) == 0

@@ -407,9 +407,6 @@ def test_radii_of_the_true_legs_are_drawn_and_nothing_else_with_them(
 @pytest.mark.parametrize(
     ("name", "errors", "found"),
     [
-        ("3-upu", ParameterErrors(axes=Spread(-1e-3)), "errors of axes .* found a size of"),
-        ("3-upu", ParameterErrors(axes=Spread(float("nan"))), "errors of axes .* a size of"),
-        ("3-upu", ParameterErrors(axes=Spread(2.0)), "errors of axes .* found a size of"),
         ("hexapod", ParameterErrors(radii=Spread(8e-3)), "errors of radii .* needed at most"),
         ("hexapod", ParameterErrors(radii=Spread(2e-3, Distribution.NORMAL)), "errors of radii"),
     ],

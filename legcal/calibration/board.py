@@ -307,7 +307,6 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
 
 
 def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return notes on boards that are far from their stated pose."""
     notes = []
     for fixed in dataset.boards:
         stated, fitted = fixed.T_link_board, solution.T_frame_board.get(fixed.link)
@@ -360,7 +359,6 @@ def in_one_camera(
 
 
 def _agree(pose: RigidTransform, other: RigidTransform, size: float, reach: float = 1.0) -> bool:
-    """Return whether two rough poses of a board agree."""
     distance, turned = pose_distance(pose, other)
     return distance <= reach * _MAX_DISTANCE * size and turned <= reach * _MAX_ANGLE
 

@@ -311,7 +311,6 @@ def _of_arms(
 
 
 def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
-    """Return notes on the cameras and the images."""
     views = data.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes(
@@ -325,7 +324,6 @@ def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
 
 
 def _gamma_notes(data: OrderedDataset) -> list[str]:
-    """Return a note on cameras without a stated gamma."""
     views = data.measurements.views
     without_gamma = [view.name for view in views if not view.camera.gamma_is_given]
     if not without_gamma:

@@ -18,7 +18,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from markupsafe import Markup
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.detection import OVERLAYS, PHOTOGRAPHS, Detection, unique_names
@@ -51,8 +50,8 @@ from legcal.pages.document import (
     Text,
     Verdict,
     number,
+    page_html,
 )
-from legcal.pages.html import page_html
 from legcal.perception.overlays import (
     Mark,
     PartMarks,
@@ -209,7 +208,6 @@ def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
 
 
 def _marks(detection: Detection, row: int) -> list[PartMarks]:
-    """Return the marks of the parts in the image of a row."""
     measurements, outlines = detection.dataset.measurements, detection.outlines
     camera = measurements.views[int(measurements.view[row])].camera
     return marks_of_image(
@@ -227,13 +225,11 @@ def _unplaced_camera(detection: Detection, row: int) -> Camera | None:
 
 
 def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
-    """Return the marks of the board corners in the image of a row."""
     corners = detection.corners
     return () if corners is None else marks_of_corners(corners.choose(corners.row == row))
 
 
 def _caption(detection: Detection, row: int) -> str:
-    """Return the caption of the overlay of a row."""
     view, outlines = detection.view_of(row), detection.outlines
     measurements = detection.dataset.measurements
     used = outlines.used[outlines.row == row]
@@ -266,7 +262,6 @@ def _own_files(destination: Path) -> list[Path]:
 
 
 def _is_place(name: Path) -> bool:
-    """Return whether a detection may contain a file of this relative path."""
     if ".." in name.parts:
         return False
     tables = {
@@ -333,7 +328,6 @@ def tables_of(examination: Examination) -> list[Table]:
 
 
 def _outline_cells(view: ViewCondition) -> list[Cell]:
-    """Return the figures of the outlines of a view."""
     rejected = ", ".join(f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items())
     return [
         view.view,
@@ -411,7 +405,6 @@ def _worst(detection: Detection) -> set[int]:
 
 
 def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str, str]:
-    """Return the number of used outlines of an image and the reasons for rejecting legs."""
     outlines, legs = detection.outlines, detection.dataset.machine.leg_names
     indices = np.flatnonzero(outlines.row == row).tolist()
     used = f"{np.count_nonzero(outlines.used[indices])} of {len(indices)} used"
@@ -489,7 +482,7 @@ def _landmark_editor(detection: Detection, token: str) -> LandmarkEditor:
             for name, (leg, _) in joints.items()
         ],
         clicks=clicks,
-        drawing=Markup(draw_machine(machine, in_page=True)),
+        drawing=draw_machine(machine, in_page=True).markup(),
         sigma=SIGMA_PX,
         first=min(unplaced, default=0),
         token=token,

@@ -196,14 +196,11 @@ def detect(
 
 
 def _folder(path: Path) -> Path:
-    """Return the folder of a dataset, given the folder or its ``dataset.yaml``."""
     return path if path.is_dir() else path.parent
 
 
 @dataclass
 class _Checklist:
-    """The checks of a dataset with their findings so far."""
-
     dataset: Dataset
     refuses: bool  # whether unusable photographs are errors rather than findings
     checks: dict[str, str] = field(default_factory=dict)
@@ -339,7 +336,6 @@ def _look_for_still_encoders(checklist: _Checklist, shares: Mapping[str, float])
 
 
 def _look_for_rounded_readings(checklist: _Checklist) -> None:
-    """Look for readings rounded more coarsely than their stated noise."""
     dataset, legs = checklist.dataset, checklist.dataset.machine.legs
     sigma = dataset.measurements.sigma_of(legs)
     for unit in ("m", "rad"):
@@ -371,7 +367,6 @@ def _last_digit(q: Array) -> float | None:
 
 
 def _look_at_cameras(checklist: _Checklist, choices: Choices) -> None:
-    """Check the metadata of photographs against the camera files and each other."""
     dataset, m = checklist.dataset, checklist.dataset.measurements
     shown_views = sorted({int(v) for v in m.view})
     files = {dataset.camera_paths[v]: m.views[v].camera for v in shown_views}
@@ -468,7 +463,6 @@ def _look(load: ImageReader, row: int) -> tuple[Exposure | None, str]:
 
 
 def _look_at_views(checklist: _Checklist, exposures: Mapping[int, Exposure]) -> None:
-    """Look for blurred or overexposed views."""
     m = checklist.dataset.measurements
     of_views = {
         view.name: of_view
@@ -504,7 +498,6 @@ def _look_at_views(checklist: _Checklist, exposures: Mapping[int, Exposure]) -> 
 
 
 def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
-    """Try common mistakes if images contradict the session."""
     checklist.diagnosis = diagnose(data)
     checklist.checks["mistakes"] = (
         "one explains the images better"
@@ -656,18 +649,15 @@ def _outline_figures(detection: Detection, view: str) -> dict[str, Any]:
 
 
 def _count_legs(outlines: Outlines, chosen: BoolArray) -> int:
-    """Return the number of legs in images with one of the chosen outlines."""
     return len(set(zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)))
 
 
 def _median(values: Sequence[float] | Array) -> float | None:
-    """Return the median of the finite values; None without any."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.median(finite)) if finite else None
 
 
 def _range(values: Sequence[float]) -> str:
-    """Return the range of values in words."""
     least, greatest = (f"{float(f'{end(values):.2g}'):g}" for end in (min, max))
     return least if least == greatest else f"{least} to {greatest}"
 

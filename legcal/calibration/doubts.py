@@ -15,7 +15,6 @@ from scipy.special import ndtr, stdtrit
 
 from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.documents import DoubtBlock
 from legcal.calibration.joint_fit.cross_validation import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import HeldOut
@@ -96,16 +95,6 @@ class Doubt:
     def sentence(self) -> str:
         """What was found, and what to do."""
         return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
-
-    def document(self) -> DoubtBlock:
-        """Return the entry of documents."""
-        return DoubtBlock(
-            code=self.code,
-            what=self.what,
-            sigma_dX_m=self.sigma_dX_m,
-            sigma_dE_rad=self.sigma_dE_rad,
-            remedy=self.remedy,
-        )
 
 
 def worst_first(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
@@ -691,12 +680,12 @@ def _held_out(held_out: HeldOut | None) -> list[Doubt]:
         f"images that were kept aside lie {held_out.rms_px:.3f} px from their prediction, where "
         f"{held_out.expected_px:.3f} px were expected"
     )
-    pair = held_out.at_platform
+    pair = held_out.platform
     return [
         Doubt(
             "held_out",
             what,
             "look at the worst outlines, and for play, bending or a camera that moved",
-            *((None, None) if pair is None else (pair.displacement, pair.rotation)),
+            *((None, None) if pair is None else (pair.dX_m, pair.dE_rad)),
         )
     ]

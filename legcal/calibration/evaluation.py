@@ -190,35 +190,28 @@ def evaluate(
 
 
 def _in_the_order_of(reference: Machine, model: Machine) -> Machine:
-    """Return the reference with legs and frame legs in the model's order."""
-    if set(reference.leg_names) != set(model.leg_names):
+    if different := machine_difference(reference, model):
         raise ModelError(
-            f"The models could not be compared: {model.name} has the legs "
-            f"{', '.join(model.leg_names)} and {reference.name} has "
-            f"{', '.join(reference.leg_names)}; both must describe the same machine; "
-            "check the two paths."
+            f"The models could not be compared: found {reference.name} with {different} of "
+            f"{model.name}, needed two models of one machine in the same frame; check the two "
+            "paths, and legcal.base_frame."
         )
-    reference = reference.with_leg_order(model.leg_names)
-    if reference.frame_legs != model.frame_legs:
-        differences = " and ".join(
-            ", ".join(m.leg_names[leg] for leg in m.frame_legs) for m in (model, reference)
-        )
-        raise ModelError(
-            f"The models could not be compared: their base_frame legs differ ({differences}); "
-            "coordinates mean the same only in the same frame; give both the same base_frame."
-        )
-    different = [
-        f"{leg.name} is {leg.kind} {leg.type} and {other.kind} {other.type}"
-        for leg, other in zip(model.legs, reference.legs, strict=True)
-        if (leg.type, leg.kind) != (other.type, other.kind)
-    ]
-    if different or model.spatial != reference.spatial:
-        differences = "; ".join(different) or "one is spatial and the other planar"
-        raise ModelError(
-            f"The models could not be compared: {differences}; both must describe the same "
-            "machine; check the two paths."
-        )
-    return reference
+    return reference.with_leg_order(model.leg_names)
+
+
+def machine_difference(machine: Machine, other: Machine) -> str:
+    """Return how a model differs from another one of the same machine in words; "" if it may be."""
+    if set(machine.leg_names) != set(other.leg_names):
+        return f"the legs {', '.join(machine.leg_names)}, not {', '.join(other.leg_names)}"
+    machine = machine.with_leg_order(other.leg_names)
+    for leg, other_leg in zip(machine.legs, other.legs, strict=True):
+        words, other_words = (f"{x.name} ({x.kind}, {x.type})" for x in (leg, other_leg))
+        if words != other_words:
+            return f"the leg {words}, not {other_words}"
+    frames = [[m.leg_names[j] for j in m.frame_legs] for m in (machine, other)]
+    if frames[0] != frames[1]:
+        return f"base_frame {', '.join(frames[0])}, not {', '.join(frames[1])}"
+    return ""
 
 
 def _readings_of(dataset: Dataset, machine: Machine) -> Array:
@@ -261,7 +254,6 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
 
 
 def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:
-    """Return the rows that the model or the reference cannot reach, in the order of the file."""
     m = dataset.measurements
     names = row_names(m)
     return tuple(

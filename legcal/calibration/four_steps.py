@@ -20,7 +20,7 @@ from legcal.machine.leg import Leg
 from legcal.machine.parameters import geometries, parametrization_of, reframed
 from legcal.machine.ties import machine_ties, on_ties
 from legcal.paper.four_steps import run_base_steps, run_platform_steps
-from legcal.paper.nominal import nominal_machine
+from legcal.paper.unknowns import nominal_machine
 from legcal.perception.placement import Placement
 
 

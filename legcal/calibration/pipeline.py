@@ -29,7 +29,6 @@ from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
-from legcal.calibration.fit_overlays import check_overlays, with_overlays
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
@@ -37,10 +36,9 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
 from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
-from legcal.calibration.notes import Note, Topic
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
-from legcal.calibration.result_folder import Beside, write_result
+from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.calibration.verdict import judge
 from legcal.data.cache import (
@@ -50,10 +48,10 @@ from legcal.data.cache import (
     store_outlines,
 )
 from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset_file import Override, listed, overrides_of_call
 from legcal.data.image_choice import chosen_images, dataset_at, own_zeros, split_images
 from legcal.data.measurements import few_views, image_notes
 from legcal.data.outlines import reject_unused_legs
-from legcal.data.overrides import Override, listed, overrides_of_call
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
@@ -187,19 +185,20 @@ def calibrate(
         found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
     )
     notes = [
-        *Note.about(Topic.DIAGNOSIS, (one.sentence for one in found.diagnosis)),
-        *Note.about(Topic.DATASET, dataset.notes),
-        *Note.about(Topic.DATASET, missing),
-        *Note.about(Topic.IMAGES, on_images),
-        *Note.about(Topic.MODEL, (*choices.notes, *identify_notes)),
-        *Note.about(Topic.DATASET, cache_notes),
-        *Note.about(Topic.READINGS, found.fitted.unreached_notes()),
-        *Note.about(Topic.READINGS, _own_zero_notes(dataset, found.solution)),
-        *Note.about(Topic.IMAGES, [f"Left out, as asked: {leave_out}."] if leave_out else ()),
-        *Note.about(Topic.BOARDS, board_notes(dataset, found.solution, found.corners)),
+        *(one.sentence for one in found.diagnosis),
+        *dataset.notes,
+        *missing,
+        *on_images,
+        *choices.notes,
+        *identify_notes,
+        *cache_notes,
+        *found.fitted.unreached_notes(),
+        *_own_zero_notes(dataset, found.solution),
+        *([f"Left out, as asked: {leave_out}."] if leave_out else ()),
+        *board_notes(dataset, found.solution, found.corners),
         *found.solution.notes,
-        *Note.about(Topic.CAMERAS, _camera_notes(dataset, found.solution)),
-        *Note.about(Topic.CAMERAS, exact_cameras(dataset, choices)),
+        *_camera_notes(dataset, found.solution),
+        *exact_cameras(dataset, choices),
     ]
     calibration = judge(
         dataset_at(dataset, fitted),
@@ -331,7 +330,6 @@ def _leaves_out_many(estimate: Estimate) -> bool:
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
-    """Return notes on rough camera poses and on images that contradict the fit."""
     fitted, o = estimate.fitted, estimate.solution.outlines
     shown = set(fitted.measurements.view[o.row[o.used]].tolist())
     views = fitted.measurements.views
@@ -407,7 +405,6 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
 def _fitted_and_held_out(
     dataset: Dataset, left_out: BoolArray | None, holdout: float | None
 ) -> tuple[IntArray, IntArray]:
-    """Return the rows of fitted and of held-out images."""
     rows = np.arange(dataset.measurements.n_rows)
     if left_out is not None:
         rows = rows[~left_out]
@@ -429,7 +426,6 @@ def _fitted_and_held_out(
 
 
 def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> HeldOut:
-    """Compare the held-out images with the prediction of the fit."""
     held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
     outlines = estimate.outlines.at(held_out.rows)
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
@@ -438,7 +434,6 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
 
 
 def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return a note on each zero that an encoder had in some images."""
     posterior, notes = solution.posterior, list[str]()
     sigma = np.sqrt(np.diagonal(posterior.covariance)[posterior.problem.where("own_zeros")])
     zeros = dataset.measurements.own_zeros, posterior.state.own_zeros.tolist(), sigma.tolist()

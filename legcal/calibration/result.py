@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from legcal.brief import brief
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     BoardPose,
     Distance,
+    DoubtBlock,
     Gamma,
     Holdout,
-    HoldoutPlatform,
     Kinematic,
     NoSteps,
     Observations,
@@ -37,18 +38,20 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.held_out import HeldOut, Posterior
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
-from legcal.calibration.plots import plot_residuals
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
+from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import row_names
+from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.directions import describe_direction
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences
@@ -58,16 +61,6 @@ from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
 from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import camera_numbers, shared_cameras
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-from dataclasses import replace
-
-from legcal.brief import brief
-from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.data.image_tables import canonical_order
-from legcal.data.outlines import Outlines
-from legcal.geometry.types import Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -87,6 +80,38 @@ class Verdict:
     def is_to_be_refused(self) -> bool:
         """Whether it is not to be loaded into a controller: a doubt is grave."""
         return any(doubt.is_grave for doubt in self.doubts)
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class OutlineResiduals:
+    """Residuals of the outlines in the fit, including those it rejected."""
+
+    index: IntArray  # (n,): rows of the table of outlines
+    # (n, 2): distance of each end from the predicted outline, common-mode edge biases removed [px]
+    offset: Array
+    whitened: Array  # (n, 2): the same, uncorrelated and in standard deviations
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def outline_residuals(
+    posterior: Posterior, dataset: Dataset, outlines: Outlines
+) -> OutlineResiduals:
+    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
+    problem = posterior.problem
+    offset = problem.offsets(posterior.state)
+    covariance = posterior.noise.covariance(problem.outlines.covariance)
+    L = np.linalg.cholesky(covariance) if len(offset) else covariance
+    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
+    # The fit numbers outlines as they stand in canonical order.
+    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
+    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
+    number = order.reorder(numbered).contrast.astype(np.intp)
+    index = number[problem.outlines.index]
+    back = np.argsort(index, kind="stable")
+    return OutlineResiduals(index[back], offset[back], whitened[back])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +170,6 @@ class Calibration(Summarised):
         solution = self.solution
         return outline_residuals(solution.posterior, self.dataset, solution.outlines)
 
-    def plot_residuals(self) -> Figure:
-        """Return a figure of how far outlines are from the fit, over the field of each view."""
-        return plot_residuals(self.solution.posterior)
-
     def __repr__(self) -> str:
         return few_lines(f"Calibration of '{self.dataset.machine.name}'", self.result)
 
@@ -173,13 +194,13 @@ def _result_of(calibration: Calibration) -> Result:
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     nominal, witness = geometries(machine), single_witness(solution.posterior.problem)
-    turned_from = nominal_axes(names, nominal)
+    turned_from, held_out = nominal_axes(names, nominal), calibration.held_out
     return Result(
         legcal_result=1,
         status="converged",
         verdict=calibration.verdict.sentence,
         trustworthy=calibration.verdict.trustworthy,
-        doubts=[doubt.document() for doubt in calibration.doubts],
+        doubts=[DoubtBlock.model_validate(doubt) for doubt in calibration.doubts],
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=turned_from,
@@ -214,7 +235,7 @@ def _result_of(calibration: Calibration) -> Result:
         ),
         start=solution.start,
         platform=_platform(calibration),
-        holdout=_holdout(calibration),
+        holdout=None if held_out is None else Holdout.model_validate(held_out),
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
@@ -394,64 +415,3 @@ def _errors(error: PlatformError, prefix: str = "") -> dict[str, Any]:
 def _predicted(error: PlatformError) -> dict[str, Any]:
     """Return the fields of :class:`WorkspaceAccuracy`."""
     return {"poses": len(error.displacement), **_errors(error, "sigma_")}
-
-
-def _holdout(calibration: Calibration) -> Holdout | None:
-    """Return what images that were kept aside say."""
-    held_out = calibration.held_out
-    if held_out is None:
-        return None
-    pair = held_out.at_platform
-    return Holdout(
-        images=held_out.n_images,
-        poses=held_out.n_poses,
-        outlines=held_out.outlines,
-        wrong=held_out.wrong,
-        rms_px=held_out.rms_px,
-        expected_px=held_out.expected_px,
-        views=held_out.rms_px_of_view,
-        platform=None
-        if pair is None
-        else HoldoutPlatform(
-            poses=len(held_out.displacement),
-            dX_m=pair.displacement,
-            expected_dX_m=pair.expected_displacement,
-            dE_rad=pair.rotation,
-            expected_dE_rad=pair.expected_rotation,
-        ),
-    )
-
-
-# Residuals
-
-
-@brief
-@dataclass(frozen=True, eq=False)
-class OutlineResiduals:
-    """Residuals of the outlines in the fit, including those it rejected."""
-
-    index: IntArray  # (n,): rows of the table of outlines
-    # (n, 2): distance of each end from the predicted outline, common-mode edge biases removed [px]
-    offset: Array
-    whitened: Array  # (n, 2): the same, uncorrelated and in standard deviations
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-
-def outline_residuals(
-    posterior: Posterior, dataset: Dataset, outlines: Outlines
-) -> OutlineResiduals:
-    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
-    problem = posterior.problem
-    offset = problem.offsets(posterior.state)
-    covariance = posterior.noise.covariance(problem.outlines.covariance)
-    L = np.linalg.cholesky(covariance) if len(offset) else covariance
-    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
-    # The fit numbers outlines as they stand in canonical order.
-    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
-    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
-    number = order.reorder(numbered).contrast.astype(np.intp)
-    index = number[problem.outlines.index]
-    back = np.argsort(index, kind="stable")
-    return OutlineResiduals(index[back], offset[back], whitened[back])

@@ -1,9 +1,9 @@
-"""What a calibration says to people: its table of parameters and sentences, from the document."""
+"""What a calibration says to people: tables, sentences and charts, from the document."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, overload
@@ -21,7 +21,6 @@ from legcal.calibration.documents import (
     WorkspaceAccuracy,
 )
 from legcal.calibration.link_joints import joints_title, mark_in_words
-from legcal.calibration.plots import plot_uncertainty
 from legcal.calibration.quantities import (
     FRAMES,
     Quantity,
@@ -33,11 +32,12 @@ from legcal.calibration.quantities import (
 from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
 from legcal.machine.directions import list_in_words
+from legcal.pages.document import Number, Table
+from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
 from legcal.vision.board import Link
 
 if TYPE_CHECKING:
     import pandas
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -125,6 +125,18 @@ class ParameterTable:
             for row, n in zip(self.rows, self.digits, strict=True)
         ]
 
+    def as_table(self, title: str = "") -> Table:
+        """Return the table for a terminal or a page."""
+        columns = [f">{name}" if name in NUMBERS else name for name in self.columns]
+        rows = [
+            [
+                Number(x, text) if name in NUMBERS else text
+                for name, x, text in zip(self.columns, row, texts, strict=True)
+            ]
+            for row, texts in zip(self.rows, self.cells(), strict=True)
+        ]
+        return Table(columns, rows, title)
+
     def to_pandas(self) -> pandas.DataFrame:
         """Return a data frame, a row a parameter.
 
@@ -169,12 +181,10 @@ class ParameterTable:
 
 
 def _numbers(q: Quantity) -> tuple[Any, ...]:
-    """Return the numbers of the columns of a quantity."""
     return q.nominal, q.value, q.change, q.sigma
 
 
 def _place(q: Quantity) -> tuple[str, ...]:
-    """Return leg, joint or axis, coordinate and link."""
     return q.parameter.owner, q.parameter.kind.replace("_", " "), q.parameter.component, q.frame
 
 
@@ -183,7 +193,6 @@ NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values(
 
 
 def _cell(column: str, x: Any, digits: int) -> str:
-    """Return a number or text of the table."""
     if column == "status":
         return "" if x == "estimated" else str(x)
     if x is None:
@@ -221,9 +230,13 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
 
     *verbose* says how the fit went too, and names what moves the platform by nothing.
     """
+    notes = [f"Note: {note}" for note in result.notes]
+    return [*doubt_lines(result), *notes, *fit_lines(result, verbose=verbose)]
+
+
+def fit_lines(result: Result, *, verbose: bool) -> list[str]:
+    """Return what a fit was made from, how well it fits, and what it leaves open."""
     return [
-        *_doubt_lines(result),
-        *(f"Note: {note}" for note in result.notes),
         *(result.details if verbose else ()),
         *_observation_lines(result),
         *_board_lines(result),
@@ -236,13 +249,12 @@ def sentences(result: Result, *, verbose: bool = False) -> list[str]:
 
 
 def brief_sentences(result: Result) -> list[str]:
-    """Return what the first screen says beside the verdict and the platform error."""
+    """Return what the first screen says beside the verdict, the platform error and notes."""
     return [
-        *_doubt_lines(result),
+        *doubt_lines(result),
         *_direction_lines(result, 1),
         *_observation_lines(result),
         *([] if result.holdout is None else _holdout_lines(result.holdout)),
-        *(f"Note: {note}" for note in result.notes),
     ]
 
 
@@ -309,13 +321,13 @@ class Summarised:
 
     def plot_uncertainty(self) -> Figure:
         """Return a figure of the standard deviations of parameters, and of the platform."""
-        return plot_uncertainty(self.result)
+        return uncertainty_figure(self.result).markup()
 
     def _repr_html_(self) -> str:
         return summary_html(self.result)
 
 
-def _doubt_lines(result: Result) -> list[str]:
+def doubt_lines(result: Result) -> list[str]:
     """Return what speaks against the result, each with its effect on the platform and its remedy.
 
     One doubt alone stands in the verdict.
@@ -347,7 +359,6 @@ def _observation_lines(result: Result) -> list[str]:
 
 
 def _left_out_lines(seen: Observations) -> list[str]:
-    """Return how many images and views were left out."""
     of_views = Counter(image.view for cause in seen.left_out for image in cause.images)
     if not of_views:
         return []
@@ -484,3 +495,41 @@ def _holdout_lines(found: Holdout) -> list[str]:
         f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
         f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
     ]
+
+
+# Charts
+
+
+def parameter_charts(quantities: Sequence[Quantity]) -> list[Canvas]:
+    """Draw changes and standard deviations of estimated quantities, a chart for each unit."""
+    charts = []
+    for unit in ("mm", "deg"):
+        shown = [q for q in quantities if q.unit == unit and q.sigma]
+        if shown:
+            changes = [None if q.change is None else abs(q.change) for q in shown]
+            bars = Bars("change", changes), Bars("1 sigma", [q.sigma for q in shown])
+            names = [q.name for q in shown]
+            charts.append(log_bars("Change against the nominal model", unit, names, *bars))
+    return charts
+
+
+def platform_chart(result: Result) -> list[Canvas]:
+    """Draw the change of the platform at the poses, and its predicted error; none without both."""
+    poses = [] if result.platform is None else result.platform.per_pose
+    number = np.arange(1.0, len(poses) + 1.0)
+    lines = [
+        Points(number, 1e3 * np.array(values), group=k, label=label, line="")
+        for k, (values, label) in enumerate(
+            (
+                ([pose.change_dX_m for pose in poses], "before: change against the nominal model"),
+                ([pose.sigma_dX_m for pose in poses], "after: predicted error (1 sigma)"),
+            )
+        )
+    ]
+    return [scatter("Platform error", lines, "pose", "platform [mm]", log="y")] if poses else []
+
+
+def uncertainty_figure(result: Result) -> Canvas:
+    """Draw changes and standard deviations of all parameters, and of the platform at poses."""
+    charts = parameter_charts(parameters_of(result))
+    return stacked("How well the parameters are known", [*charts, *platform_chart(result)])

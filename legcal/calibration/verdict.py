@@ -24,7 +24,6 @@ from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import SCALE
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.notes import Note, Topic
 from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
@@ -110,10 +109,10 @@ def judge(
         verdict,
         (
             *notes,
-            *Note.about(Topic.IMAGES, click_notes(dataset, solution)),
-            *Note.about(Topic.READINGS, commanded(dataset)),
-            *Note.about(Topic.MODEL, _asked_lengths(dataset, solution, doubts)),
-            *Note.about(Topic.READINGS, _untested(dataset, sequences, session, platform)),
+            *click_notes(dataset, solution),
+            *commanded(dataset),
+            *_asked_lengths(dataset, solution, doubts),
+            *_untested(dataset, sequences, session, platform),
             *closeness(dataset.folder, measurements.n_rows, platform),
         ),
         held_out,
@@ -208,7 +207,6 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
 
 
 def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
-    """Return the verdict that follows from what was found and from doubts, the worst first."""
     if not doubts:
         return Verdict(doubts, f"Calibrated: {found}.", remedy)
     more = len(doubts) - 1

@@ -25,7 +25,7 @@ from legcal.calibration.documents import (
     FitQuality,
     MovedPlatform,
 )
-from legcal.calibration.joint_fit.held_out import PlatformPair
+from legcal.calibration.evaluation import machine_difference
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -75,7 +75,7 @@ class Check:
         The fit of the new images alone.
     movement : Movement
         The test; ``movement.moved`` is its answer.
-    at_platform : PlatformPair
+    at_platform : MovedPlatform
         Difference of the platform between new images and earlier result, root mean square over
         the poses, and its standard deviation if nothing moved.
     notes : tuple of str
@@ -86,7 +86,7 @@ class Check:
     earlier: EarlierResult
     solution: Solution
     movement: Movement
-    at_platform: PlatformPair
+    at_platform: MovedPlatform
     notes: tuple[str, ...] = ()
 
     @property
@@ -95,12 +95,12 @@ class Check:
         movement, pair = self.movement, self.at_platform
         p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
         test = f"p-value {p}, significance {100 * movement.significance:g} %"
-        uncertainty = f"{mm_deg(pair.expected_displacement, pair.expected_rotation)} (1 sigma)"
+        uncertainty = f"{mm_deg(pair.sigma_dX_m, pair.sigma_dE_rad)} (1 sigma)"
         if not movement.moved:
             return (
                 f"No change was detected ({test}); the platform pose is confirmed to {uncertainty}."
             )
-        change = mm_deg(pair.displacement, pair.rotation)
+        change = mm_deg(pair.dX_m, pair.dE_rad)
         return (
             f"Something has moved ({test}): the platform pose has changed by {change}, uncertainty "
             f"{uncertainty}; calibrate again."
@@ -108,7 +108,7 @@ class Check:
 
     def document(self) -> dict[str, Any]:
         """Return the output of ``--json``."""
-        movement, pair = self.movement, self.at_platform
+        movement = self.movement
         return CheckDocument(
             legcal_check=1,
             result=str(self.earlier.folder),
@@ -133,12 +133,7 @@ class Check:
                 )
                 for explanation in movement.explanations
             ],
-            platform=MovedPlatform(
-                dX_m=pair.displacement,
-                dE_rad=pair.rotation,
-                sigma_dX_m=pair.expected_displacement,
-                sigma_dE_rad=pair.expected_rotation,
-            ),
+            platform=self.at_platform,
             images=self.dataset.measurements.n_rows,
             residuals=FitQuality.model_validate(self.solution.quality),
             notes=list(self.notes),
@@ -214,11 +209,12 @@ def check(
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
     """Return the new images with the calibrated model in place of their own."""
     named, calibrated = dataset.machine, earlier.machine
-    if sorted(named.leg_names) != sorted(calibrated.leg_names):
-        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(named.leg_names)}"
-    else:
+    different = machine_difference(calibrated, named)
+    if not different:
         calibrated = calibrated.with_leg_order(named.leg_names)
-        different = _model_difference(calibrated, named)
+        for leg, other in zip(calibrated.legs, named.legs, strict=True):
+            if leg.prismatic != other.prismatic:
+                different = f"the joint {leg.prismatic}, not {other.prismatic}"
     if different:
         raise DatasetError(
             f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
@@ -226,22 +222,6 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
             "the result that belongs to these images."
         )
     return replace(dataset, machine=calibrated, overrides=())
-
-
-def _model_difference(calibrated: Machine, given: Machine) -> str:
-    """Return the difference of two models with the same legs in words; "" without one."""
-    for calibrated_leg, given_leg in zip(calibrated.legs, given.legs, strict=True):
-        calibrated_in_words, given_in_words = (
-            f"{leg.name} ({leg.kind}, {leg.type})" for leg in (calibrated_leg, given_leg)
-        )
-        if calibrated_in_words != given_in_words:
-            return f"the leg {calibrated_in_words}, not {given_in_words}"
-        if calibrated_leg.prismatic != given_leg.prismatic:
-            return f"the joint {calibrated_leg.prismatic}, not {given_leg.prismatic}"
-    frames = [[m.leg_names[j] for j in m.frame_legs] for m in (calibrated, given)]
-    if frames[0] != frames[1]:
-        return f"base_frame {', '.join(frames[0])}, not {', '.join(frames[1])}"
-    return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +356,6 @@ def _compare(
     prior: _EarlierEstimate,
     significance: float,
 ) -> Check:
-    """Return the test of the earlier result by the fit of the new images."""
     machine, parametrization = dataset.machine, solution.kinematic.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
     variance_factor = _earlier_noise(solution, earlier)
@@ -395,7 +374,7 @@ def _compare(
     return Check(dataset, earlier, solution, movement, at_platform)
 
 
-def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPair:
+def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> MovedPlatform:
     """Return the platform motion of a fit; J (k, 6, n) is its derivative by the parameters."""
     values, covariance = fit.estimate()
     # Priors shrink the estimate towards the earlier result by 1 - G.
@@ -403,11 +382,11 @@ def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> PlatformPa
     spread = G @ covariance + G @ prior.covariance @ G.T
     shift = J @ (values - prior.old)
     variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
-    return PlatformPair(
-        _rms(shift[:, 3:] ** 2),
-        _rms(variance[:, 3:]),
-        _rms(shift[:, :3] ** 2),
-        _rms(variance[:, :3]),
+    return MovedPlatform(
+        dX_m=_rms(shift[:, 3:] ** 2),
+        dE_rad=_rms(shift[:, :3] ** 2),
+        sigma_dX_m=_rms(variance[:, 3:]),
+        sigma_dE_rad=_rms(variance[:, :3]),
     )
 
 
@@ -425,7 +404,6 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
 
 
 def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
-    """Return the parametrization with selected parameters."""
     place = np.full(parametrization.place.shape, -1, dtype=np.intp)
     for new, old in enumerate(columns):
         place[parametrization.place == old] = new

@@ -1,8 +1,7 @@
-"""Platform errors of a calibration over the workspace.
+"""Platform errors of a calibration on a grid over the workspace, at the orientation of home.
 
-At sample poses of the workspace, and on a grid of reachable positions at the orientation of home:
-the change from the nominal to the calibrated model, eq (20), and the error of the calibrated model
-predicted by its covariance.
+They are the change from the nominal to the calibrated model, eq (20), and the error of the
+calibrated model predicted by its covariance.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.brief import brief
 from legcal.calibration.joint_fit.platform import (
     PlatformError,
     expected_error,
@@ -35,68 +33,55 @@ _FLAT = 1e-3  # extent of a planar workspace, relative to the largest extent
 _CLOSED = 2.5e-6  # largest difference of a point and the pose by its readings [leg lengths, rad]
 
 
-@brief
 @dataclass(frozen=True, eq=False)
 class PlatformMap:
-    """Platform errors over the workspace.
+    """Displacements of the platform at places of the workspace.
 
     Attributes
     ----------
-    position : (n, 3) array
-        The origin of the platform link in the base link [m].
-    change, sigma : PlatformError
-        At these positions: change from the nominal to the calibrated model at the same readings,
-        and predicted error of the calibrated model, one standard deviation.
     x, y, z : (n_x,), (n_y,), (n_z,) arrays
-        The grid [m]; empty if the machine cannot keep the orientation of home elsewhere.
-    index : (n_z, n_y, n_x) array of int
-        Index of the position of each point of the grid; -1 if the machine cannot reach it.
+        The grid of origins of the platform link in the base link [m].
+    change, sigma : (n_z, n_y, n_x) arrays
+        Change from the nominal to the calibrated model at the same readings, and predicted error of
+        the calibrated model, one standard deviation [m]; NaN out of reach.
     """
 
-    position: Array
-    change: PlatformError
-    sigma: PlatformError
     x: Array
     y: Array
     z: Array
-    index: Array
+    change: Array
+    sigma: Array
 
 
 def platform_map(calibration: Calibration) -> PlatformMap | None:
     """Return the platform errors over the workspace; None if readings do not determine the pose.
 
-    None also if no random poses can be drawn within the travels of the model.
+    None also if no random poses can be drawn within the travels of the model, or if it reaches few
+    places in the orientation of home.
     """
     machine = calibration.dataset.machine
     if calibration.platform is None:
         return None
     try:
-        q, drawn = workspace(machine)
+        _, drawn = workspace(machine)
     except DidNotConverge:
         return None
-    position = np.array([T.translation for T in drawn])
-    axes = _grid(position)
-    grids = np.meshgrid(*axes[::-1], indexing="ij")
+    x, y, z = _grid(np.array([T.translation for T in drawn]))
+    grids = np.meshgrid(z, y, x, indexing="ij")
     places = np.stack([grid.ravel() for grid in grids[::-1]], axis=1)
     R = np.broadcast_to(machine.home.rotation.as_matrix(), (len(places), 3, 3))
-    poses = list(motions_of(R, places))
     readings = readings_at_poses(machine, np.concatenate([R, places[..., None]], axis=2))
-    inside = _inside(machine, readings)
-    all_poses = [*drawn, *(poses[k] for k in np.flatnonzero(inside))]
-    errors = _errors(calibration, np.concatenate([q, readings[inside]]), all_poses)
+    inside = np.flatnonzero(_inside(machine, readings))
+    poses = motions_of(R[inside], places[inside])
+    errors = _errors(calibration, readings[inside], list(poses)) if len(inside) else None
     if errors is None:
         return None
     reached, change, sigma = errors
-    number = np.full(len(all_poses), -1)
-    number[reached] = np.arange(reached.sum())
-    index = np.full(len(places), -1)
-    index[inside] = number[len(drawn) :]
-    if np.count_nonzero(index >= 0) < MIN_PLACES:
-        axes, index = [np.zeros(0)] * 3, np.zeros(0, dtype=np.intp)
-    shape = tuple(len(axis) for axis in axes[::-1])
-    reached_position = np.concatenate([position, places[inside]])[reached]
-    x, y, z = axes
-    return PlatformMap(reached_position, change, sigma, x, y, z, index.reshape(shape))
+    if len(change.displacement) < MIN_PLACES:
+        return None
+    maps = np.full((2, len(places)), np.nan)
+    maps[:, inside[reached]] = change.displacement, sigma.displacement
+    return PlatformMap(x, y, z, *maps.reshape(2, *grids[0].shape))
 
 
 def _grid(position: Array) -> list[Array]:

@@ -175,10 +175,10 @@ def calibrate(
         )
     from legcal.calibration import pipeline
     from legcal.calibration.result_folder import REPORT_NAME
-    from legcal.data.overrides import overrides_of_settings
-    from legcal.pages.html import PAGE
+    from legcal.data.dataset_file import overrides_of_settings
+    from legcal.pages.document import PAGE
     from legcal.report import calibration
-    from legcal.report.page.writing import write_report
+    from legcal.report.calibration_page import write_report
 
     arguments: dict[str, Any] = {
         "criteria": criteria,
@@ -236,7 +236,7 @@ def _page_of_check(output: Path) -> Path:
     """
     from legcal.calibration.result_folder import REPORT_NAME
     from legcal.files.folder import RESULT, check_path
-    from legcal.pages.html import PAGE
+    from legcal.pages.document import PAGE
 
     check_path(output)
     if RESULT.is_in(output):
@@ -281,8 +281,7 @@ def _check(
 ) -> None:
     """Test an earlier result with new images."""
     from legcal.calibration.verification import check
-    from legcal.report.calibration import check_summary
-    from legcal.report.page.verdicts import check_verdict
+    from legcal.report.calibration import check_summary, check_verdict
 
     found = check(
         dataset,

@@ -188,7 +188,7 @@ def inspect(
     machine = load_mechanism(model, base=base, platform=platform, leg_radius=radius)
     description = machine_document(machine)
     if picture is not None:
-        MACHINE_PICTURE.write(picture, draw_machine(machine))
+        MACHINE_PICTURE.write(picture, draw_machine(machine).markup())
         typer.echo(printable(f"Wrote {picture}."), err=True)
     if write is not None:
         for path in write_model(machine, write):
@@ -238,8 +238,7 @@ def identify(
 ) -> None:
     """Report which parameters are identifiable, and how to make the others so."""
     from legcal.calibration.identify.identifiability import answer
-    from legcal.report.identify import identify_table
-    from legcal.report.page.verdicts import identify_verdict
+    from legcal.report.identify import identify_table, identify_verdict
 
     check_page(page)
     views = [text.split(",") for text in view or []]
@@ -315,10 +314,6 @@ def locate(
             "0,0,0 by default.",
         ),
     ] = None,
-    world_link: Annotated[str, typer.Option(help="With --urdf: name of the world link.")] = (
-        "world"
-    ),
-    tool_link: Annotated[str, typer.Option(help="With --urdf: name of the tool link.")] = "tool",
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -327,18 +322,12 @@ def locate(
     from legcal.calibration.location.document import (
         LOCATION_FILE,
         location_document,
+        write_located_model,
         write_location,
     )
-    from legcal.calibration.location.urdf import write_located_model
     from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
     from legcal.machine.loader import load_mechanism
     from legcal.report.machine import location_table
-
-    if urdf is None and (world_link, tool_link) != ("world", "tool"):
-        raise UsageError(
-            "The names of the links could not be used: found them without --urdf, needed the "
-            "folder of the model to write; name it or leave the names out."
-        )
 
     def quantity(text: str | None, units: Mapping[str, float], option: str) -> float | None:
         return None if text is None else parse_quantity(text, units, option)
@@ -356,7 +345,7 @@ def locate(
     )
     written = []
     if urdf is not None:
-        paths = write_located_model(machine, location, urdf, world=world_link, tool=tool_link)
+        paths = write_located_model(machine, location, urdf)
         written += [str(path) for path in paths]
     write_location(location, output)
     written.append(str(output))

@@ -6,11 +6,10 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -101,7 +100,7 @@ if TYPE_CHECKING:
 
 def check_page(page: Path | None) -> None:
     """Refuse, before any work, a place where no page can be written."""
-    from legcal.pages.html import PAGE
+    from legcal.pages.document import PAGE
 
     if page is not None:
         PAGE.check_place(page)
@@ -112,16 +111,16 @@ def write_page(
     title: str,
     report: Report,
     verdict: Verdict | None = None,
-    figures: Mapping[str, Path] = MappingProxyType({}),
+    blocks: Sequence[Any] = (),
 ) -> None:
-    """Write the printed text as a page, with figures (PNG) by their captions, if *page* is set."""
-    from legcal.report.page import writing
-    from legcal.report.page.text_page import picture, text_page
+    """Write the printed text as a page, with further blocks, if *page* is set."""
+    from legcal.pages.document import PAGE, page_html
+    from legcal.report.render import text_page
 
     if page is not None:
-        blocks = [picture(path, caption) for caption, path in figures.items()]
-        document = text_page(title, report, verdict=verdict, blocks=blocks, command=command_line())
-        writing.write_page(document, page)
+        command = command_line()
+        content = text_page(title, report, verdict=verdict, blocks=blocks, command=command)
+        PAGE.write(page, page_html(content))
 
 
 @dataclass

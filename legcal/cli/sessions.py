@@ -36,7 +36,7 @@ from legcal.vision.distortion import CameraProgram, DistortionModel
 if TYPE_CHECKING:
     from legcal.calibration.detection import Detection
     from legcal.calibration.examination import Examination
-    from legcal.planning.planned_session import Plan
+    from legcal.planning.session import Plan
 
 
 def camera(
@@ -84,7 +84,7 @@ def camera(
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
     from legcal.calibration.camera_calibration.projection import compare_cameras
-    from legcal.report.images import camera_table, comparison_table
+    from legcal.report.machine import camera_table, comparison_table
     from legcal.vision.camera_export import convert_camera
     from legcal.vision.camera_file import read_camera
 
@@ -218,7 +218,7 @@ def plan(
 
 def _previews(plan: Plan) -> dict[str, bytes]:
     """Return a small rendered photograph of each view, by its name."""
-    from legcal.simulation.previews import preview
+    from legcal.simulation.session import preview
 
     views = plan.views[:1] if plan.hand_held else plan.views
     return {
@@ -277,7 +277,7 @@ def init(
 ) -> None:
     """Make a dataset from a folder of photographs and a table of readings."""
     from legcal.data.new_dataset import SheetOptions, plan_new_dataset, write_new_dataset
-    from legcal.report.new_dataset import matching_table, written_lines
+    from legcal.report.session import matching_table, written_lines
 
     options = SheetOptions(
         cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
@@ -334,7 +334,7 @@ def import_(
     """Make a dataset from recordings of a machine that rests at each pose."""
     from legcal.progress import shown_progress
     from legcal.recordings.importing import import_recordings, plan_import
-    from legcal.report.new_dataset import import_table, written_lines
+    from legcal.report.session import import_table, written_lines
 
     with shown_progress(not quiet) as progress:
         plan = plan_import(
@@ -369,7 +369,7 @@ def doctor(
     Exit 0 if it is ready, 1 for problems, 2 if files cannot be used.
     """
     from legcal.calibration import doctor as job
-    from legcal.report.doctor import examination_table
+    from legcal.report.session import examination_table
 
     examination = job.doctor(dataset, progress=not quiet, workers=image_workers(cluster, workers))
     show(as_json, examination.document, lambda: examination_table(examination))
@@ -411,7 +411,7 @@ def detect(
     """
     from legcal.calibration import doctor as job
     from legcal.data.dataset import load_dataset
-    from legcal.report.doctor import examination_table
+    from legcal.report.session import examination_table
 
     if edit:
         from legcal.viewer.address import Address, check_address

@@ -106,10 +106,10 @@ def simulate(
     (legcal.SimulationSettings).
     """
     from legcal.machine.loader import load_mechanism
-    from legcal.report.images import simulation_table
+    from legcal.report.session import simulation_table
     from legcal.simulation.dataset import simulate as run
     from legcal.simulation.dataset import summary_document
-    from legcal.simulation.request import requested
+    from legcal.simulation.settings import requested
 
     nominal = load_mechanism(model)
     settings = requested(
@@ -162,16 +162,19 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
-    from legcal.report.study import study_table
+    from markupsafe import Markup
+
+    from legcal.pages.document import Drawing
+    from legcal.report.session import study_table
     from legcal.simulation.observe import TableNoise
     from legcal.simulation.paper import PaperStudy
     from legcal.simulation.study import StudyResult, run_study
     from legcal.workers import processors
 
     def make_page(study_result: StudyResult, folder: Path) -> None:
-        caption = "Mean errors of the parameters, as in Fig. 4 of the paper; fig4.svg enlarges it."
-        title, figures = "The paper's simulation", {caption: folder / "fig4.png"}
-        write_page(folder / REPORT, title, study_table(study_result.document()), figures=figures)
+        figure = Markup((folder / "fig4.svg").read_text(encoding="utf-8"))
+        title, text = "The paper's simulation", study_table(study_result.document())
+        write_page(folder / REPORT, title, text, blocks=[Drawing(figure)])
 
     noise, page = TableNoise.in_radians() if radians else TableNoise(), PageOfResult(make_page)
     result = run_study(

@@ -17,6 +17,7 @@ from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
     ENCODER_SIGMAS,
+    Override,
     ViewEntry,
     entry_problem,
     find_dataset_file,
@@ -38,7 +39,6 @@ from legcal.data.measurements import (
     unread_motors,
 )
 from legcal.data.outlines import Outlines, read_observations
-from legcal.data.overrides import Override
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reading_units import (
     SERVO_SIGMA,

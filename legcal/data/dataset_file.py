@@ -1,11 +1,12 @@
-"""The file dataset.yaml: its schema, and checks for contradictions."""
+"""The file dataset.yaml: its schema, and checks for contradictions; parameters given by name."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -18,11 +19,10 @@ from pydantic import (
     field_validator,
 )
 
-from legcal.data.overrides import Override, read_override
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
-from legcal.errors import Code, DatasetError, Problem
+from legcal.errors import Code, DatasetError, Problem, UsageError
 from legcal.files.motions import MotionEntry
-from legcal.files.quantity import PRIOR_SCHEMA, Quantity, read_prior
+from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
 from legcal.machine.directions import list_in_words
 from legcal.machine.files import DATASET_YAML
@@ -33,6 +33,25 @@ ENCODER_SIGMAS = (1e-12, 1.0)  # [m] plausible standard deviations of an encoder
 _Text = Annotated[str, Strict(), WithJsonSchema({"type": "string"})]
 _BOUNDS = ("minimum", "maximum")
 GAMMAS = (0.2, 5.0)  # plausible gammas of a camera
+
+
+Action = Literal["prior", "fixed", "free"]
+_WORDS: Mapping[Action, str] = {
+    "prior": "prior",
+    "fixed": "parameter to fix",
+    "free": "parameter to free",
+}
+
+
+@dataclass(frozen=True)
+class Override:
+    """An override of one parameter, or of all that a pattern matches."""
+
+    name: str  # or a pattern
+    action: Action
+    where: str  # its place, as the start of a sentence about it
+    stated: Quantity | None = None  # the prior, or the value that it is fixed at
+    in_file: bool = False  # stated in ``dataset.yaml``; overrides of a run take precedence
 
 
 class ViewEntry(FileSchema):
@@ -74,22 +93,18 @@ class ParametersEntry(FileSchema):
     def overrides(self, path: Path) -> tuple[Override, ...]:
         """Return the overrides of the block; ``path`` is the file, for messages."""
         block = f"{path}: parameters"
+        given = [("priors", self.priors), ("lengths", self.lengths)]
+        stated: list[tuple[Action, Sequence[str]]] = [("fixed", self.fixed), ("free", self.free)]
         return (
             *(
-                read_override("prior", name, f"{block}.priors.{name}", stated, in_file=True)
-                for name, stated in self.priors.items()
+                read_override("prior", name, f"{block}.{key}.{name}", value, in_file=True)
+                for key, values in given
+                for name, value in values.items()
             ),
             *(
-                read_override("prior", name, f"{block}.lengths.{name}", stated, in_file=True)
-                for name, stated in self.lengths.items()
-            ),
-            *(
-                read_override("fixed", text, f"{block}.fixed '{text}'", in_file=True)
-                for text in self.fixed
-            ),
-            *(
-                read_override("free", text, f"{block}.free '{text}'", in_file=True)
-                for text in self.free
+                read_override(action, text, f"{block}.{action} '{text}'", in_file=True)
+                for action, texts in stated
+                for text in texts
             ),
         )
 
@@ -235,3 +250,70 @@ def view_problems(
         if view.T_base_camera is not None
     ]
     return problems
+
+
+def overrides_of_call(
+    priors: Mapping[str, object] | Sequence[str] = (),
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
+) -> tuple[Override, ...]:
+    """Return the overrides in the arguments of a call or the options of a command."""
+    entries: list[tuple[Action, str, object]] = []
+    if isinstance(priors, Mapping):
+        entries += [("prior", str(name), value) for name, value in priors.items()]
+    else:
+        entries += [("prior", text, None) for text in listed(priors)]
+    entries += [("fixed", text, None) for text in listed(fixed)]
+    entries += [("free", text, None) for text in listed(free)]
+    overrides: list[Override] = []
+    problems: list[str] = []
+    for action, text, value in entries:
+        word = "length" if action == "prior" and ":" in text else _WORDS[action]
+        start = f"The {word} {describe(text)}"
+        try:
+            overrides.append(read_override(action, text, start, value))
+        except ValueError as error:
+            problems.append(f"{start} could not be used: {error}")
+    if problems:
+        raise UsageError(problems)
+    return tuple(overrides)
+
+
+def overrides_of_settings(texts: Iterable[str]) -> dict[str, list[str]]:
+    """Return the settings of the option ``--set`` as the arguments priors, fixed and free.
+
+    ``NAME`` and ``NAME=VALUE`` fix a parameter, ``NAME=VALUE±SIGMA`` is a prior, and ``NAME=free``
+    estimates the parameter without one.
+    """
+    arguments: dict[str, list[str]] = {"priors": [], "fixed": [], "free": []}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        if name and value.strip().casefold() == "free":
+            arguments["free"].append(name)
+        elif name and any(sign in value for sign in ("±", "+-", "+/-")):
+            arguments["priors"].append(text)
+        else:
+            arguments["fixed"].append(text)
+    return arguments
+
+
+def read_override(
+    action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
+) -> Override:
+    """Parse an override."""
+    name, stated = text, None
+    if value is not None:
+        stated = read_prior(value)
+    elif action != "free" and "=" in text:
+        name, _, behind = text.rpartition("=")
+        stated = read_prior(behind) if action == "prior" else read_value(behind)
+    if action == "prior" and stated is None:
+        raise ValueError(
+            f"found no value, needed one and its sigma; write them behind the name: {EXAMPLE}."
+        )
+    return Override(name, action, where, stated, in_file)
+
+
+def listed(texts: Iterable[str]) -> list[str]:
+    """Return texts as a list; a single text counts as one element."""
+    return [texts] if isinstance(texts, str) else [str(text) for text in texts]

@@ -95,55 +95,27 @@ class NewDatasetDocument(Document):
 
 @dataclass(frozen=True, eq=False)
 class NewDataset:
-    """A dataset that is not written yet.
+    """A dataset that is not written yet."""
 
-    Attributes
-    ----------
-    machine : Machine
-        The nominal model.
-    model : str
-        Its name in ``dataset.yaml``.
-    folder, table, destination : Path
-        Photographs, readings, and the dataset's folder.
-    columns : dict
-        Meaning of each heading of the table: a joint, view, image, pose or time.
-    are_lengths : bool
-        Whether the table holds whole lengths of legs.
-    rows : tuple of Row
-        The entries of each row of the table about its photograph.
-    poses : tuple of str
-        The pose of each row; empty where the table does not name them.
-    matching : Matching
-        Pairs of row and photograph.
-    views : tuple of str
-        The view of each pair.
-    readings : SheetReadings
-        Readings of the motors, in the order of their legs, and their unit in the table.
-    cameras : dict
-        The camera file of each view.
-    encoder_sigma : float or mapping
-        One standard deviation of a reading [m], by joint [m or rad] where a motor turns.
-    notes : tuple of str
-        Oddities, and choices that were made.
-    made_cameras : mapping
-        Contents of camera files to write, from the metadata of photographs.
-    """
-
-    machine: Machine
-    model: str
-    folder: Path
-    table: Path
-    destination: Path
+    machine: Machine  # the nominal model
+    model: str  # its name in ``dataset.yaml``
+    folder: Path  # of the photographs
+    table: Path  # of the readings
+    destination: Path  # the folder of the dataset
+    # Meaning of each heading of the table: a joint, view, image, pose or time
     columns: Mapping[str, str]
-    are_lengths: bool
-    rows: tuple[Row, ...]
-    poses: tuple[str, ...]
-    matching: Matching
-    views: tuple[str, ...]
+    are_lengths: bool  # whether the table holds whole lengths of legs
+    rows: tuple[Row, ...]  # the entries of each row of the table about its photograph
+    poses: tuple[str, ...]  # the pose of each row; empty where the table does not name them
+    matching: Matching  # pairs of row and photograph
+    views: tuple[str, ...]  # the view of each pair
+    # Readings of the motors, in the order of their legs, and their unit in the table
     readings: SheetReadings
-    cameras: Mapping[str, Path]
+    cameras: Mapping[str, Path]  # the camera file of each view
+    # One standard deviation of a reading [m], by joint [m or rad] where a motor turns
     encoder_sigma: float | dict[str, float]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # oddities, and choices that were made
+    # Contents of camera files to write, from the metadata of photographs
     made_cameras: Mapping[Path, str] = field(default_factory=dict)
 
     @property

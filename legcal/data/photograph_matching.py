@@ -67,22 +67,18 @@ class Matching:
     notes: tuple[str, ...] = ()
 
 
-class ViewPattern:
-    """A pattern of file names with their view: ``{view}_*`` for ``left_012.jpg``."""
+_VIEW_FIRST = {"{view}_*": "_", "{view}-*": "-"}  # patterns of names, and the mark beside the view
+_VIEW_LAST = {"*_{view}": "_", "*-{view}": "-"}
 
-    def __init__(self, pattern: str) -> None:
-        before, after = (
-            ".*?".join(map(re.escape, part.split("*"))) for part in pattern.split("{view}")
-        )
-        self._form = re.compile(f"(?P<before>{before})(?P<view>.+?)(?P<after>{after})", re.DOTALL)
 
-    def of(self, photograph: Photograph) -> Photograph | None:
-        """Return a photograph with its view, or None if its name has another form."""
-        parts = self._form.fullmatch(PurePosixPath(photograph.name).stem)
-        if parts is None:
-            return None
-        label = parts["before"] + parts["after"]
-        return replace(photograph, view=parts["view"], label=label.strip(_SEPARATORS))
+def _with_view(photograph: Photograph, pattern: str) -> Photograph:
+    """Return a photograph with the view in its name, "" if it has another form."""
+    stem = PurePosixPath(photograph.name).stem
+    if pattern in _VIEW_FIRST:
+        view, mark, label = stem.partition(_VIEW_FIRST[pattern])
+    else:
+        label, mark, view = stem.rpartition(_VIEW_LAST[pattern])
+    return replace(photograph, view=view if mark else "", label=label.strip(_SEPARATORS))
 
 
 def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
@@ -94,8 +90,7 @@ def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograp
     pattern = likely_pattern(photographs)
     if pattern is None or any(photograph.folder != "." for photograph in photographs):
         return list(photographs), None
-    form = ViewPattern(pattern)
-    with_views = [named for photograph in photographs if (named := form.of(photograph)) is not None]
+    with_views = [_with_view(photograph, pattern) for photograph in photographs]
     if all(photograph.view.isdecimal() for photograph in with_views):
         return list(photographs), None
     return with_views, pattern
@@ -107,20 +102,15 @@ def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
     Patterns with words as views are preferred to numbers, and then patterns with few views.
     """
     likely: list[tuple[bool, int, int, str]] = []
-    for pattern in ("{view}_*", "{view}-*", "*_{view}", "*-{view}"):
-        form, labels = ViewPattern(pattern), dict[str, set[str]]()
-        named = [
-            named_photograph
-            for photograph in photographs
-            if (named_photograph := form.of(photograph)) is not None
-        ]
-        for named_photograph in named:
-            labels.setdefault(named_photograph.view, set()).add(named_photograph.label)
+    for k, pattern in enumerate((*_VIEW_FIRST, *_VIEW_LAST)):
+        labels: dict[str, set[str]] = {}
+        for photograph in photographs:
+            named = _with_view(photograph, pattern)
+            labels.setdefault(named.view, set()).add(named.label)
         sizes = {len(of_view) for of_view in labels.values()}
-        if len(named) == len(photographs) and 1 < len(labels) <= MAX_VIEWS and len(sizes) == 1:
+        if "" not in labels and 1 < len(labels) <= MAX_VIEWS and len(sizes) == 1 < max(sizes):
             are_numbers = all(view.isdecimal() for view in labels)
-            if max(sizes) > 1:
-                likely.append((are_numbers, len(labels), len(likely), pattern))
+            likely.append((are_numbers, len(labels), k, pattern))
     return min(likely)[-1] if likely else None
 
 

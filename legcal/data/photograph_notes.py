@@ -18,7 +18,6 @@ from legcal.vision.image_facts import ImageFacts, Size, size_change
 GOOD_QUALITY = 95  # JPEG quality from which the loss is far below the noise of a camera
 _TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned by 90 deg",
           8: "to be turned by 270 deg"}  # fmt: skip
-_MOST = 3  # minimum ratio of photographs of a view that name their camera to those that do not
 _ROUNDING, _ROUNDING_35MM = 0.005, 0.04  # relative: of focal length and zoom; of whole millimetres
 _BREATHING = 1e-3  # minimum relative change of the focal length by another focus
 _MOST_RECORDED = 20  # maximum number of values of a fact
@@ -201,17 +200,8 @@ def _against_camera(
 def _of_view(
     measurements: Measurements, view: int, images: Sequence[tuple[str, ImageFacts]]
 ) -> Iterator[str]:
-    """Yield oddities of single photographs of a view."""
+    """Yield a note on a camera that was turned between the images of a view."""
     name = measurements.views[view].name
-    nameless = [image for image, facts in images if not facts.device]
-    devices = [facts.device for _, facts in images if facts.device]
-    if nameless and len(devices) >= _MOST * len(nameless):
-        yield (
-            f"Images {few(nameless)} of view {name} may be cropped or rescaled: found no camera "
-            f"named in them, '{devices[0]}' in {len(devices)} others, as after editing, a "
-            "screenshot or a messenger, needed the files that the camera wrote; copy them from the "
-            "camera."
-        )
     turns: dict[int, list[str]] = {}
     for image, facts in images:
         if facts.orientation in _TURNS:

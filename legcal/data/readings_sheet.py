@@ -26,6 +26,7 @@ from legcal.data.reading_units import (
     doubtful_units,
     in_travel,
     is_length,
+    joint_values,
     meanings,
     readings_of_lengths,
 )
@@ -41,6 +42,7 @@ LEAST_USED = 0.01  # minimum fraction of the travel in use: with less, the unit 
 # Units tried where none is stated, of motors that slide and that turn
 GUESSED = {False: ("m", "mm"), True: ("rad", "deg", PULSES)}
 READING_ANGLES = (*ANGLE, PULSES)
+_DECIMALS = 12  # of readings in metres and radians
 _HEADINGS = {
     "view": ("view", "camera", "cam", "cameraposition", "viewpoint", "station", "setup"),
     "image": ("image", "img", "file", "filename", "imagefile", "name", "photo", "photograph",
@@ -143,12 +145,9 @@ class ReadingsSheet:
         """
         units, unit_from = self._units(unit, lengths)
         texts = [self._table.text(joint) for joint in self._joints]
-        values = np.array(
-            [_exactly(column, unit) for column, unit in zip(texts, units, strict=True)]
-        ).T
-        q = values
-        if lengths:
-            q = np.round(readings_of_lengths(values, self.motors), 12) + 0.0
+        q = joint_values(self._table.numbers(self._joints), units)
+        q = readings_of_lengths(q, self.motors) if lengths else q
+        q = np.round(q, _DECIMALS) + 0.0  # as decimal as they were written
         inside = in_travel(q, self.motors)
         for row, j in np.argwhere(~inside).tolist():
             leg = self.motors[j]
@@ -169,10 +168,7 @@ class ReadingsSheet:
                 self._table.refuse_file(problem)
         self._table.check()
         digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
-        last = [
-            _scaled(Decimal(1).scaleb(digit), unit)
-            for digit, unit in zip(digits, units, strict=True)
-        ]
+        last = [abs(unit.size) * 10.0**digit for digit, unit in zip(digits, units, strict=True)]
         return SheetReadings(q, np.array(last), units, unit_from)
 
     def _units(self, option: str | None, lengths: bool) -> tuple[tuple[ReadingUnit, ...], str]:
@@ -474,17 +470,3 @@ def _needed(leg: Leg, *, has_pulses: bool) -> str:
         f"readings in the travel of the model ({travel}) or lengths ({min(lengths):g} to "
         f"{max(lengths):g} mm, with --lengths)"
     )
-
-
-def _exactly(texts: Sequence[str], unit: ReadingUnit) -> list[float]:
-    """Return readings [m or rad], lengths by their decimal digits."""
-    if unit.name in LENGTH:
-        return [_scaled(Decimal(text), unit) for text in texts]
-    return [float(x) for x in unit.values(np.array([float(text) for text in texts]))]
-
-
-def _scaled(number: Decimal, unit: ReadingUnit) -> float:
-    """Return a difference of readings [m or rad], positive or not."""
-    if unit.name in LENGTH:
-        return float(number * Decimal(repr(unit.size)))
-    return float(number) * abs(unit.size)

@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass, UsageError
-from legcal.exports.identifiers import comment
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject
+from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.configurations import workspace
 from legcal.machine.coordinates import (
@@ -61,32 +60,23 @@ def correction_refusal(subject: Subject) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Model:
-    """A machine for the table: poses from coordinates, readings from poses and back."""
+class _Models:
+    """Both machines, and the independent coordinates of their poses."""
 
-    machine: Machine
-    columns: IntArray  # independent coordinates, as indices into COORDINATES
+    calibrated: Machine
+    nominal: Machine
+    columns: IntArray  # indices into COORDINATES
 
-    def poses(self, coordinates: Array, near: Array) -> tuple[Array, BoolArray]:
+    def poses(self, machine: Machine, coordinates: Array) -> tuple[Array, BoolArray]:
         """Return poses (k, 3, 4) at coordinates (k, m), and which were reached."""
-        return poses_at_coordinates(self.machine, self.columns, coordinates, near)
+        home = self.calibrated.home.as_matrix()[:3]
+        return poses_at_coordinates(machine, self.columns, coordinates, home)
 
-    def readings(self, poses: Array) -> Array:
-        """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
-        machine = self.machine
-        moved = [leg.is_motor for leg in machine.legs]
-        return np.where(moved, readings_at_poses(machine, poses), 0.0)
 
-    def in_travel(self, q: Array) -> BoolArray:
-        """Return which readings are within the travel."""
-        ends = np.array([leg.travel for leg in self.machine.legs]).reshape(-1, 2)
-        motors = list(self.machine.motors)
-        inside = (q >= ends[:, 0]) & (q <= ends[:, 1])
-        return np.asarray(inside[:, motors].all(axis=1))
-
-    def forward(self, q: Array, near: Array) -> tuple[Array, BoolArray]:
-        """Return :func:`poses_at_readings`."""
-        return poses_at_readings(self.machine, q, near)
+def _readings(machine: Machine, poses: Array) -> Array:
+    """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
+    moved = [leg.is_motor for leg in machine.legs]
+    return np.where(moved, readings_at_poses(machine, poses), 0.0)
 
 
 def poses_at_readings(machine: Machine, q: Array, near: Array) -> tuple[Array, BoolArray]:
@@ -110,7 +100,7 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
     calibrated = subject.machine
     columns = independent_coordinates(calibrated)
     n_nodes = _number_of_nodes(options.nodes, len(columns))
-    models = _Model(calibrated, columns), _Model(nominal, columns)
+    models = _Models(calibrated, nominal, columns)
     ticks, nodes, corrected = _grid(models, n_nodes)
     shape = (n_nodes,) * len(columns)
     left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(columns)))
@@ -150,13 +140,12 @@ def _number_of_nodes(given: int | None, m: int) -> int:
     return n
 
 
-def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Array, Array]:
+def _grid(models: _Models, n_nodes: int) -> tuple[list[Array], Array, Array]:
     """Return ticks, nodes (k, m) and corrected nodes (k, m) of the largest grid in the travel.
 
     The grid is about the middle of the workspace and has its proportions.
     """
-    calibrated, _ = models
-    machine, columns = calibrated.machine, calibrated.columns
+    machine, columns = models.calibrated, models.columns
     centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, columns]
     there = coordinates_of(stacked(workspace(machine)[1]))[0][:, columns]
     there = centre + turned_back(there - centre, columns)
@@ -173,29 +162,26 @@ def _grid(models: tuple[_Model, _Model], n_nodes: int) -> tuple[list[Array], Arr
     raise OutOfClass(_no_grid(machine))
 
 
-def _corrected(models: tuple[_Model, _Model], commands: Array) -> tuple[Array, BoolArray]:
+def _corrected(models: _Models, commands: Array) -> tuple[Array, BoolArray]:
     """Return corrected coordinates (k, m) of commands, and which both machines reach.
 
-    If the calibrated machine does not reach all commands, they are not corrected.
+    If the calibrated machine does not reach all commands in its travel, they are not corrected.
     """
-    calibrated, nominal = models
-    home = calibrated.machine.home.as_matrix()[:3]
-    X, reached = calibrated.poses(commands, home)
-    q = calibrated.readings(X)
-    reached &= calibrated.in_travel(q)
+    calibrated, columns = models.calibrated, models.columns
+    X, reached = models.poses(calibrated, commands)
+    q, motors = _readings(calibrated, X), list(calibrated.motors)
+    ends = np.array([calibrated.legs[j].travel for j in motors]).reshape(-1, 2)
+    reached &= ((q[:, motors] >= ends[:, 0]) & (q[:, motors] <= ends[:, 1])).all(axis=1)
     if not reached.all():
         return commands, reached
-    moved, there = nominal.forward(q, X)
-    columns = calibrated.columns
-    reached_coordinates = coordinates_of(moved)[0][:, columns]
-    return commands + turned_back(reached_coordinates - commands, columns), reached & there
+    moved, there = poses_at_readings(models.nominal, q, X)
+    coordinates = coordinates_of(moved)[0][:, columns]
+    return commands + turned_back(coordinates - commands, columns), reached & there
 
 
-def _residuals(
-    models: tuple[_Model, _Model], ticks: list[Array], corrected: Array
-) -> tuple[Array, Array]:
+def _residuals(models: _Models, ticks: list[Array], corrected: Array) -> tuple[Array, Array]:
     """Return displacement [m] and rotation [rad] (k, 2) in the middle of cells, and uncorrected."""
-    calibrated, nominal = models
+    calibrated, nominal = models.calibrated, models.nominal
     m, n = len(ticks), len(ticks[0])
     cells = np.array(list(np.ndindex(*(n - 1,) * m)))
     if len(cells) > TESTED:
@@ -203,13 +189,12 @@ def _residuals(
         cells = cells[np.sort(chosen)]
     commands = np.stack([0.5 * (t[c] + t[c + 1]) for t, c in zip(ticks, cells.T, strict=True)], 1)
     corners = [corrected[tuple((cells + corner).T)] for corner in product((0, 1), repeat=m)]
-    home = calibrated.machine.home.as_matrix()[:3]
-    X, _ = calibrated.poses(commands, home)
+    X, _ = models.poses(calibrated, commands)
     residuals = []
     for asked in (np.mean(corners, axis=0), commands):
-        asked_poses, _ = nominal.poses(asked, home)
-        reached, _ = calibrated.forward(nominal.readings(asked_poses), X)
-        residuals.append(_pose_errors(calibrated.machine, reached, X))
+        asked_poses, _ = models.poses(nominal, asked)
+        reached, _ = poses_at_readings(calibrated, _readings(nominal, asked_poses), X)
+        residuals.append(_pose_errors(calibrated, reached, X))
     return residuals[0], residuals[1]
 
 

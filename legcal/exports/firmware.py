@@ -1,4 +1,4 @@
-"""The nearest Delta that a firmware can express, as the lines to paste, and the error that remains.
+"""Controllers: LinuxCNC, FlyPT, and the nearest Delta that a firmware can express.
 
 A firmware knows upright towers and two parallel rods as one (:mod:`legcal.machine.firmware`). Its
 numbers are those with which it puts the nozzle, the origin of the platform link, nearest to where
@@ -10,30 +10,40 @@ numbers that are read back from the written lines.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.exports.correction import poses_at_readings, stacked
-from legcal.exports.identifiers import comment
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
+from legcal.exports.subject import (
+    ExportedFile,
+    ExportOptions,
+    Rendered,
+    Subject,
+    comment,
+    one_file,
+    other_gains,
+)
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
-from legcal.machine.configurations import random_poses
+from legcal.machine.configurations import random_poses, workspace
 from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
 from legcal.machine.firmware_files import read_delta
-from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.hexapod_files import SIDES, STRUTS, Rig, rig_in
+from legcal.machine.leg import LegKind
+from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
 from legcal.version import __version__
 
 DIGITS = 7  # decimals of a number [mm, deg]
 ROUNDS, RANK, SETTLED = 30, 1e-7, 1e-9  # of Gauss-Newton steps [mm, deg]
-N_POSES, LEAST_POSES, SEED = 400, 50, 20160501
 STEP = 1e-4  # of differences [mm, deg]
+N_POSES, LEAST_POSES, SEED = 400, 50, 20160501
 UPRIGHT = 0.97  # least cosine of a tower to the vertical
 TURNED = 5.0  # [deg] of all towers from the nominal angles, above which the frame is turned
 _MM = 1e3
@@ -97,13 +107,7 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
         then = _mounted(subject.nominal, firmware)
         nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
         before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
-    figures = {"remaining_mm": figures_of(after)}
-    sentences = [f"{firmware.title} is off by {describe_errors(after)} over the workspace."]
-    if before is not None:
-        figures["nominal_mm"] = figures_of(before)
-        sentences.append(
-            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
-        )
+    sentences, figures = in_words(firmware.title, "over the workspace", after, before)
     moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
     ways = [f"{moved:.3g} mm and {turned:.3g} deg away"] * bool(moved > 1e-3 or turned > 1e-3)
     ways += ["turned so that its towers stand as in the firmware"] * mount.is_turned
@@ -120,12 +124,7 @@ def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
         )
     sentences.append(f"To use it, {firmware.after}.")
     text = head + "".join(f"{mark} {line}\n" for line in sentences) + f"\n{lines}"
-    picture = picture_of(firmware.title, seen.nozzle, after, before)
-    return Rendered(
-        (ExportedFile("", text.encode()), ExportedFile(".svg", picture.encode())),
-        tuple(sentences),
-        figures,
-    )
+    return with_picture(text, firmware.title, seen.nozzle, after, before, sentences, figures)
 
 
 def number_text(value: float) -> str:
@@ -372,7 +371,37 @@ def describe_errors(errors: Array) -> str:
     return f"{figures['rms']:.3g} mm rms and {figures['max']:.3g} mm at most"
 
 
-def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
+def in_words(
+    title: str, where: str, after: Array, before: Array | None
+) -> tuple[list[str], dict[str, Any]]:
+    """Return the errors that remain, and with the nominal model: in words, and as figures."""
+    sentences = [f"{title} is off by {describe_errors(after)} {where}."]
+    figures = {"remaining_mm": figures_of(after)}
+    if before is not None:
+        figures["nominal_mm"] = figures_of(before)
+        sentences.append(
+            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
+        )
+    return sentences, figures
+
+
+def with_picture(
+    text: str,
+    title: str,
+    points: Array,  # (..., 3) of the machine [mm]
+    after: Array,  # (..., 3) errors there [mm]
+    before: Array | None,
+    sentences: Sequence[str],
+    figures: dict[str, Any],
+) -> Rendered:
+    """Return a file with the picture of its errors beside it."""
+    first = None if before is None else before.reshape(-1, 3)
+    picture = _picture(title, points.reshape(-1, 3), after.reshape(-1, 3), first).encode()
+    files = ExportedFile("", text.encode()), ExportedFile(".svg", picture)
+    return Rendered(files, tuple(sentences), figures)
+
+
+def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
     """Return the errors at poses of the workspace, from above, as SVG."""
     panels = [(f"{title}: what remains", after)]
     if before is not None:
@@ -406,3 +435,221 @@ def picture_of(title: str, nozzle: Array, after: Array, before: Array | None) ->
         colour=DIM,
     )
     return str(canvas.markup()).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+
+
+# LinuxCNC
+
+
+def linuxcnc_refusal(subject: Subject) -> str | None:
+    """Return the reason for refusing a machine that no kinematics of LinuxCNC are like, or None."""
+    refusal = hexapod_refusal(subject)
+    of_deltas = firmware_refusal("linuxcnc")(subject)
+    return None if of_deltas is None else refusal and f"{refusal}, or a Delta with three motors"
+
+
+def hexapod_refusal(subject: Subject) -> str | None:
+    """Return the reason for refusing a machine unsupported by genhexkins, or None."""
+    machine, legs = subject.machine, subject.machine.legs
+    needed = "needed six legs with motors between universal and spherical joints (genhexkins)"
+    if machine.actuators:
+        motor = machine.actuators[0]
+        return f"found that the motor '{motor.joint}' moves joints at A, {needed}"
+    if len(legs) != STRUTS:
+        return f"found {len(legs)} legs, {needed}"
+    others = [
+        f"'{leg.name}' of type {leg.type}{'' if leg.is_motor else ' without motor'}"
+        for leg in legs
+        if leg.kind is not LegKind.ACTUATED or len(leg.equations) > 1
+    ]
+    return f"found the leg {others[0]}, {needed}" if others else None
+
+
+def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the HAL file; lines for the INI file are in its comments."""
+    machine = subject.machine
+    if machine.actuators:
+        return firmware_files("linuxcnc")(subject, options, path)
+    home = readings_at(machine, machine.home)
+    pose = [*(_MM * machine.home.translation), *machine.home.rotation.as_euler("xyz", degrees=True)]
+    lines = [
+        f"# genhexkins of {comment(subject.name)}, written by legcal {__version__}.",
+        "# Machine units are mm and degrees ([TRAJ] LINEAR_UNITS = mm, ANGULAR_UNITS = degree).",
+        "# X Y Z A B C is the platform link in the base link; joint N is the length of a leg:",
+        *(f"#   joint {j}: {comment(leg.name)}" for j, leg in enumerate(machine.legs)),
+        "# Load it after the module: loadrt genhexkins, or [KINS] KINEMATICS = genhexkins.",
+        "",
+    ]
+    for side, points in (("base", machine.A_base), ("platform", machine.B_platform)):
+        for j, point in enumerate(points):
+            lines += [
+                f"setp genhexkins.{side}.{j}.{axis} {float(_MM * x)!r}"
+                for axis, x in zip("xyz", point, strict=True)
+            ]
+        lines.append("")
+    lines += [
+        "setp genhexkins.spindle-offset 0.0",
+        "setp genhexkins.screw-lead 0.0",
+        "",
+        "# For the INI file. HOME_OFFSET is the length where the encoder reads zero, HOME that at",
+        "# the home pose of the model. Readings of the sign -1 shrink as the leg grows.",
+        "# [TRAJ]",
+        "# LINEAR_UNITS = mm",
+        f"# HOME = {' '.join(repr(float(x)) for x in pose)}",
+    ]
+    for j, leg in enumerate(machine.legs):
+        lines += [
+            f"# [JOINT_{j}]",
+            "# TYPE = LINEAR",
+            f"# HOME_OFFSET = {float(_MM * leg.q0)!r}",
+            f"# HOME = {float(_MM * leg.length_at(float(home[j])))!r}",
+            f"# (sign of the encoder: {leg.sign:+d})",
+        ]
+        ends = sorted(leg.length_at(q) for q in leg.travel)
+        if np.isfinite(ends).all():
+            lines += [
+                f"# {key} = {float(_MM * end)!r}"
+                for key, end in zip(("MIN_LIMIT", "MAX_LIMIT"), ends, strict=True)
+            ]
+    return one_file("\n".join(lines) + "\n")
+
+
+# FlyPT Mover: the regular hexapod nearest to a machine, as the numbers of its rig. The rig has two
+# sides each of platform and base, one length for all actuators, and the place of the centre of
+# rotation (:class:`legcal.machine.hexapod_files.Rig`). FlyPT Mover is taken to be off by the
+# distance of the joints of the platform from where the rig has them, at the same positions of the
+# actuators: least squares over the workspace, in a frame of the base that is chosen with it.
+
+_NEWTON = 8  # steps of the forward kinematics of a rig
+_N = len(SIDES) + 1 + 3  # unknowns of a rig: sides, length, centre of rotation
+
+
+def flypt_refusal(subject: Subject) -> str | None:
+    """Return the reason for refusing a machine other than a hexapod, or None."""
+    refusal = hexapod_refusal(subject)
+    return (
+        None if refusal is None else refusal.split("; ")[0].replace("genhexkins", "LinearHexapod")
+    )
+
+
+def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the numbers of the rig, and a picture of what remains."""
+    machine = subject.machine
+    readings, motions = workspace(machine)
+    poses = stacked(motions)
+    places = _Places(machine, readings, poses)
+    x = places.nearest()
+    numbers = dict(zip((*SIDES, "Middle", "COR X", "COR Y", "COR Z"), x[:_N], strict=True))
+    stroke = np.ptp([leg.travel for leg in machine.legs], axis=1).min()
+    numbers["Range"] = 0.5 * _MM * stroke
+    text = "".join(f"{key}: {number_text(float(value))}\n" for key, value in numbers.items())
+    rig, centre = rig_in(path, text)[:2]
+    written = np.array([*(getattr(rig, side) for side in SIDES), rig.Middle, *centre])
+    after = places.placed(written)
+    before = None
+    if subject.nominal is not None:
+        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
+        before = places.placed(of_nominal.nearest()[:_N])
+    sentences, figures = in_words("FlyPT Mover", "at the joints of the platform", after, before)
+    legs = ", ".join(f"'{comment(machine.leg_names[j])}'" for j in places.order)
+    sentences += [
+        f"Actuators counterclockwise from the right one of the short side in front: {legs}.",
+        "To use it, write the numbers into the rig (LinearHexapod) and start the rig from its "
+        "lowest position; actuators have no offsets there, so that what they need is set in their "
+        "controllers.",
+    ]
+    head = f"FlyPT Mover rig of {comment(subject.name)}, written by legcal {__version__}."
+    comments = "".join(f"# {line}\n" for line in [head, *sentences])
+    return with_picture(
+        f"{comments}\n{text}", "FlyPT Mover", places.joints, after, before, sentences, figures
+    )
+
+
+class _Places:
+    """Where a machine has the joints of its platform, at positions of its actuators [mm]."""
+
+    def __init__(
+        self, machine: Machine, readings: Array, poses: Array, order: list[int] | None = None
+    ) -> None:
+        B = _MM * machine.B_platform
+        centred = B - B.mean(axis=0)
+        home = machine.home.rotation.as_matrix()
+        seen = centred @ home.T
+        angle = np.degrees(np.arctan2(seen[:, 1], seen[:, 0])) % 360.0
+        by_angle = np.argsort(angle)
+        gaps = np.diff(angle[by_angle], append=angle[by_angle[0]] + 360.0)
+        first = int(np.argmin([gaps[k] + gaps[k + 2] + gaps[(k + 4) % 6] for k in (0, 1)]))
+        pairs = list(range(first, STRUTS, 2))
+        middles = np.array([(angle[by_angle[k]] + 0.5 * gaps[k]) % 360.0 for k in pairs])
+        front = pairs[int(np.argmin(np.abs((middles - 90.0 + 180.0) % 360.0 - 180.0)))]
+        self.order = [int(j) for j in np.roll(by_angle, -front)] if order is None else order
+        turn = (middles[pairs.index(front)] - 90.0 + 180.0) % 360.0 - 180.0
+        self._turn = Rotation.from_euler("z", turn, degrees=True)
+        self._of_platform = home.T @ self._turn.as_matrix()  # axes of the rig in the link
+        legs = [machine.legs[j] for j in self.order]
+        mid = np.array([np.mean(leg.travel) for leg in legs])
+        sign = np.array([float(leg.sign) for leg in legs])
+        self.moves = _MM * sign * (readings[:, self.order] - mid)  # (k, 6) beyond the middle
+        self.poses = poses.copy()
+        self.poses[:, :, 3] *= _MM
+        self._B = B[self.order]
+        A = _MM * machine.A_base[self.order]
+        self._middle = A.mean(axis=0)
+        self.joints = self._B @ np.swapaxes(poses[:, :, :3], 1, 2) + self.poses[:, None, :, 3]
+        lengths = _MM * np.array(
+            [leg.length_at(q) for leg, q in zip(legs, mid.tolist(), strict=True)]
+        )
+        (long, short), (short_base, long_base) = _sides(self._B, 0), _sides(A, 1)
+        sides = [long, short, short_base, long_base]
+        centre = -B.mean(axis=0) @ self._of_platform
+        self._start = np.array([*sides, lengths.mean(), *centre])
+
+    def errors(self, x: Array) -> Array:
+        """Return the errors (k, 6, 3) of the joints, with a rig and the frame of its base (14,)."""
+        rig = Rig(*x[: len(SIDES) + 1])
+        frame = self._turn * Rotation.from_rotvec(x[_N + 3 :] / self._start[4])
+        origin = self._middle + x[_N : _N + 3]
+        near_R = frame.as_matrix().T @ self.poses[:, :, :3] @ self._of_platform
+        near = (self.joints.mean(axis=1) - origin) @ frame.as_matrix()
+        R, t = _forward(rig, rig.Middle + self.moves, near_R, near)
+        joints = rig.platform @ np.swapaxes(R, 1, 2) + t[:, None]
+        return np.asarray(joints @ frame.as_matrix().T + origin - self.joints)
+
+    def nearest(self) -> Array:
+        """Return the rig (8,) and its frame (6,) of least errors."""
+        start = np.concatenate([self._start, np.zeros(6)])
+        free = [*range(len(SIDES) + 1), *range(_N, _N + 6)]
+
+        def errors(step: Array) -> Array:
+            x = start.copy()
+            x[free] += step
+            return self.errors(x).ravel()
+
+        start[free] += least_squares(errors, len(free))
+        return start
+
+    def placed(self, rig: Array) -> Array:
+        """Return the errors (k, 6, 3) of a rig (8,) in its best frame."""
+        frame = least_squares(lambda y: self.errors(np.concatenate([rig, y])).ravel(), 6)
+        return self.errors(np.concatenate([rig, frame]))
+
+
+def _sides(joints: Array, first: int) -> tuple[float, float]:
+    """Return the mean sides of a hexagon: of pairs from the first or second joint, and others."""
+    sides = np.linalg.norm(np.roll(joints, -1, axis=0) - joints, axis=1)
+    others, pairs = float(sides[1 - first :: 2].mean()), float(sides[first::2].mean())
+    return (others, pairs) if first == 0 else (pairs, others)
+
+
+def _forward(rig: Rig, lengths: Array, R: Array, t: Array) -> tuple[Array, Array]:
+    """Return the poses of a rig at lengths (k, 6), near others, by Newton's method."""
+    for _ in range(_NEWTON):
+        arms = rig.platform @ np.swapaxes(R, 1, 2)
+        legs = arms + t[:, None] - rig.base
+        now = np.linalg.norm(legs, axis=2)
+        u = legs / now[..., None]
+        slope = np.concatenate([u, cross(arms, u)], axis=2)
+        step = np.linalg.solve(slope, (lengths - now)[..., None])[..., 0]
+        t = t + step[:, :3]
+        R = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ R
+    return R, t

@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.correction import correction_files, correction_refusal
-from legcal.exports.firmware import firmware_files, firmware_refusal
-from legcal.exports.flypt import flypt_files, flypt_refusal
+from legcal.exports.firmware import (
+    firmware_files,
+    firmware_refusal,
+    flypt_files,
+    flypt_refusal,
+    linuxcnc_files,
+    linuxcnc_refusal,
+)
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
-from legcal.exports.linuxcnc import linuxcnc_files, linuxcnc_refusal
-from legcal.exports.mjcf import mjcf_files, mjcf_refusal
 from legcal.exports.parameter_files import csv_files, json_files, table_files
-from legcal.exports.robot_files import ros_files, urdf_files
+from legcal.exports.robot_files import mjcf_files, mjcf_refusal, ros_files, urdf_files
 from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
 from legcal.files.folder import OutputFile, OutputKind, result_folder
 from legcal.files.schema import Document, Number, SparseDocument

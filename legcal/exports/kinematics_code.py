@@ -16,15 +16,18 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import UsageError
-from legcal.exports.identifiers import (
+from legcal.exports.subject import (
+    ExportOptions,
+    Rendered,
+    Subject,
     c_string,
     comment,
     identifier,
     identifiers,
     is_identifier,
     matlab_string,
+    one_file,
 )
-from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator

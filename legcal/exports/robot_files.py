@@ -12,11 +12,21 @@ from pathlib import Path
 import numpy as np
 import yaml
 from lxml import etree
+from scipy.spatial.transform import RigidTransform
 
-from legcal.exports.identifiers import identifier
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, other_gains
+from legcal.exports.subject import (
+    ExportedFile,
+    ExportOptions,
+    Rendered,
+    Subject,
+    comment,
+    identifier,
+    other_gains,
+)
 from legcal.files.motions import motion_to_xyz_quat
+from legcal.geometry.types import Array
 from legcal.machine.model import Machine
+from legcal.machine.urdf import UrdfJoint, origins_of, parse_robot
 from legcal.version import __version__
 
 STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about each axis of the link
@@ -147,3 +157,195 @@ def _calibration(subject: Subject) -> dict[str, object]:
             "covariance": np.array(result.kinematic.covariance).tolist(),
         }
     return calibration
+
+
+# MJCF
+
+
+WORLD = "world"
+_X, _Y, _Z = np.eye(3)
+STIFF = "0.001 1"  # solref of closures: one millisecond, critically damped
+GAIN = 1e4  # gain of the position servos [N/m]
+LEAST = 1e-15  # least mass, moment of inertia or size that MuJoCo accepts
+
+
+def mjcf_refusal(subject: Subject) -> str | None:
+    """Return the reason for refusing a tree that MuJoCo cannot represent, or None."""
+    if gains := other_gains(subject.machine):
+        return (
+            f"found gains other than 1 ({gains}), needed joints that move by their "
+            "readings, as those of MuJoCo do"
+        )
+    urdf = subject.machine.urdf
+    above = {joint.child: joint for joint in urdf.joints.values()}
+    for joint in urdf.joints.values():
+        link = joint.parent
+        while joint.type == "floating" and link in above:
+            if above[link].moves:
+                return (
+                    f"found the floating joint '{joint.name}' below '{above[link].name}', which "
+                    "moves, needed it to hang from the world alone (MuJoCo)"
+                )
+            link = above[link].parent
+    return None
+
+
+def mjcf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the MJCF file."""
+    machine = subject.machine
+    root = _Writer(machine).model(subject.name)
+    etree.indent(root)
+    title = f" {comment(subject.name)}, written by legcal {__version__} "
+    content = f"<!--{title.replace('--', '__')}-->\n".encode()
+    return Rendered((ExportedFile("", content + etree.tostring(root, encoding="utf-8") + b"\n"),))
+
+
+class _Writer:
+    """The writer of the bodies of one machine."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        urdf = machine.urdf
+        robot = parse_robot(urdf.path, urdf.content)
+        self._links = {str(e.get("name")): e for e in robot.iterfind("link")}
+        self._below: dict[str, list[UrdfJoint]] = {}
+        for joint in urdf.joints.values():
+            self._below.setdefault(joint.parent, []).append(joint)
+        self._world = etree.Element("worldbody")
+        self._name = {link: link for link in urdf.links}  # names of bodies; the root is the world
+        if WORLD in self._name and urdf.root != WORLD:
+            self._name[WORLD] = _unused(WORLD, set(urdf.links))
+        self._joints = set(urdf.joints)
+        self._motors = {machine.legs[j].prismatic for j in machine.motors}
+        self._body: dict[str, etree._Element] = {urdf.root: self._world}
+
+    def model(self, name: str) -> etree._Element:
+        """Return the ``<mujoco>`` element."""
+        machine = self._machine
+        mujoco = etree.Element("mujoco", model=name)
+        etree.SubElement(
+            mujoco, "compiler", angle="radian", autolimits="true", balanceinertia="true"
+        )
+        etree.SubElement(mujoco, "option", gravity="0 0 0")
+        mujoco.append(self._world)
+        self._shapes(machine.urdf.root, self._world)
+        pending = [machine.urdf.root]
+        while pending:
+            link = pending.pop(0)
+            for joint in self._below.get(link, []):
+                self._add(joint)
+                pending.append(joint.child)
+        equality = etree.SubElement(mujoco, "equality")
+        for i, closure in enumerate(machine.chain.closures, start=1):
+            sites = {}
+            for number, frame in enumerate((closure.frame_1, closure.frame_2), start=1):
+                link = frame if frame in self._body else machine.urdf.joints[frame].child
+                sites[f"site{number}"] = f"loop_{i}_{number}"
+                etree.SubElement(self._body[link], "site", name=f"loop_{i}_{number}")
+            tag = "connect" if closure.kind == "3d" else "weld"
+            etree.SubElement(equality, tag, {"name": f"loop_{i}", "solref": STIFF, **sites})
+        motors = etree.SubElement(mujoco, "actuator")
+        for j in machine.motors:
+            motor = str(machine.legs[j].prismatic)
+            etree.SubElement(motors, "position", name=motor, joint=motor, kp=_text(GAIN))
+        return mujoco
+
+    def _add(self, joint: UrdfJoint) -> None:
+        """Add the child body of a joint."""
+        machine, link = self._machine, joint.child
+        chain, home = machine.chain, machine.home_configuration
+        is_free = joint.type == "floating"
+        parent = machine.urdf.root if is_free else joint.parent
+        T = chain.pose(home, parent, link)
+        body = etree.SubElement(self._body[parent], "body", {"name": self._name[link], **_pose(T)})
+        self._body[link] = body
+        if is_free:
+            etree.SubElement(body, "freejoint", name=joint.name)
+        elif joint.type == "planar":
+            # As in Pinocchio: x and y of the joint frame, then rotation about z.
+            x, y, cosine, sine = home[chain.q_index(joint.name) :][:4]
+            turned = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+            for name, kind, axis, value in (
+                (f"{joint.name}_x", "slide", turned @ _X, x),
+                (f"{joint.name}_y", "slide", turned @ _Y, y),
+                (f"{joint.name}_turn", "hinge", _Z, np.arctan2(sine, cosine)),
+            ):
+                _joint(body, _unused(name, self._joints), kind, axis, value)
+        elif joint.moves:
+            value = home[chain.q_index(joint.name)]
+            if joint.type == "continuous":
+                value = np.arctan2(home[chain.q_index(joint.name) + 1], value)
+            is_slide = joint.type == "prismatic"
+            element = _joint(body, joint.name, "slide" if is_slide else "hinge", joint.axis, value)
+            if joint.limits is not None and (is_slide or joint.name in self._motors):
+                element.set("range", _text(*joint.limits))
+        if joint.moves:
+            self._inertia(link, body)
+        self._shapes(link, body)
+
+    def _inertia(self, link: str, body: etree._Element) -> None:
+        """Add the inertia of a link, or a stub."""
+        inertial = self._links[link].find("inertial")
+        mass = None if inertial is None else inertial.find("mass")
+        moments = None if inertial is None else inertial.find("inertia")
+        full = np.zeros((3, 3))
+        if mass is not None and moments is not None:
+            numbers = (
+                float(moments.get(key, 0.0)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+            )
+            ixx, iyy, izz, ixy, ixz, iyz = numbers
+            full = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+        heavy = 0.0 if mass is None else float(mass.get("value", 0.0))
+        if inertial is None or min(heavy, np.linalg.eigvalsh(full)[0]) <= LEAST:
+            stub = _text(*[STUB_INERTIA] * 3)
+            etree.SubElement(body, "inertial", pos="0 0 0", mass=_text(STUB_MASS), diaginertia=stub)
+            return
+        T = RigidTransform.from_matrix(origins_of([inertial])[0])
+        R = T.rotation.as_matrix()
+        full = R @ full @ R.T
+        etree.SubElement(
+            body,
+            "inertial",
+            pos=_text(*T.translation),
+            mass=_text(heavy),
+            fullinertia=_text(*np.diagonal(full), full[0, 1], full[0, 2], full[1, 2]),
+        )
+
+    def _shapes(self, link: str, body: etree._Element) -> None:
+        """Add the visual cylinders of a link."""
+        for visual in self._links[link].iterfind("visual"):
+            cylinder = visual.find("geometry/cylinder")
+            if cylinder is not None:
+                T = RigidTransform.from_matrix(origins_of([visual])[0])
+                size = float(cylinder.get("radius", 0)), 0.5 * float(cylinder.get("length", 0))
+                if min(size) <= LEAST:
+                    continue
+                shape = {"type": "cylinder", "size": _text(*size), "mass": "0"}
+                apart = {"contype": "0", "conaffinity": "0"}
+                etree.SubElement(body, "geom", {**shape, **apart, **_pose(T)})
+
+
+def _joint(body: etree._Element, name: str, kind: str, axis: Array, value: float) -> etree._Element:
+    """Add a joint at the origin of a body, with its value at home."""
+    return etree.SubElement(
+        body, "joint", name=name, type=kind, axis=_text(*axis), ref=_text(value), damping="1"
+    )
+
+
+def _pose(T: RigidTransform) -> dict[str, str]:
+    """Return a pose as XML attributes."""
+    x, y, z, w = T.rotation.as_quat()
+    return {"pos": _text(*T.translation), "quat": _text(w, x, y, z)}
+
+
+def _text(*numbers: float) -> str:
+    """Return numbers that are read back exactly."""
+    return " ".join(repr(float(x)) for x in numbers)
+
+
+def _unused(name: str, taken: set[str]) -> str:
+    """Return an unused name."""
+    unused = name
+    while unused in taken:
+        unused += "_"
+    return unused

@@ -1,21 +1,36 @@
-"""The content of a page: sections of blocks with plain texts, without HTML.
+"""A page: sections of blocks with plain texts, and the one HTML file that they become.
 
-The template has one macro for each class of blocks and escapes every text.
+The template has one macro for each class of blocks and escapes every text; the file has the style
+sheet, and the scripts that its blocks need.
 """
 
 from __future__ import annotations
 
 import base64
 import gzip
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, ClassVar, Literal
+from datetime import UTC, datetime
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from markupsafe import Markup
 
+from legcal.errors import printable
+from legcal.files.folder import OutputFile
+from legcal.version import __version__
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 MAX_ROWS = 2000  # maximum number of rows shown of a table
 Light = Literal["good", "doubtful", "bad"]
+MARK = "legcal-page"  # the name that identifies a page of legcal
+PAGE = OutputFile(
+    "the page", "page", "", "a new file or an earlier page of legcal", mark=MARK.encode()
+)
 
 
 @dataclass(frozen=True)
@@ -253,3 +268,68 @@ def number(value: float | None, digits: int, *, signed: bool = False) -> Number:
     if value is None:
         return Number(None, "")
     return Number(float(value), f"{value:{'+' if signed else ''}z.{digits}f}")
+
+
+_SCRIPTS = {Scene: "scene.js", OutlineEditor: "editor.js", LandmarkEditor: "landmarks.js"}
+
+
+def time_of_page() -> str:
+    """Return the time on a page: now, or ``SOURCE_DATE_EPOCH`` if it is set.
+
+    The variable makes pages reproducible for comparison.
+    """
+    stated = os.environ.get("SOURCE_DATE_EPOCH", "")
+    now = datetime.fromtimestamp(int(stated), UTC) if stated.isdecimal() else datetime.now()
+    return now.astimezone().strftime("%Y-%m-%d %H:%M %Z")
+
+
+def page_html(page: Page) -> str:
+    """Return a page as HTML."""
+    blocks = [block for section in page.sections for block in section.blocks]
+    blocks += [inner for block in blocks if isinstance(block, Row) for inner in block.blocks]
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            page=page,
+            mark=MARK,
+            version=__version__,
+            style=_asset("page.css"),
+            scripts=[
+                _asset("page.js"),
+                *(
+                    _asset(name)
+                    for kind, name in _SCRIPTS.items()
+                    if any(isinstance(block, kind) for block in blocks)
+                ),
+            ],
+            served=any(isinstance(block, LandmarkEditor) and block.token for block in blocks),
+            pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
+        )
+    )
+
+
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # most commands need none
+
+    return Environment(
+        loader=PackageLoader("legcal.pages", "assets"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_shown,
+    )
+
+
+def _shown(value: Any) -> Any:
+    """Return a value for the page: texts without control characters."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return printable(value)
+    return value
+
+
+@cache
+def _asset(name: str) -> Markup:
+    return Markup((files("legcal.pages") / "assets" / name).read_text("utf-8"))

@@ -1,19 +1,21 @@
-"""Drawings without scripts: bars with error bars, histograms, grids of numbers."""
+"""Drawings without scripts: bars, points and lines over axes, grids of numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from os import fspath
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
 
-from legcal.errors import printable
+from legcal.errors import OutOfResources, UsageError, printable
 from legcal.geometry.types import Array, IntArray
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
-_MAX_BARS = 14  # maximum number of bars of a histogram
+PALE = "#d6dae0"
 _FONT = 'font-family="system-ui, sans-serif"'
 _COLOURS = ("#1f5fa8", "#b26a00", "#1e7d46", "#8e44ad", "#b3261e", "#4a5568", "#00838f", "#6d4c41")
 _MARKS = (  # paths about a point, as different as their colours
@@ -26,6 +28,40 @@ _MARKS = (  # paths about a point, as different as their colours
     "m-2 0h4m-3-1.7l2 3.4m0-3.4l-2 3.4",
     "m0 2l2-3.4h-4z",
 )
+
+
+class Figure(Markup):
+    """A drawing (SVG), which a notebook shows and :meth:`savefig` writes."""
+
+    def _repr_svg_(self) -> str:
+        return str(self)
+
+    def __repr__(self) -> str:
+        return f"Figure of {len(self)} characters: savefig() writes it"
+
+    def savefig(self, path: str | Path) -> None:
+        """Write the drawing to a file ``.svg``, which browsers show and text programs take.
+
+        Raises
+        ------
+        UsageError
+            If the name ends otherwise.
+        OutOfResources
+            If the file cannot be written.
+        """
+        file = Path(fspath(path))
+        if file.suffix.lower() != ".svg":
+            raise UsageError(
+                f"{file}: the drawing could not be written: found the suffix '{file.suffix}', "
+                "needed .svg; change the name."
+            )
+        try:
+            file.write_text(str(self), encoding="utf-8")
+        except OSError as error:
+            raise OutOfResources(
+                f"{file}: the drawing could not be written: found '{error.strerror}', needed a "
+                "folder that can be written to; give another path."
+            ) from error
 
 
 @dataclass
@@ -58,6 +94,15 @@ class Canvas:
             f'stroke="{colour}" stroke-width="{width:.3g}"{shown}/>'
         )
 
+    def path(self, points: Array, colour: str, width: float = 1.5, dashes: str = "") -> None:
+        """Draw a line through points (n, 2)."""
+        shown = " ".join(f"{x:.1f},{y:.1f}" for x, y in points.tolist())
+        dashed = f' stroke-dasharray="{dashes}"' * bool(dashes)
+        self.parts.append(
+            f'<polyline points="{shown}" fill="none" stroke="{colour}" '
+            f'stroke-width="{width:.3g}"{dashed}/>'
+        )
+
     def box(
         self, x: float, y: float, width: float, height: float, colour: str, tip: str = ""
     ) -> None:
@@ -88,14 +133,32 @@ class Canvas:
             f'fill="{colour}">{escape(printable(text))}</text>'
         )
 
-    def markup(self) -> Markup:
+    def put(self, other: Canvas, x: float, y: float) -> None:
+        """Draw another canvas on this one."""
+        inside = "".join(other.parts)
+        self.parts.append(f'<g transform="translate({x:.1f} {y:.1f})">{inside}</g>')
+
+    def markup(self) -> Figure:
         """Return the drawing."""
         label = escape(printable(self.title))
-        return Markup(
+        return Figure(
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
             f'width="{self.width:g}" height="{self.height:g}" role="img" aria-label="{label}" '
             f"{_FONT}>" + "".join(self.parts) + "</svg>"
         )
+
+
+def stacked(title: str, canvases: Sequence[Canvas], columns: int = 1) -> Canvas:
+    """Return drawings in rows from the left, under a title."""
+    width = max((canvas.width for canvas in canvases), default=300.0) + 20.0
+    whole = Canvas(columns * width, 30.0, title)
+    whole.text(8.0, 18.0, title, size=14)
+    for start in range(0, len(canvases), columns):
+        row = canvases[start : start + columns]
+        for k, canvas in enumerate(row):
+            whole.put(canvas, k * width, whole.height)
+        whole.height += max(canvas.height for canvas in row) + 14.0
+    return whole
 
 
 def shortened(text: str, most: int) -> str:
@@ -116,114 +179,68 @@ def ticks(low: float, high: float, n: int = 5) -> list[float]:
     return [float(k * step) + 0.0 for k in np.arange(first, last + 1)]
 
 
-def change_bars(
-    names: Sequence[str],
-    values: Sequence[float],
-    sigmas: Sequence[float | None],
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Return powers of ten from *low* to *high*; if few, their double and fivefold too."""
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+    for steps in ((1.0, 2.0, 5.0), (1.0,)):
+        marks = [float(f"{s * power:.1g}") for power in powers for s in steps]
+        inside = [mark for mark in marks if low <= mark <= high]
+        if len(inside) < 9:
+            break
+    return inside if len(inside) > 1 else ticks(low, high)
+
+
+class Bars(NamedTuple):
+    """Values of a bar chart, which are positive; None and zero have no bar."""
+
+    label: str
+    values: Sequence[float | None]
+
+
+def log_bars(
+    title: str,
     unit: str,
-) -> Markup:
-    """Return bars of changes to the right and left, with error bars of two standard deviations."""
-    left, width, step, top = 190.0, 900.0, 17.0, 30.0
-    reach = [abs(v) + 2.0 * (s or 0.0) for v, s in zip(values, sigmas, strict=True)]
-    most = max([*reach, 1e-12]) * 1.04
-    height = top + step * len(names) + 30.0
-    canvas = Canvas(width, height, f"Changes of parameters [{unit}]")
-    scale = 0.5 * (width - left - 20.0) / most
-    zero = left + scale * most
-
-    for tick in ticks(-most, most, 8):
-        x = zero + scale * tick
-        canvas.line(x, top, x, height - 26.0, GREY if tick == 0 else RULE)
-        canvas.text(x, height - 10.0, f"{tick:g}", anchor="middle", size=11, colour=DIM)
-    canvas.text(left, 16.0, f"change against the nominal model [{unit}]", size=12, colour=DIM)
-    for k, (name, value, sigma) in enumerate(zip(names, values, sigmas, strict=True)):
-        y = top + step * (k + 0.5)
-        canvas.text(left - 12.0, y + 4.0, shortened(name, 28), anchor="end", size=11.5)
-        spread = "" if sigma is None else f" +- {sigma:.3g} {unit} (1 sigma)"
-        tip = f"{name}: {value:+.4g} {unit}{spread}"
-        canvas.box(zero + scale * min(value, 0.0), y - 4.5, scale * abs(value), 9.0, "#9dbbe0", tip)
-        if sigma is not None:
-            a, b = (zero + scale * (value + f * sigma) for f in (-2.0, 2.0))
-            canvas.line(a, y, b, y, INK, 1.3)
-            for x in (a, b):
-                canvas.line(x, y - 3.0, x, y + 3.0, INK, 1.3)
-    return canvas.markup()
-
-
-def error_bars(
     names: Sequence[str],
-    before: Sequence[float],
-    after: Sequence[float],
-    sigmas: Sequence[float | None],
-    unit: str,
-) -> Markup:
-    """Draw errors before and after on a logarithmic scale, with the predicted errors after.
+    before: Bars,
+    after: Bars,
+    marks: Bars | None = None,
+) -> Canvas:
+    """Draw values before and after on a logarithmic scale, and marks over those after.
 
-    They are positive; errors below a hundred-thousandth of the largest reach the left border.
+    Values below a hundred-thousandth of the largest reach the left border.
     """
-    left, width, step, top = 190.0, 900.0, 21.0, 48.0
-    shown = [x for x in (*before, *after, *(s or 0.0 for s in sigmas)) if x > 0.0] or [1.0]
+    left, width, step = 134.0, 400.0, 21.0
+    series = [before, after, *([marks] if marks else [])]
+    shown = [x for bars in series for x in bars.values if x] or [1.0]
     high = np.ceil(np.log10(max(shown)))
     low = max(np.floor(np.log10(min(shown))), high - 5.0) - 0.3
-    height = top + step * len(names) + 30.0
-    canvas = Canvas(width, height, f"Errors of parameters [{unit}]")
+    top = 32.0 + 16.0 * len(series)
+    canvas = Canvas(width, top + step * len(names) + 26.0, f"{title} [{unit}]")
 
-    def place(value: float) -> float:
-        share = (np.log10(max(value, 1e-300)) - low) / (high - low)
+    def place(value: float | None) -> float:
+        share = (np.log10(max(value or 0.0, 1e-300)) - low) / (high - low)
         return left + (width - left - 20.0) * float(np.clip(share, 0.0, 1.0))
 
-    canvas.box(left, 7.0, 22.0, 7.0, "#d6dae0")
-    canvas.text(left + 28.0, 15.0, "nominal model", size=12, colour=DIM)
-    canvas.box(left + 140.0, 7.0, 22.0, 7.0, BLUE)
-    canvas.text(left + 168.0, 15.0, "calibrated", size=12, colour=DIM)
-    canvas.line(left + 262.0, 5.0, left + 262.0, 16.0, INK, 2.0)
-    canvas.text(left + 270.0, 15.0, "its standard deviation as predicted", size=12, colour=DIM)
-    canvas.text(left, 34.0, f"distance from the truth [{unit}]", size=12, colour=DIM)
+    canvas.text(8.0, 16.0, canvas.title)
+    for k, (bars, colour) in enumerate(zip(series, (PALE, BLUE, INK), strict=False)):
+        y = 23.0 + 16.0 * k
+        canvas.box(left + 10.0 * (k > 1), y, 2.0 if k > 1 else 22.0, 9.0, colour)
+        canvas.text(left + 28.0, y + 9.0, bars.label, colour=DIM)
     for decade in np.arange(np.ceil(low), high + 1.0).tolist():
         x = place(10.0**decade)
-        canvas.line(x, top, x, height - 26.0)
-        canvas.text(x, height - 10.0, f"{10.0**decade:g}", anchor="middle", size=11, colour=DIM)
+        canvas.line(x, top, x, canvas.height - 22.0)
+        label = f"{10.0**decade:g}"
+        canvas.text(x, canvas.height - 6.0, label, anchor="middle", colour=DIM)
     for k, name in enumerate(names):
-        y, sigma = top + step * (k + 0.5), sigmas[k]
-        canvas.text(left - 12.0, y + 4.0, shortened(name, 28), anchor="end", size=11.5)
-        tips = (f"{name}, nominal: {before[k]:.3g} {unit}", f"calibrated: {after[k]:.3g} {unit}")
-        canvas.box(left, y - 7.5, place(before[k]) - left, 7.0, "#d6dae0", tips[0])
-        canvas.box(left, y + 0.5, place(after[k]) - left, 7.0, BLUE, f"{name}, {tips[1]}")
-        if sigma is not None and sigma > 0.0:
-            canvas.line(place(sigma), y - 1.5, place(sigma), y + 9.5, INK, 2.0)
-    return canvas.markup()
-
-
-def histogram(values: Array, label: str) -> Markup:
-    """Draw a histogram of values that are not negative, from zero on."""
-    left, width, height, top, bottom = 34.0, 440.0, 210.0, 14.0, 40.0
-    canvas = Canvas(width, height, label)
-    low, high = 0.0, 1.05 * float(values.max()) or 1.0
-    n = min(_MAX_BARS, max(4, len(values) // 2))
-    counts, edges = np.histogram(values, bins=n, range=(low, high))
-    most = max(int(counts.max()), 1)
-    sx, sy = (width - left - 12.0) / (high - low), (height - top - bottom) / most
-    base = height - bottom
-    for tick in ticks(0.0, most, 4):
-        if tick == int(tick):
-            y = base - sy * tick
-            canvas.line(left, y, width - 12.0, y)
-            canvas.text(left - 6.0, y + 4.0, f"{tick:g}", anchor="end", size=11, colour=DIM)
-    for count, a, b in zip(counts.tolist(), edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        tip = f"{count} from {a:.3g} to {b:.3g}"
-        canvas.box(
-            left + sx * (a - low) + 1.0,
-            base - sy * count,
-            sx * (b - a) - 2.0,
-            sy * count,
-            BLUE,
-            tip,
-        )
-    for tick in ticks(low, high, 5):
-        x = left + sx * (tick - low)
-        canvas.text(x, base + 15.0, f"{tick:g}", anchor="middle", size=11, colour=DIM)
-    canvas.text(left, height - 6.0, label, size=12, colour=DIM)
-    return canvas.markup()
+        y = top + step * (k + 0.5)
+        canvas.text(left - 8.0, y + 4.0, shortened(name, 22), anchor="end", size=11.5)
+        for bars, colour, dy in ((before, PALE, -7.5), (after, BLUE, 0.5)):
+            if value := bars.values[k]:
+                tip = f"{name}, {bars.label}: {value:.3g} {unit}"
+                canvas.box(left, y + dy, place(value) - left, 7.0, colour, tip)
+        if marks and (value := marks.values[k]):
+            canvas.line(place(value), y - 1.5, place(value), y + 9.5, INK, 2.0)
+    return canvas
 
 
 def shade(share: float) -> str:
@@ -235,10 +252,10 @@ def shade(share: float) -> str:
 
 def number_grid(
     x: Sequence[float], y: Sequence[float], values: Array, title: str, most: float, digits: int
-) -> Markup:
+) -> Canvas:
     """Draw a map of numbers over x (columns) and y (rows, upwards); NaN leaves a field empty.
 
-    Each field has its number, darker for larger ones: it can be read without colours.
+    Each field has its number, darker for larger ones up to *most*: it can be read without colours.
     """
     left, top, size = 44.0, 24.0, 37.0
     width, height = left + size * len(x) + 8.0, top + size * len(y) + 34.0
@@ -246,14 +263,8 @@ def number_grid(
     canvas.text(left, 15.0, title, size=12.5)
     for row, coordinate in enumerate(y):
         v = top + size * (len(y) - 1 - row)
-        canvas.text(
-            left - 6.0,
-            v + 0.5 * size + 4.0,
-            f"{coordinate:z.0f}",
-            anchor="end",
-            size=10.5,
-            colour=DIM,
-        )
+        middle = v + 0.5 * size + 4.0
+        canvas.text(left - 6.0, middle, f"{coordinate:z.0f}", anchor="end", size=10.5, colour=DIM)
         for column in range(len(x)):
             u, value = left + size * column, float(values[row, column])
             if not np.isfinite(value):
@@ -261,10 +272,9 @@ def number_grid(
                 continue
             share = value / most if most else 0.0
             canvas.box(u, v, size - 1.0, size - 1.0, shade(0.9 * share))
-            colour = "#ffffff" if share > 0.62 else INK
             canvas.text(
-                u + 0.5 * size - 0.5, v + 0.5 * size + 4.0, f"{value:.{digits}f}",
-                anchor="middle", size=11 if digits < 4 else 9, colour=colour,
+                u + 0.5 * size - 0.5, middle, f"{value:.{digits}f}", anchor="middle",
+                size=11 if digits < 4 else 9, colour="#ffffff" if share > 0.62 else INK,
             )  # fmt: skip
     base = top + size * len(y)
     for column, coordinate in enumerate(x):
@@ -273,44 +283,7 @@ def number_grid(
             size=10.5, colour=DIM,
         )  # fmt: skip
     canvas.text(left, base + 28.0, "x to the right, y up [mm]", size=11, colour=DIM)
-    return canvas.markup()
-
-
-def matrix(names: Sequence[str], values: Array, title: str) -> Markup:
-    """Draw a symmetric matrix of numbers from -1 to 1 as squares of proportional area.
-
-    Squares of positive numbers are filled, of negative numbers outlined.
-    """
-    n = len(names)
-    size = float(np.clip(700.0 / max(n, 1), 5.0, 22.0))
-    left = top = 130.0 if size > 8.0 else 20.0
-    canvas = Canvas(left + size * n + 10.0, top + size * n + 10.0, title)
-    if size > 8.0:
-        for k, name in enumerate(names):
-            middle = left + size * (k + 0.5)
-            shown = shortened(name, 20)
-            canvas.text(left - 6.0, middle + 3.5, shown, anchor="end", size=min(11.0, 0.8 * size))
-            canvas.text(middle + 3.5, top - 6.0, shown, size=min(11.0, 0.8 * size), upwards=True)
-    canvas.parts.append(
-        f'<rect x="{left}" y="{top}" width="{size * n:.1f}" height="{size * n:.1f}" fill="none" '
-        f'stroke="{RULE}"/>'
-    )
-    for i in range(n):
-        for j in range(n):
-            value = float(values[i, j])
-            side = (size - 1.5) * np.sqrt(min(abs(value), 1.0))
-            if i == j or side < 0.12 * size:
-                continue
-            x, y = left + size * (j + 0.5) - 0.5 * side, top + size * (i + 0.5) - 0.5 * side
-            tip = escape(printable(f"{names[i]}, {names[j]}: {value:+.2f}"))
-            look = (
-                f'fill="{BLUE}"' if value > 0 else 'fill="none" stroke="#b3261e" stroke-width="1.2"'
-            )
-            canvas.parts.append(
-                f'<rect x="{x:.1f}" y="{y:.1f}" width="{side:.1f}" height="{side:.1f}" {look}>'
-                f"<title>{tip}</title></rect>"
-            )
-    return canvas.markup()
+    return canvas
 
 
 class Points(NamedTuple):
@@ -318,8 +291,10 @@ class Points(NamedTuple):
 
     x: Array  # (n,)
     y: Array  # (n,)
-    numbers: IntArray  # (n,) what they stand for
+    numbers: IntArray | None = None  # (n,) what they stand for
     group: int = 0
+    label: str = ""  # in the legend
+    line: str | None = None  # dashes of a line through the points, "" for none
 
 
 def scatter(
@@ -330,39 +305,41 @@ def scatter(
     *,
     words: Sequence[str] = (),
     diagonal: bool = False,
-) -> Markup:
-    """Draw points, whose numbers are for the script of the page.
+    log: Literal["", "y", "xy"] = "",
+) -> Canvas:
+    """Draw points, whose numbers are for the script of the page, or lines through them.
 
-    *words* name the x of 0, 1, 2, ...; a *diagonal* is the line of equal x and y.
+    *words* name the x of 0, 1, 2, ...; a *diagonal* is the line of equal x and y; the axes of *log*
+    are logarithmic.
     """
-    top, width, height = 8.0, 340.0, 290.0
-    x, y = (np.concatenate([points[k] for points in groups]) for k in range(2))
-    (x_low, x_high), (y_low, y_high) = _limits(x), _limits(y)
-    y_ticks = [(tick, f"{tick:g}") for tick in ticks(y_low, y_high, 5)]
+    labels = [points.label for points in groups if points.label]
+    top, width, height = 8.0 + 16.0 * len(labels), 340.0, 290.0 + 16.0 * len(labels)
+    x_axis = _Axis.of([points.x for points in groups], "x" in log)
+    y_axis = _Axis.of([points.y for points in groups], "y" in log)
+    y_ticks = [(tick, f"{tick:g}") for tick in y_axis.ticks]
     # The title of the axis stands beside the longest label.
     left = max(52.0, 28.0 + 6.6 * max((len(label) for _, label in y_ticks), default=0))
     names = [shortened(word, 14) for word in words]
     upwards = sum(map(len, names)) > 34
     bottom = height - (44.0 if not upwards else 26.0 + 6.5 * max(map(len, names)))
     if words:
-        x_low, x_high = -0.5, len(words) - 0.5
-    sx, sy = (width - left - 6.0) / (x_high - x_low), (bottom - top) / (y_high - y_low)
+        x_axis = _Axis(-0.5, len(words) - 0.5, False)
 
-    def on_paper(x: Array, y: Array) -> list[list[float]]:
-        uv = np.stack([left + sx * (x - x_low), bottom - sy * (y - y_low)], axis=-1)
-        return [[u, v] for u, v in uv.tolist()]
+    def on_paper(x: Array, y: Array) -> Array:
+        u = left + (width - left - 6.0) * x_axis.share(x)
+        return np.stack([u, bottom - (bottom - top) * y_axis.share(y)], axis=-1)
 
     canvas = Canvas(width, height, title)
     for tick, word in y_ticks:
-        v = bottom - sy * (tick - y_low)
+        v = float(bottom - (bottom - top) * y_axis.share(np.array(tick)))
         canvas.line(left, v, width - 6.0, v, GREY if tick == 0.0 else RULE)
         canvas.text(left - 6.0, v + 4.0, word, anchor="end", size=11, colour=DIM)
     every = -(-len(names) // 24)
     marks = list(zip(range(len(names)), names, strict=True))[::every] if words else [
-        (tick, f"{tick:g}") for tick in ticks(x_low, x_high, 5)
+        (tick, f"{tick:g}") for tick in x_axis.ticks
     ]  # fmt: skip
     for tick, word in marks:
-        u = left + sx * (tick - x_low)
+        u = float(left + (width - left - 6.0) * x_axis.share(np.array(tick)))
         if not words:
             canvas.line(u, top, u, bottom)
         if upwards:
@@ -374,24 +351,57 @@ def scatter(
             canvas.text(at, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
     canvas.line(left, top, left, bottom, GREY)
     if diagonal:
-        ends = np.array([max(x_low, y_low), min(x_high, y_high)])
-        (x1, y1), (x2, y2) = on_paper(ends, ends)
-        canvas.line(x1, y1, x2, y2, GREY)
+        ends = np.array([max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)])
+        canvas.path(on_paper(ends, ends), GREY, 1.0)
     for points in groups:
         colour, mark = (of[points.group % len(of)] for of in (_COLOURS, _MARKS))
-        path = "".join(f"M{u:.1f} {v:.1f}{mark}" for u, v in on_paper(points.x, points.y))
-        numbers = " ".join(map(str, points.numbers.tolist()))
+        places = on_paper(points.x, points.y)
+        if points.line is not None:
+            canvas.path(places, colour, 1.5, points.line)
+        path = "".join(f"M{u:.1f} {v:.1f}{mark}" for u, v in places.tolist())
+        numbers = () if points.numbers is None else points.numbers.tolist()
+        stands_for = f'data-points="{" ".join(map(str, numbers))}" ' * bool(numbers)
         canvas.parts.append(
-            f'<path d="{path}" data-points="{numbers}" fill="{colour}" stroke="{colour}" '
+            f'<path d="{path}" {stands_for}fill="{colour}" stroke="{colour}" '
             'fill-opacity="0.7" stroke-opacity="0.8"/>'
         )
+        if points.label:
+            y = 12.0 + 16.0 * labels.index(points.label)
+            ends = np.array([[left, y - 4.0], [left + 22.0, y - 4.0]])
+            canvas.path(ends, colour, 2.0, points.line or "")
+            canvas.text(left + 28.0, y, points.label, colour=DIM)
     canvas.text(left + 0.5 * (width - left), height - 6.0, x_label, anchor="middle", size=12)
     canvas.text(12.0, 0.5 * (top + bottom), y_label, anchor="middle", size=12, upwards=True)
-    return canvas.markup()
+    return canvas
 
 
-def _limits(values: Array) -> tuple[float, float]:
-    """Return the ends of an axis: those of the values with a margin."""
-    low, high = float(values.min()), float(values.max())
-    margin = 0.04 * (high - low) or 1.0
-    return low - margin, high + margin
+class _Axis(NamedTuple):
+    """An axis of a chart from *low* to *high*."""
+
+    low: float
+    high: float
+    is_log: bool
+
+    @classmethod
+    def of(cls, values: Sequence[Array], is_log: bool) -> _Axis:
+        """Return the axis of some values, which has a margin."""
+        every = np.concatenate(values)
+        every = every[every > 0.0] if is_log else every
+        low, high = (float(every.min()), float(every.max())) if len(every) else (1.0, 1.0)
+        if is_log:
+            margin = (high / low) ** 0.04 if high > low else 1.5
+            return cls(low / margin, high * margin, True)
+        margin = 0.04 * (high - low) or 1.0
+        return cls(low - margin, high + margin, False)
+
+    @property
+    def ticks(self) -> list[float]:
+        """The labelled values."""
+        return _log_ticks(self.low, self.high) if self.is_log else ticks(self.low, self.high, 5)
+
+    def share(self, values: Array) -> Array:
+        """Return where values are, from 0 at the low end to 1."""
+        if self.is_log:
+            lowest = np.maximum(values, self.low)
+            return np.asarray(np.log(lowest / self.low) / np.log(self.high / self.low))
+        return np.asarray((values - self.low) / (self.high - self.low))

@@ -11,6 +11,7 @@ packages vision and data) and the readings; out come the identified legs and the
 ``offsets``            3.4      step 3: offsets of the legs, (13), (14)
 ``platform``           3.5      step 4: joints and axes on the platform, passive legs, (16)-(19)
 ``four_steps``         3        the steps in a row
+``unknowns``           -        the machine and the unknowns of a step; weak directions
 ``least_squares``      -        the sum of squares of some of them, minimised by IPOPT
 =====================  =======  ==================================================================
 

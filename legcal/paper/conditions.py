@@ -7,7 +7,7 @@ information than the steps): ranks decide.
 The paper has no moving joints at A. Where actuators carry them, the counts are made by analogy and
 marked as ours: (12) counts the axis of every actuator among the revolute axes, with four unknowns
 of an arm and two of a carriage, and the centre of the circle of every rod on an arm as a further
-point; (6') needs three readings of a carriage, or five of an arm, in one view.
+point.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.parameters import n_frame_legs
 
-MIN_IMAGES = {False: 3, True: 5}  # images of one view for (6'), by whether the actuator turns
 _SAME_DIRECTION = 1e-9  # minimum eigenvalue of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that determine the pose of the platform in the camera frame, eq (18)
 
@@ -100,26 +99,6 @@ def two_directions(view: IntArray, leg: IntArray, u: Array, n_legs: int) -> Cond
     smallest = np.linalg.eigvalsh(information)[..., 0]
     has_two = ((number > 0) & (smallest > _SAME_DIRECTION * number)).any(axis=0)
     return _without("two_directions", set(np.flatnonzero(~has_two).tolist()))
-
-
-def enough_readings(
-    view: IntArray, leg: IntArray, q: Array, legs: Sequence[Leg]
-) -> tuple[Condition, ...]:
-    """Return the condition that each rod on an actuator is seen at enough readings, (6').
-
-    They are counted for one camera position. ``q`` (k,) are the readings of observed rods ``leg``
-    (k,). There is no condition where no joint at A moves.
-    """
-    carried = {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator is not None}
-    if not carried:
-        return ()
-    missing = set()
-    for j, actuator in carried.items():
-        of_leg = leg == j
-        n_readings = [len(np.unique(q[of_leg & (view == v)])) for v in np.unique(view[of_leg])]
-        if max(n_readings, default=0) < MIN_IMAGES[actuator.turns]:
-            missing.add(j)
-    return (replace(_without("enough_readings", missing), by_analogy=True),)
 
 
 def three_legs_at_once(

@@ -5,8 +5,14 @@ Every function depends on the unknowns, on errors of the observed values, and on
 of axes become weights by the derivatives with respect to them. Of the three residuals of a vector
 product two are independent: (6), (18) and (19) have the two across the direction.
 
+Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
+have no branches and no square root. It is the chart of ``Frames``, except that a small w is half of
+a rotation vector, and that steps begin with the translation. An unknown axis is turned about its
+normal basis e1, e2 by two turns, w = (turn_1 e1 + turn_2 e2) / 2: its
+:func:`~legcal.geometry.axes.axis_angles` but for a factor near one (:func:`gibbs_of`).
+
 An observed direction is u + e1 alpha1 + e2 alpha2, its normal basis E being e1, e2 as rows. An
-error of a pose is a step of :func:`~legcal.paper.gibbs.moved_points`.
+error of a pose is a step of :func:`~legcal.paper.equations.moved_points`.
 """
 
 from __future__ import annotations
@@ -18,46 +24,25 @@ from itertools import combinations, combinations_with_replacement
 from math import comb
 
 import casadi as ca
+import numpy as np
 
+from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.rotations import turned
+from legcal.geometry.types import Array
 from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual
 from legcal.machine.leg import JointType
-from legcal.paper.gibbs import moved_points, turned_frame, turned_points
 
 END_ERRORS = 3  # errors of the end of a leg (13): two of its direction, one of its reading
 
 
 @cache
 def joint_on_axis() -> ca.Function:
-    """Return (6) and (6'): (A_1, A_2, A_3; alpha, beta; b, u, M, E) -> (M - A) x u (2,) [m].
-
-    The joint is at A = b_1 A_1 + b_2 A_2 + b_3 A_3, the numbers b being functions of its reading:
-    1, 0, 0 for a fixed joint, 1, q, 0 on a carriage, 1, cos q, sin q on an arm.
-    """
-    local, error, b = ca.SX.sym("local", 9), ca.SX.sym("error", 4), ca.SX.sym("b", 3)
-    u, M, E = ca.SX.sym("u", 3), ca.SX.sym("M", 3), ca.SX.sym("E", 2, 3)
-    A = ca.reshape(local, 3, 3) @ b
+    """Return (6): (A; alpha, beta; u, M, E) -> (M - A) x u (2,) [m]."""
+    A, error, M = ca.SX.sym("A", 3), ca.SX.sym("error", 4), ca.SX.sym("M", 3)
+    u, E = _direction()
     residual = ca.cross(M + E.T @ error[2:] - A, u + E.T @ error[:2])
-    return ca.Function("joint_on_axis", [local, error, b, u, M, E], [E @ residual])
-
-
-@cache
-def joint_of_motion(*, turns: bool) -> ca.Function:
-    """Return the joint from the solution of (6'): (A_1..A_n; -) -> (A, w, c) (9,).
-
-    A is the joint at reading 0, w the unit axis of the actuator and c a point of it. On a carriage
-    A_1 + q A_2 is the joint; on an arm A_1 + cos q A_2 + sin q A_3, where A_2 and A_3 are replaced
-    by the nearest vectors that are orthogonal and of equal length.
-    """
-    n = 3 if turns else 2
-    local = ca.SX.sym("local", 3 * n)
-    centre, x, *more = ca.vertsplit(local, 3)
-    w, A = x / ca.norm_2(x), centre
-    if turns:
-        normal = ca.cross(x, more[0])
-        w = normal / ca.norm_2(normal)
-        A = centre + 0.5 * (x + ca.cross(more[0], w))
-    joint = ca.vertcat(A, w, centre)
-    return ca.Function("joint_of_motion", [local, ca.SX.sym("error", 0)], [joint])
+    return ca.Function("joint_on_axis", [A, error, u, M, E], [E @ residual])
 
 
 @cache
@@ -76,71 +61,58 @@ def leg_across_axis() -> ca.Function:
 
 @dataclass(frozen=True)
 class LegInView:
-    """A leg in a view, and its vectors in V (8), (8')."""
+    """A leg in a view, and its vectors in V (8)."""
 
-    places: tuple[int, ...]  # of A (3), turns of v, of w and displacements of c among the unknowns
+    places: tuple[int, ...]  # of A (3) and the turns of v among the unknowns
     has_axis: bool  # its revolute axis v is located
-    has_actuator: bool  # the axis w of the actuator of its joint at A is a vector
-    has_arm: bool  # so is the arm to its joint, from the nearest point of w
 
 
 def pairs_of_vectors(legs: Sequence[LegInView]) -> list[tuple[int, int]]:
     """Return the pairs of vectors of V that (9) multiplies: all but squares of unit vectors."""
-    n_units = sum(leg.has_axis + leg.has_actuator for leg in legs)
-    n_others = comb(len(legs), 2) + sum(leg.has_arm for leg in legs)
+    n_units, n_others = sum(leg.has_axis for leg in legs), comb(len(legs), 2)
     pairs = combinations_with_replacement(range(n_others + n_units), 2)
     return [(p, q) for p, q in pairs if p != q or p < n_others]
 
 
 @cache
 def vectors_of_view(legs: tuple[LegInView, ...]) -> ca.Function:
-    """Return (8): (-; errors; A, v, w, c of each leg) -> the vectors of V in a camera, (3 n,).
-
-    Errors are of A, v, w and c, leg by leg; c is a point of the axis w.
-    """
+    """Return (8): (-; errors of A, v of each leg; A, v of each leg) -> the vectors of V."""
     n = len(legs)
     none, error, observed = (
         ca.SX.sym("local", 0),
-        ca.SX.sym("error", 12 * n),
-        ca.SX.sym("seen", 12, n),
+        ca.SX.sym("error", 6 * n),
+        ca.SX.sym("seen", 6, n),
     )
-    shifted = observed + ca.reshape(error, 12, n)
-    of_legs = [tuple(ca.vertsplit(shifted[:, j], 3)) for j in range(n)]
+    shifted = observed + ca.reshape(error, 6, n)
+    of_legs = [(shifted[:3, j], shifted[3:, j]) for j in range(n)]
     return ca.Function("vectors", [none, error, observed], [ca.vertcat(*_vectors(legs, of_legs))])
 
 
 @cache
 def products_in_base(legs: tuple[LegInView, ...], n_unknowns: int) -> ca.Function:
-    """Return (9) and (9') of a view: (unknowns; -; ...) -> V_p . V_q in R_b minus R_c.
+    """Return (9) of a view: (unknowns; -; ...) -> V_p . V_q in R_b minus R_c.
 
-    Observed are, a column a leg, the known coordinates of A, the frames of v and of w and points of
-    w; then the products of :func:`pairs_of_vectors` in the camera, and the units of residuals.
+    Observed are, a column a leg, the known coordinates of A and the frames of v; then the products
+    of :func:`pairs_of_vectors` in the camera, and the units of residuals.
     """
     n, pairs = len(legs), pairs_of_vectors(legs)
     x, error, products, unit = (ca.SX.sym("x", m) for m in (n_unknowns, 0, len(pairs), len(pairs)))
-    observed = [ca.SX.sym(f"o{k}", 3, size * n) for k, size in enumerate((1, 3, 3, 1))]
-    known_A, frames, of_actuators, points = observed
-    padded, of_legs = ca.vertcat(x, 0.0), list[tuple[ca.SX, ...]]()
+    known_A, frames = ca.SX.sym("known", 3, n), ca.SX.sym("frames", 3, 3 * n)
+    padded, of_legs = ca.vertcat(x, 0.0), list[tuple[ca.SX, ca.SX]]()
     for j, leg in enumerate(legs):
-        values, columns = padded[list(leg.places)], slice(3 * j, 3 * j + 3)
-        v = turned_frame(values[3:5], frames[:, columns])[:, 0]
-        w = turned_frame(values[5:7], of_actuators[:, columns])[:, 0]
-        c = points[:, j] + of_actuators[:, columns][:, 1:] @ values[7:9]
-        of_legs.append((values[:3] + known_A[:, j], v, w, c))
+        values = padded[list(leg.places)]
+        v = turned_frame(values[3:5], frames[:, 3 * j : 3 * j + 3])[:, 0]
+        of_legs.append((values[:3] + known_A[:, j], v))
     V = _vectors(legs, of_legs)
     residuals = ca.vertcat(*[ca.dot(V[p], V[q]) for p, q in pairs]) - products
-    return ca.Function("products", [x, error, *observed, products, unit], [residuals / unit])
+    observed = [known_A, frames, products, unit]
+    return ca.Function("products", [x, error, *observed], [residuals / unit])
 
 
-def _vectors(legs: Sequence[LegInView], of_legs: Sequence[tuple[ca.SX, ...]]) -> list[ca.SX]:
-    """Return V of (A, v, w, c) of each leg: between joints, arms, then the unit vectors."""
+def _vectors(legs: Sequence[LegInView], of_legs: Sequence[tuple[ca.SX, ca.SX]]) -> list[ca.SX]:
+    """Return V of (A, v) of each leg: between joints, then the unit vectors."""
     V = [of_legs[g][0] - of_legs[j][0] for j, g in combinations(range(len(legs)), 2)]
-    for leg, (A, _, w, c) in zip(legs, of_legs, strict=True):
-        if leg.has_arm:
-            V.append(A - c - ca.dot(A - c, w) * w)
-    V += [v for leg, (_, v, _, _) in zip(legs, of_legs, strict=True) if leg.has_axis]
-    V += [w for leg, (_, _, w, _) in zip(legs, of_legs, strict=True) if leg.has_actuator]
-    return V
+    return V + [v for leg, (_, v) in zip(legs, of_legs, strict=True) if leg.has_axis]
 
 
 def leg_end(q0: ca.SX, leg: ca.SX, error: ca.SX) -> ca.SX:
@@ -292,3 +264,60 @@ def _ray() -> tuple[ca.SX, ca.SX]:
 
 def _direction() -> tuple[ca.SX, ca.SX]:
     return ca.SX.sym("u", 3), ca.SX.sym("E", 2, 3)
+
+
+# Unknown motions
+
+
+def moved_points(step: ca.SX, R: ca.SX, t: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) after R, t and a step (6,): translation [m], then Gibbs vector."""
+    return turned_points(step[3:], R @ points) + ca.repmat(t + step[:3], 1, points.shape[1])
+
+
+def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) turned by the rotation that has the Gibbs vector w (3,)."""
+    cross = ca.skew(w)
+    turn = ca.SX.eye(3) + 2.0 / (1.0 + ca.dot(w, w)) * (cross + ca.mtimes(cross, cross))
+    return turn @ points
+
+
+def stepped_poses(R: Array, t: Array, steps: Array) -> tuple[Array, Array]:
+    """Return the poses (n, 3, 3), (n, 3) of :func:`moved_points` for numbers, steps (n, 6)."""
+    return turned(R, 2.0 * steps[:, 3:]), t + steps[:, :3]
+
+
+# Unknown axes
+
+
+def axis_frames(v: Array) -> Array:
+    """Return axes (n, 3) and their normal bases as columns, (n, 3, 3)."""
+    return np.concatenate([v[:, :, None], np.swapaxes(normal_basis(v), 1, 2)], axis=2)
+
+
+def turned_frame(turns: ca.SX, frame: ca.SX) -> ca.SX:
+    """Return an axis and its normal basis, columns (3, 3), after two turns of the axis."""
+    return turned_points(0.5 * frame[:, 1:] @ turns, frame)
+
+
+def gibbs_of(angles: Array) -> Array:
+    """Return the turns (..., 2) of an axis that is turned by angles (..., 2) [rad]."""
+    half = 0.5 * np.linalg.norm(angles, axis=-1, keepdims=True)
+    return np.asarray(angles * np.where(half > 0.0, np.tan(half) / np.where(half, half, 1.0), 1.0))
+
+
+def angles_of(turns: Array) -> Array:
+    """Return the angles (..., 2) [rad] of turns, the inverse of :func:`gibbs_of`."""
+    half = 0.5 * np.linalg.norm(turns, axis=-1, keepdims=True)
+    return np.asarray(
+        turns * np.where(half > 0.0, np.arctan(half) / np.where(half, half, 1.0), 1.0)
+    )
+
+
+def axis_slope(nominal: Array, turns: Array) -> Array:
+    """Return the derivative (3, 2) of the first column of :func:`turned_frame` by the turns."""
+    by_turns = np.array([-0.5 * turns, [0.0, 1.0], [-1.0, 0.0]])
+    axis = turned_axis(nominal, angles_of(turns))
+    frame = np.vstack([nominal, normal_basis(nominal)])
+    return np.asarray(
+        (frame.T @ by_turns - 0.5 * np.outer(axis, turns)) / (1.0 + 0.25 * float(turns @ turns))
+    )

@@ -10,9 +10,9 @@ from legcal.machine.leg import KinematicParameters, Leg
 from legcal.paper.criteria import Criteria
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
-from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import identify_offsets, leg_directions
 from legcal.paper.platform import locate_platform_joints
+from legcal.paper.unknowns import NominalMachine
 
 
 @dataclass(frozen=True, eq=False)

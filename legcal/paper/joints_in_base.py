@@ -8,10 +8,6 @@ all pairs of vectors of V, squares included, are equal in the camera and in R_b 
 Scalar products are even in a coordinate normal to coplanar joints, and equal for a mirror image:
 (9) determines neither z nor the handedness. With weights, directions with less information in (9)
 than in the nominal model stay nominal, until (18) of all joints in all cameras determines them.
-
-Where actuators move joints at A (our extension, not in the paper) these are taken at reading 0. As
-printed (8', 9'), V has also the axis of every actuator of the view, and the arm from the axis of a
-revolute actuator to the joint.
 """
 
 from __future__ import annotations
@@ -25,17 +21,20 @@ from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry.motions import components, motion_of
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import LegColumns
-from legcal.paper.camera_poses import candidate_camera_poses
 from legcal.paper.equations import (
     LegInView,
     pairs_of_vectors,
     products_in_base,
+    stepped_poses,
     vectors_of_view,
 )
-from legcal.paper.gibbs import stepped_poses
-from legcal.paper.joints_in_camera import JointsInCamera, adjusted_to_base, points_in_both
+from legcal.paper.joints_in_camera import (
+    JointsInCamera,
+    adjusted_to_base,
+    candidate_camera_poses,
+    points_in_both,
+)
 from legcal.paper.least_squares import (
     LeastSquares,
     Term,
@@ -43,14 +42,10 @@ from legcal.paper.least_squares import (
     evaluated,
     solve_least_squares,
 )
-from legcal.paper.nominal import NominalMachine
 from legcal.paper.platform_pose import SeenPoints, poses_on_rays
-from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
+from legcal.paper.unknowns import NominalMachine, Unknowns, hold_at_nominal, left_near_nominal
 
-_PLACES = np.r_[
-    LegColumns.A, LegColumns.BASE_AXIS, ActuatorColumns.AXIS, ActuatorColumns.POINT
-]  # the numbers of a leg that are in (9)
+_PLACES = np.r_[LegColumns.A, LegColumns.BASE_AXIS]  # the numbers of a leg that are in (9)
 
 
 Cameras = tuple[RigidTransform | None, ...]
@@ -60,8 +55,7 @@ Cameras = tuple[RigidTransform | None, ...]
 class JointsInBase:
     """Base joint centres and revolute axes in R_b, and the cameras."""
 
-    # with located A, revolute axes at the base and actuators
-    machine: NominalMachine
+    machine: NominalMachine  # with located A and revolute axes at the base
     T_Rb_camera: Cameras  # None for a view with too few joints
     in_cameras: JointsInCamera  # the input of this step
     diagnostics: tuple[str, ...]  # omissions and nominal values, with their reasons
@@ -97,7 +91,7 @@ def locate_joints_in_base(
     located = replace(machine, legs=unknowns.legs(x, machine.legs))
     cameras = register_views(located, joints)
     if machine.spatial and any(T is not None for T in cameras):
-        if weighted and not machine.actuators:
+        if weighted:
             located, cameras, shown = _joints_on_rays(located, unknowns, joints, cameras)
             joints = _joints_of_base(located, joints, cameras, measurements)
             held = np.setdiff1d(held, shown)
@@ -123,8 +117,6 @@ def build_scalar_products(
             LegInView(
                 tuple(unknowns.place[j, _PLACES].tolist()),
                 bool(revolute[v, j]),
-                j in machine.actuators,
-                j in machine.actuators and machine.actuators[j].turns,
             )
             for j in np.flatnonzero(located).tolist()
         )
@@ -137,8 +129,6 @@ def build_scalar_products(
         known_values = (
             unknowns.known_A[view_legs].T,
             np.hstack(list(unknowns.base_frames[view_legs])),
-            np.hstack(list(unknowns.actuator_frames[view_legs])),
-            unknowns.actuator_points[view_legs].T,
         )
         unit = sigma if weighted else np.ones_like(sigma)
         observed = *(np.tile(values, (len(views), 1, 1)) for values in known_values), products, unit
@@ -159,16 +149,13 @@ def _products_seen(
     """
     view_legs = np.flatnonzero(joints.located[views[0]]).tolist()
     columns, C = (
-        np.zeros((len(views), 12, len(view_legs))),
-        np.zeros((len(views), *[12 * len(view_legs)] * 2)),
+        np.zeros((len(views), 6, len(view_legs))),
+        np.zeros((len(views), *[6 * len(view_legs)] * 2)),
     )
     for k, v in enumerate(views):
         for i, j in enumerate(view_legs):
-            columns[k, :6, i] = *joints.A[v, j], *joints.v[v, j]
-            if (v, j) in joints.actuators:
-                actuator = joints.actuators[v, j]
-                columns[k, 6:, i] = *actuator.axis, *actuator.point
-            C[k, 12 * i : 12 * i + 12, 12 * i : 12 * i + 12] = joints.covariance[v, j]
+            columns[k, :, i] = *joints.A[v, j], *joints.v[v, j]
+            C[k, 6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = joints.covariance[v, j]
     function, none = vectors_of_view(legs), np.zeros((len(views), 0))
     V = evaluated(function, none, columns).reshape(len(views), -1, 3)
     by_error = derivatives(function, 1, none, columns)

@@ -7,11 +7,6 @@ normal to the revolute axis v of that joint:
 
 In a planar machine the axes v of a view are one common normal.
 
-A rod on a carriage or an arm has its joint at A(q) at the reading q (6'), our extension of the
-paper: a + q d of a prismatic is linear in a and d, from three images; p + x cos q + y sin q of a
-revolute in p, x and y, from five. Afterwards |d| = 1 (otherwise readings and outlines contradict
-each other in lengths), or x.y = 0 and |x| = |y|, with the axis w along x x y.
-
 The most uncertain direction in an image is the tilt of a leg towards the camera. With weights,
 directions are adjusted to the joints from all images of the view: an axis through A and the point
 M, which is accurate, has a much better direction than its outlines give.
@@ -19,41 +14,39 @@ M, which is accurate, has a much better direction than its outlines give.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csc_array
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry.axes import turned_axis
 from legcal.geometry.lines import cross
+from legcal.geometry.motions import register_points
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.actuator import Actuator
-from legcal.paper.camera_poses import candidate_camera_poses, signs_seen
-from legcal.paper.conditions import MIN_IMAGES
-from legcal.paper.equations import joint_of_motion, joint_on_axis, leg_across_axis
-from legcal.paper.gibbs import angles_of, axis_frames, axis_slope
+from legcal.paper.equations import (
+    angles_of,
+    axis_frames,
+    axis_slope,
+    joint_on_axis,
+    leg_across_axis,
+)
 from legcal.paper.least_squares import (
     LeastSquares,
     Term,
     adjusted,
-    derivatives,
-    evaluated,
     inverse_of,
     solve_least_squares,
 )
-from legcal.paper.nominal import NominalMachine
+from legcal.paper.unknowns import NominalMachine
 
 _SAME_DIRECTION = 1e-9  # minimum eigenvalue of the normalised information of different directions
-_WRONG_SCALE = 0.02  # minimum relative error of the motion of a carriage: the tolerance of radii
-_SURE = 5.0  # minimum standard deviations of a wrong scale
 _OUTLIER = 8.0  # minimum standard deviations of an outlier, or medians where these are too small
 _ROUNDING = 1e-14  # relative rounding of a difference of variances
-_JOINT = np.r_[0:3, 6:12]  # A, w and c in the covariance of a joint
 _AXIS = slice(3, 6)  # v in the covariance of a joint
 
 
@@ -61,12 +54,10 @@ _AXIS = slice(3, 6)  # v in the covariance of a joint
 class JointsInCamera:
     """Base joint centres and revolute axes in the frame of each view; zero where not located."""
 
-    A: Array  # (n_views, n_legs, 3) [m]; on actuators at reading 0
+    A: Array  # (n_views, n_legs, 3) [m]
     v: Array  # (n_views, n_legs, 3); the common normal in a plane; zero without an axis
     located: BoolArray  # (n_views, n_legs)
-    actuators: Mapping[tuple[int, int], Actuator]  # actuators of located joints, by view and leg
-    # (n_views, n_legs, 12, 12) of A [m^2], of v, of the axis of the actuator of A, and of a point
-    # of that axis [m^2]; zero for absent parts, and without weights
+    # (n_views, n_legs, 6, 6) of A [m^2] and of v; zero for absent parts, and without weights
     covariance: Array
     axes: LegAxes  # of located joints; with weights, adjusted to these
     observed: LegAxes  # the same as the images gave them
@@ -77,31 +68,22 @@ class JointsInCamera:
         """Mask of the located revolute axes, (n_views, n_legs)."""
         return np.asarray(np.any(self.v != 0.0, axis=2))
 
-    def A_at(self, view: IntArray, leg: IntArray, q: Array) -> Array:
-        """Return A in the cameras of views (k,) of legs (k,) at readings (k,), (k, 3) [m]."""
-        A = self.A[view, leg]
-        for (v, j), actuator in self.actuators.items():
-            of_joint = (view == v) & (leg == j)
-            A[of_joint] = actuator.at(self.A[v, j], q[of_joint])
-        return A
-
 
 def locate_joints_in_cameras(
     machine: NominalMachine, axes: LegAxes, measurements: Measurements, *, weighted: bool
 ) -> JointsInCamera:
     """Locate base joint centres and revolute axes in each camera frame, eqs (6) and (7).
 
-    Raises NotIdentifiable if some leg has two different directions in no view, or a rod on an
-    actuator too few in all.
+    Raises NotIdentifiable if some leg has two different directions in no view, or if motors move
+    joints at A, which the paper does not have.
     """
-    if not machine.spatial and machine.actuators:
+    if any(leg.actuator is not None for leg in machine.legs):
         raise NotIdentifiable(
-            "The four steps could not be run: found joints at the base that actuators move in a "
-            "machine that moves in a plane, needed a machine that moves in space; use the joint "
-            "fit alone."
+            "The four steps could not be run: found joints at the base that motors move, needed "
+            "joints that stay; the joint fit needs no steps."
         )
     bundles = _Bundles.of(machine, axes, measurements)
-    reasons = bundles.undetermined(machine)
+    reasons = bundles.undetermined()
     left_out = tuple(
         f"The base joint of leg {machine.leg_names[j]} in view {measurements.views[v].name} was "
         f"left out: {reason}."
@@ -114,8 +96,8 @@ def locate_joints_in_cameras(
         raise NotIdentifiable(
             [
                 f"The base joint of leg {machine.leg_names[j]} could not be located: found no view "
-                f"that shows the {_needed(machine, j)}, needed one; add images in which it is "
-                "visible."
+                "that shows the leg in two different directions, needed one; add images in which "
+                "it is visible."
                 for j in missing
             ]
             + list(left_out)
@@ -137,130 +119,67 @@ class _Bundles:
     """The axes of each leg in each view, which meet in its base joint."""
 
     axes: LegAxes
-    q: Array  # (k,) the reading of the leg of each axis in its image
     view: IntArray  # (n,)
     leg: IntArray  # (n,)
     of_axis: IntArray  # (k,): the bundle of each axis
-    places: IntArray  # (n, 9): indices of unknowns of (6) and (6'); -1 for absent ones
-    problem: LeastSquares
+    problem: LeastSquares  # (6), three unknowns a bundle
 
     @classmethod
     def of(cls, machine: NominalMachine, axes: LegAxes, measurements: Measurements) -> _Bundles:
-        """Return the bundles of a session, by view and leg, with (6) and (6') of all of them."""
+        """Return the bundles of a session, by view and leg, with (6) of all of them."""
         key = measurements.view[axes.row] * machine.n_legs + axes.leg
         distinct, of_axis = np.unique(key, return_inverse=True)
         view, leg = np.divmod(distinct, machine.n_legs)
-        q, b = measurements.q[axes.row, axes.leg], np.zeros((len(axes), 3))
-        b[:, 0], size = 1.0, np.full(machine.n_legs, 3)
-        for j, actuator in machine.actuators.items():
-            of_leg, size[j] = axes.leg == j, 9 if actuator.turns else 6
-            motion = actuator.gain * q[of_leg]
-            b[of_leg, 1] = np.cos(motion) if actuator.turns else motion
-            b[of_leg, 2] = np.sin(motion) if actuator.turns else 0.0
-        last = np.cumsum(size[leg])
-        places = (last - size[leg])[:, None] + np.arange(9)
-        places[np.arange(9) >= size[leg][:, None]] = -1
-        observed = b, axes.u, axes.M, axes.basis
-        term = Term(joint_on_axis(), places[of_axis.ravel()], observed, axes.covariance)
-        start = np.zeros(int(last.max(initial=0)))
-        problem = LeastSquares("The base joints (eq 6)", (term,), start)
-        return cls(axes, q, view, leg, of_axis.ravel(), places, problem)
+        place = 3 * of_axis.reshape(-1, 1) + np.arange(3)
+        term = Term(joint_on_axis(), place, (axes.u, axes.M, axes.basis), axes.covariance)
+        problem = LeastSquares("The base joints (eq 6)", (term,), np.zeros(3 * len(leg)))
+        return cls(axes, view, leg, of_axis.ravel(), problem)
 
-    def undetermined(self, machine: NominalMachine) -> list[str]:
-        """Return for each bundle why (6) or (6') has no unique solution, or ""."""
-        J, reasons = self.problem.jacobian(self.problem.start), list[str]()
-        for i, (j, F) in enumerate(zip(self.leg.tolist(), self._blocks(J), strict=True)):
-            of_bundle, n = self.of_axis == i, int(np.sum(self.of_axis == i))
-            reason = ""
-            if j in machine.actuators:
-                actuator, n = machine.actuators[j], len(np.unique(self.q[of_bundle]))
-                least, size = MIN_IMAGES[actuator.turns], np.sqrt(np.diag(F))
-                if n < least:
-                    readings = "reading" if n == 1 else "readings"
-                    reason = f"it was found at {n} {readings} of {actuator.joint}, and {least} are "
-                    reason += "needed"
-                elif np.linalg.eigvalsh(F / np.outer(size, size))[0] <= _SAME_DIRECTION:
-                    reason = f"its directions at {n} readings of {actuator.joint} do not determine "
-                    reason += "how the joint moves"
-            elif np.linalg.eigvalsh(F)[0] <= _SAME_DIRECTION * n:
-                reason = f"its direction is the same in all {n} images, and two are needed"
-                if n == 1:
-                    reason = "it was found in one image, and at least two different directions are "
-                    reason += "needed"
-            reasons.append(reason)
+    def undetermined(self) -> list[str]:
+        """Return for each bundle why (6) has no unique solution, or ""."""
+        reasons = []
+        count = np.bincount(self.of_axis, minlength=len(self.leg)).tolist()
+        for n, F in zip(
+            count, self._blocks(self.problem.jacobian(self.problem.start)), strict=True
+        ):
+            if np.linalg.eigvalsh(F)[0] > _SAME_DIRECTION * n:
+                reasons.append("")
+            elif n == 1:
+                reasons.append(
+                    "it was found in one image, and at least two different directions are needed"
+                )
+            else:
+                reasons.append(f"its direction is the same in all {n} images, and two are needed")
         return reasons
 
     def joints(
         self, machine: NominalMachine, measurements: Measurements, *, weighted: bool
     ) -> JointsInCamera:
-        """Return the joints by (6) and (6'), and the axes, adjusted to them with weights."""
-        solution, diagnostics = solve_least_squares(self.problem), list[str]()
+        """Return the joints by (6), and the axes, adjusted to them with weights."""
+        solution, left_out = solve_least_squares(self.problem), tuple[str, ...]()
         axes = observed = self.axes
-        C = np.zeros((len(self.leg), 9, 9))
+        C = np.zeros((len(self.leg), 3, 3))
         if weighted:
             problem = replace(self.problem, start=solution.x)
             solution = solve_least_squares(problem, weighted=True)
-            for block, F in zip(C, self._blocks(solution.jacobian), strict=True):
-                block[: len(F), : len(F)] = inverse_of(F)
-        local = np.append(solution.x, 0.0)[self.places]
+            C = np.array([inverse_of(F) for F in self._blocks(solution.jacobian)])
+        joint = solution.x.reshape(-1, 3)
         if weighted:
-            diagnostics += self._wrong_scales(machine, local, C)
-            of_axis = local[self.of_axis], C[self.of_axis]
+            of_axis = joint[self.of_axis], C[self.of_axis]
             axes, chi = _adjusted(axes, self.problem.terms[0], *of_axis)
             right, left_out = _without_outliers(machine, axes, chi, measurements)
-            axes, observed, diagnostics = (
-                axes.choose(right),
-                observed.choose(right),
-                [*diagnostics, *left_out],
-            )
+            axes, observed = axes.choose(right), observed.choose(right)
         shape = len(measurements.views), machine.n_legs
         A, located = np.zeros((*shape, 3)), np.zeros(shape, dtype=np.bool_)
-        covariance, actuators = np.zeros((*shape, 12, 12)), dict[tuple[int, int], Actuator]()
-        for i, (v, j) in enumerate(zip(self.view.tolist(), self.leg.tolist(), strict=True)):
-            located[v, j], A[v, j] = True, local[i, :3]
-            covariance[v, j, :3, :3] = C[i, :3, :3]
-            if j in machine.actuators:
-                function = joint_of_motion(turns=machine.actuators[j].turns)
-                values = local[[i], : function.size1_in(0)]
-                A[v, j], axis, point = np.split(evaluated(function, values)[0], 3)
-                actuators[v, j] = replace(machine.actuators[j], axis=axis, point=point)
-                slope, n = derivatives(function, 0, values)[0], values.shape[1]
-                covariance[v, j][np.ix_(_JOINT, _JOINT)] = slope @ C[i, :n, :n] @ slope.T
-        nowhere = np.zeros_like(A)
-        return JointsInCamera(
-            A, nowhere, located, actuators, covariance, axes, observed, tuple(diagnostics)
-        )
+        covariance = np.zeros((*shape, 6, 6))
+        located[self.view, self.leg], A[self.view, self.leg] = True, joint
+        covariance[self.view, self.leg, :3, :3] = C
+        return JointsInCamera(A, np.zeros_like(A), located, covariance, axes, observed, left_out)
 
     def _blocks(self, jacobian: csc_array[np.float64]) -> list[Array]:
-        """Return the information matrices of the unknowns of each bundle."""
-        information = (jacobian.T @ jacobian).tocsr()
-        return [
-            information[indices][:, indices].toarray()
-            for indices in (p[p >= 0] for p in self.places)
-        ]
-
-    def _wrong_scales(self, machine: NominalMachine, local: Array, C: Array) -> list[str]:
-        """Return in words the carriages with motions that contradict their readings."""
-        scales = dict[str, list[float]]()
-        for j, x, of_x in zip(self.leg.tolist(), local[:, 3:6], C[:, 3:6, 3:6], strict=True):
-            if j in machine.actuators and not machine.actuators[j].turns:
-                scale = float(np.linalg.norm(x))
-                sigma = float(np.sqrt(x @ of_x @ x)) / scale
-                if abs(scale - 1.0) > max(_WRONG_SCALE, _SURE * sigma):
-                    scales.setdefault(machine.actuators[j].joint, []).append(scale)
-        return [
-            f"The outlines show '{joint}' moving {np.median(scale):.2f} mm where its readings say "
-            "1 mm; check the unit of the readings, the radii of the rods, and the camera."
-            for joint, scale in scales.items()
-        ]
-
-
-def _needed(machine: NominalMachine, leg: int) -> str:
-    """Return in words the images of a leg that a view needs to locate its joint."""
-    if leg not in machine.actuators:
-        return "leg in two different directions"
-    actuator = machine.actuators[leg]
-    return f"leg at {MIN_IMAGES[actuator.turns]} different readings of {actuator.joint}"
+        """Return the information matrices (3, 3) of the unknowns of each bundle."""
+        F = (jacobian.T @ jacobian).tocsr()
+        return [F[k : k + 3, k : k + 3].toarray() for k in range(0, 3 * len(self.leg), 3)]
 
 
 def _adjusted(axes: LegAxes, term: Term, local: Array, C: Array) -> tuple[LegAxes, Array]:
@@ -298,15 +217,12 @@ def adjusted_to_base(
     Axes that miss A by far are left out.
     """
     axes = joints.observed
-    view, n = measurements.view[axes.row], len(axes)
-    local, C = np.zeros((n, 9)), np.zeros((n, 9, 9))
-    local[:, :3], C[:, :3, :3] = A[view, axes.leg], of_A[view, axes.leg]
-    stands = np.tile([1.0, 0.0, 0.0], (n, 1))
-    index = np.full((n, 9), -1)
-    term = Term(joint_on_axis(), index, (stands, axes.u, axes.M, axes.basis), axes.covariance)
+    of_axis = measurements.view[axes.row], axes.leg
+    index = np.full((len(axes), 3), -1)
+    term = Term(joint_on_axis(), index, (axes.u, axes.M, axes.basis), axes.covariance)
     covariance = joints.covariance.copy()
     covariance[:, :, :3, :3] = of_A
-    better, chi = _adjusted(axes, term, local, C)
+    better, chi = _adjusted(axes, term, A[of_axis], of_A[of_axis])
     right, left_out = _without_outliers(machine, axes, chi, measurements)
     joints = replace(
         joints,
@@ -387,9 +303,6 @@ def _with_axes(
         return joints
     some, R = axes.choose(rows), np.tile(np.eye(3), (len(rows), 1, 1))
     view, leg = measurements.view[some.row], some.leg
-    for (v, j), actuator in joints.actuators.items():
-        of_joint = (view == v) & (leg == j)
-        R[of_joint] = actuator.rotations(measurements.q[some.row[of_joint], j])
     axis = np.unique(view * machine.n_legs + leg * machine.spatial, return_inverse=True)[1].ravel()
     covariance = np.zeros((len(rows), 8, 8))
     covariance[:, :2, :2] = some.covariance[:, :2, :2]
@@ -429,21 +342,80 @@ def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
 def points_in_both(
     machine: NominalMachine, joints: JointsInCamera, view: int
 ) -> tuple[Array, Array]:
-    """Return points of the base (n, 3) that a view locates, in R_b and in the camera [m].
+    """Return the joints of the base (n, 3) that a view locates, in R_b and in the camera [m]."""
+    located = joints.located[view]
+    return machine.parameters.base_joints[located], joints.A[view, located]
 
-    They are the joints; for joints moved by actuators, their positions at three readings.
+
+# Candidate camera poses, in closed form: three joints not on a line determine the pose. Joints on
+# one line leave a rotation about it, which revolute axes across the line determine as lines: often
+# uniquely, sometimes with several nearly equal solutions, such as both sides of the plane of a
+# planar machine.
+
+_ON_A_LINE = 0.05  # maximum ratio of the spreads of collinear joints across and along their line
+_ALONG = 0.1  # minimum sine of the angle between the line and an axis that determines a camera
+_MAX_DIFFERENCE = 0.07  # between mean squared sines of angles to axes of equivalent candidates
+_TURNS = 720
+
+
+def candidate_camera_poses(
+    A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array
+) -> tuple[list[RigidTransform], bool]:
+    """Return the candidates of T_Rb_camera, most likely first, and whether they are all.
+
+    Joints (n, 3) and revolute axes (r, 3) of a view are given in the model and in the camera; axes
+    are lines without a sign. There are no candidates for fewer than two separate joints.
+    The flag is False if the pose is one of a continuum, rotated about the line of the joints.
     """
-    A_Rb, A_camera = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for j in np.flatnonzero(joints.located[view]).tolist():
-        A, nominal = machine.legs[j].A, machine.legs[j].actuator
-        if nominal is None:
-            A_Rb.append(A[None])
-            A_camera.append(joints.A[view, j][None])
-        else:
-            low, high = nominal.travel
-            if not np.isfinite(high - low) or high <= low:
-                low, high = (-1.0, 1.0) if nominal.turns else (0.0, 1.0)
-            q = np.linspace(low, high, 3)
-            A_Rb.append(nominal.at(A, q))
-            A_camera.append(joints.actuators[view, j].at(joints.A[view, j], q))
-    return np.concatenate(A_Rb), np.concatenate(A_camera)
+    if len(A_Rb) < 2:
+        return [], False
+    _, spread, directions = np.linalg.svd(A_Rb - A_Rb.mean(axis=0))
+    if spread[0] <= 1e-6 * float(np.linalg.norm(A_Rb, axis=1).max()):
+        return [], False
+    if len(A_Rb) > 2 and spread[1] > _ON_A_LINE * spread[0]:
+        return [register_points(A_camera, A_Rb)], True
+    line = directions[0]
+    across = np.linalg.norm(cross(v_Rb, line), axis=1) > _ALONG
+    T_camera_Rb = _laid_along(A_Rb, line, A_camera)
+    if not across.any():
+        return [T_camera_Rb.inv()], False
+    along, middle = T_camera_Rb.rotation.apply(line), A_camera.mean(axis=0)
+    v = T_camera_Rb.rotation.apply(v_Rb[across])
+    poses = []
+    for turn in _candidate_turns(along, v, v_camera[across]):
+        rotation = Rotation.from_rotvec(turn * along)
+        about = RigidTransform.from_components(middle - rotation.apply(middle), rotation)
+        poses.append((about * T_camera_Rb).inv())
+    return poses, True
+
+
+def signs_seen(v_Rb: Array, v_camera: Array, T_Rb_camera: RigidTransform) -> Array:
+    """Return +1 or -1 for each axis (r, 3): with it, v_camera points to the side of v_Rb."""
+    predicted = T_Rb_camera.rotation.inv().apply(v_Rb)
+    return np.where(np.sum(predicted * v_camera, axis=1) < 0.0, -1.0, 1.0)
+
+
+def _laid_along(A_Rb: Array, line: Array, A_camera: Array) -> RigidTransform:
+    """Return a T_camera_Rb that aligns collinear joints, with any rotation about their line."""
+    height = (A_Rb - A_Rb.mean(axis=0)) @ line
+    seen_line = height @ (A_camera - A_camera.mean(axis=0))
+    of_seen, of_line = axis_frames(np.array([seen_line / np.linalg.norm(seen_line), line]))
+    rotation = Rotation.from_matrix(of_seen @ of_line.T)
+    shift = A_camera.mean(axis=0) - rotation.apply(A_Rb.mean(axis=0))
+    return RigidTransform.from_components(shift, rotation)
+
+
+def _candidate_turns(along: Array, v: Array, v_seen: Array) -> Array:
+    """Return the rotations about a unit vector that align axes v (r, 3) with v_seen, best first."""
+    turn = 2.0 * np.pi / _TURNS * np.arange(_TURNS)
+    axial = (v @ along)[:, None] * along
+    across = v - axial
+    product = (
+        np.sum(v_seen * axial, axis=1)
+        + np.cos(turn)[:, None] * np.sum(v_seen * across, axis=1)
+        + np.sin(turn)[:, None] * np.sum(v_seen * cross(along, across), axis=1)
+    )
+    error = 1.0 - np.mean(product**2, axis=1)
+    least = np.flatnonzero((error <= np.roll(error, 1)) & (error < np.roll(error, -1)))
+    least = least[np.argsort(error[least], kind="stable")]
+    return np.asarray(turn[least[error[least] < error.min() + _MAX_DIFFERENCE]])

@@ -3,8 +3,7 @@
 A problem is a sum of terms. A term is one equation of the paper: a CasADi function of a few
 unknowns, mapped over its observations. It is also a function of the errors of the observed values:
 its derivative by these propagates covariances of axes to covariances of residuals, which are the
-weights. Observed values are parameters of the compiled solver, so that problems of one structure
-(other numbers, other weights) are compiled once.
+weights. Cost, gradient and Hessian of one observation are one compiled function of an equation.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,7 +19,7 @@ from scipy.sparse import csc_array
 from legcal.errors import DidNotConverge
 from legcal.geometry.covariances import whitener
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.signals import held_back_signals, is_waiting
+from legcal.signals import held_back_signals
 
 _RANK = 1e-7  # minimum singular value of the scaled Jacobian of a determined direction
 _REWEIGHTINGS = 10
@@ -30,8 +28,6 @@ _CONVERGED = 0.01  # maximum relative change of converged weights
 _MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
 _LEAST = 1e-13  # minimum information of a determined direction, relative to the largest
 _NONE = np.zeros(0, dtype=np.intp)
-_CACHE_SIZE = 20  # compiled structures, enough for one run of the steps with either criteria
-_INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")  # return statuses
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
     "calc_lam_p": False,
@@ -61,19 +57,46 @@ class Term:
     covariance: Array | None = None  # (n, k, k) of the errors; None: the weight is one
     n_printed: int | None = None  # number of first residuals in the paper; others have no weight
 
+    def __len__(self) -> int:
+        return len(self.index)
+
     @property
     def n_rows(self) -> int:
         """Number of residuals of one observation."""
         return int(self.function.size1_out(0))
 
     @property
-    def unit_weights(self) -> Array:
-        """Weights of one, (n, r, r), or as numbers (n, r) without a covariance."""
-        n, r = len(self.index), self.n_rows
+    def unit_weights(self) -> Array | None:
+        """Weights of one, (n, r, r); None if they have no covariance."""
         if self.covariance is None:
-            return np.ones((n, r))
-        printed = np.arange(r) < (r if self.n_printed is None else self.n_printed)
-        return np.tile(np.diag(printed.astype(np.float64)), (n, 1, 1))
+            return None
+        printed = np.arange(self.n_rows) < (self.n_printed or self.n_rows)
+        return np.tile(np.diag(printed.astype(np.float64)), (len(self), 1, 1))
+
+    def weights(self, x: Array, *, robust: bool) -> Array | None:
+        """Return the matrices (n, r, r) that whiten the residuals at x; None without a covariance.
+
+        Robust ones have outliers downweighted by Cauchy's function.
+        """
+        if self.covariance is None:
+            return None
+        slope = derivatives(self.function, 1, self.local(x), *self.observed)
+        W = whitener(slope @ self.covariance @ np.swapaxes(slope, 1, 2))
+        if robust:
+            chi = np.linalg.norm(W @ self.residuals(x)[..., None], axis=(1, 2))
+            W *= _cauchy(chi)[:, None, None]
+        return W
+
+    def local(self, x: Array) -> Array:
+        """Return the local unknowns (n, n_local)."""
+        return np.append(x, 0.0)[self.index]
+
+    def residuals(self, x: Array) -> Array:
+        """Return the unweighted residuals (n, r)."""
+        return evaluated(self.function, self.local(x), *self.observed)
+
+
+Weights = Sequence[Array | None]  # of terms, (n, r, r) each; None for one
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,65 +114,37 @@ class LeastSquares:
     @property
     def n_residuals(self) -> int:
         """Number of residuals of all terms."""
-        return sum(term.n_rows * len(term.index) for term in self.terms)
+        return sum(term.n_rows * len(term) for term in self.terms)
 
-    def residuals(self, x: Array) -> Array:
-        """Return the unweighted residuals (m,)."""
-        return _dense(_compiled(self._structure()).residuals(x, self._observed()))
+    def residuals(self, x: Array, weights: Weights | None = None) -> Array:
+        """Return the residuals (m,), unweighted without weights."""
+        parts = [np.zeros(0)]
+        for term, W in zip(self.terms, weights or [None] * len(self.terms), strict=True):
+            r = term.residuals(x)
+            parts.append((r if W is None else (W @ r[..., None])[..., 0]).ravel())
+        return np.concatenate(parts)
 
-    def jacobian(self, x: Array) -> csc_array[np.float64]:
-        """Return the derivative (m, n) of the unweighted residuals."""
-        return _sparse(_compiled(self._structure()).jacobian(x, self._observed()))
+    def jacobian(self, x: Array, weights: Weights | None = None) -> csc_array[np.float64]:
+        """Return the derivative (m, n) of the residuals, unweighted without weights."""
+        entries, rows, columns, first = [np.zeros(0)], [_NONE], [_NONE], 0
+        for term, W in zip(self.terms, weights or [None] * len(self.terms), strict=True):
+            J = derivatives(term.function, 0, term.local(x), *term.observed)
+            J = J if W is None else W @ J
+            row = first + np.arange(len(term) * term.n_rows).reshape(len(term), -1, 1)
+            first += len(term) * term.n_rows
+            column, row = np.broadcast_arrays(term.index[:, None], row)
+            kept = column >= 0
+            entries.append(J[kept])
+            rows.append(row[kept])
+            columns.append(column[kept])
+        place = np.concatenate(rows), np.concatenate(columns)
+        return csc_array((np.concatenate(entries), place), shape=(first, len(self.start)))
 
     def derivative_at_start(self, *, weighted: bool) -> csc_array[np.float64]:
         """Return the derivative (m, n) of the residuals at the start; in sigmas with weights."""
-        J = self.jacobian(self.start)
-        return csc_array(_matrix(self._weights(self.start, None)) @ J) if weighted else J
-
-    def _weights(self, x: Array, residuals: Array | None) -> list[Array]:
-        """Return the matrices (n, r, r) that whiten the residuals of each term at x.
-
-        They are one, (n, r), without a covariance. With residuals, outliers are downweighted by
-        Cauchy's function.
-        """
-        matrices, first = list[Array](), 0
-        for term in self.terms:
-            n, r = len(term.index), term.n_rows
-            W = term.unit_weights
-            if term.covariance is not None:
-                local = np.append(x, 0.0)[term.index]
-                slope = derivatives(term.function, 1, local, *term.observed)
-                spread = slope @ term.covariance @ np.swapaxes(slope, 1, 2)
-                W = whitener(spread)
-                if residuals is not None:
-                    whitened = W @ residuals[first : first + n * r].reshape(n, r, 1)
-                    W *= _cauchy(np.linalg.norm(whitened, axis=(1, 2)))[:, None, None]
-            matrices.append(W)
-            first += n * r
-        return matrices
-
-    def _structure(self) -> _Structure:
-        """Return the structure, common to problems with other observed values or another start."""
-        terms = [term for term in self.terms if len(term.index)]
-        keys = tuple(
-            (
-                term.function,
-                term.covariance is None,
-                term.index.shape,
-                np.ascontiguousarray(term.index, dtype=np.int64).tobytes(),
-                tuple((*values.shape[1:], 1, 1)[:2] for values in term.observed),
-            )
-            for term in terms
-        )
-        return len(self.start), keys, self.exact_hessian
-
-    def _observed(self) -> ca.DM:
-        """Return all observed values as one vector, observations side by side."""
-        parts = [np.zeros(0)]
-        for term in self.terms:
-            for values in term.observed if len(term.index) else ():
-                parts.append(_side_by_side(values).ravel(order="F"))
-        return ca.DM(np.concatenate(parts))
+        x = self.start
+        weights = [term.weights(x, robust=False) for term in self.terms] if weighted else None
+        return self.jacobian(x, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +152,7 @@ class IpoptSolution:
     """A converged least-squares problem."""
 
     x: Array  # (n,)
-    residuals: Array  # (m,), weighted
-    jacobian: csc_array[np.float64]  # (m, n), the same
+    jacobian: csc_array[np.float64]  # (m, n), weighted
 
     def covariances(self, columns: IntArray) -> Array:
         """Return covariances (n, k, k) of groups of unknowns (n, k) that share no residual.
@@ -179,6 +173,33 @@ def solve_least_squares(problem: LeastSquares, *, weighted: bool = False) -> Ipo
     """
     with held_back_signals():  # CasADi swallows exceptions in its conversions
         return _solved(problem, weighted=weighted)
+
+
+def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
+    """Return :func:`solve_least_squares`."""
+    x, weights = problem.start, [term.unit_weights for term in problem.terms]
+    solver = _solver(problem)
+    for k in range(_REWEIGHTINGS if weighted else 1):
+        if weighted:
+            before = weights
+            weights = [term.weights(x, robust=k > 0) for term in problem.terms]
+            if k > 0 and _change(weights, before) < _CONVERGED:
+                break
+        scale = _column_scale(problem.jacobian(x, weights))
+        if problem.exact_hessian and not weighted:  # some columns of J may vanish
+            scale = np.full_like(scale, scale.min())
+        entries = [np.swapaxes(W, 1, 2).ravel() for W in weights if W is not None]
+        step = solver(x0=np.zeros(len(x)), p=np.concatenate([x, scale, *entries]))["x"]
+        stats = solver.stats()
+        if not stats["success"]:
+            raise DidNotConverge(
+                f"{problem.name} could not be computed: IPOPT stopped after "
+                f"{stats['iter_count']} iterations with {stats['return_status']}, needed "
+                "Solve_Succeeded or Solved_To_Acceptable_Level; check the nominal model and the "
+                "observations, or reject the ones with large residuals."
+            )
+        x = x + scale * step.full().ravel()
+    return IpoptSolution(x, problem.jacobian(x, weights))
 
 
 def undetermined(jacobian: csc_array[np.float64]) -> BoolArray:
@@ -251,183 +272,88 @@ def _side_by_side(values: Array) -> Array:
     return np.swapaxes(values, 0, 1).reshape(values.shape[1], -1)
 
 
-def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
-    """Return :func:`solve_least_squares`; it ends early if a signal waits."""
-    compiled, observed = _compiled(problem._structure()), problem._observed()
-    x = problem.start
-    weights = [term.unit_weights for term in problem.terms]
-    for k in range(_REWEIGHTINGS if weighted else 1):
-        if weighted:
-            residuals = None if k == 0 else _dense(compiled.residuals(x, observed))
-            before, weights = weights, problem._weights(x, residuals)
-            if k > 0 and _change(weights, before) < _CONVERGED:
-                break
-        W = _matrix(weights)
-        jacobian = csc_array(W @ _sparse(compiled.jacobian(x, observed)))
-        scale = _column_scale(jacobian)
-        if problem.exact_hessian and not weighted:  # some columns of J may vanish
-            scale = np.full_like(scale, scale.min())
-        parameters = ca.vertcat(_entries(weights), ca.DM(x), ca.DM(scale), observed)
-        z, stats = _minimum(compiled, 0.0 * scale, parameters)
-        if not stats["success"]:
-            raise DidNotConverge(
-                f"{problem.name} could not be computed: IPOPT stopped after "
-                f"{stats['iter_count']} iterations with {stats['return_status']}, needed "
-                "Solve_Succeeded or Solved_To_Acceptable_Level; check the nominal model and the "
-                "observations, or reject the ones with large residuals."
-            )
-        x = x + scale * z
-    return IpoptSolution(
-        x=x,
-        residuals=np.asarray(W @ _dense(compiled.residuals(x, observed))),
-        jacobian=csc_array(W @ _sparse(compiled.jacobian(x, observed))),
+def _solver(problem: LeastSquares) -> ca.Function:
+    """Return IPOPT for z, the unknowns x + scale z; its parameters are x, scale and weights."""
+    n = len(problem.start)
+    sizes = [term.n_rows**2 * len(term) * (term.covariance is not None) for term in problem.terms]
+    z, p = ca.MX.sym("z", n), ca.MX.sym("p", 2 * n + sum(sizes))
+    x, scale, *weights = ca.vertsplit(p, np.cumsum([0, n, n, *sizes]).tolist())
+    unknowns = ca.vertcat(x + scale * z, 0.0)
+    cost, slopes, curves = ca.MX(0), [ca.MX(0, 1)], [ca.MX(0, 1)]
+    places, rows, columns = [_NONE], [_NONE], [_NONE]
+    for term, W in zip(problem.terms, weights, strict=True):
+        if not len(term):
+            continue
+        place = np.where(term.index < 0, n, term.index)
+        local = ca.reshape(unknowns[place.ravel().tolist()], place.shape[1], len(term))
+        values: list[ca.MX | Array] = [*map(_side_by_side, term.observed)]
+        if W.size1():
+            values.insert(0, ca.reshape(W, term.n_rows, term.n_rows * len(term)))
+        functions = _half_square(term.function, W.size1() > 0, problem.exact_hessian)
+        (value, slope), curve = (part.map(len(term))(local, *values) for part in functions)
+        cost += ca.sum2(value)
+        slopes.append(ca.vec(slope))
+        curves.append(ca.vec(curve))
+        places.append(place.ravel())
+        row, column = np.broadcast_arrays(place[:, None], place[:, :, None])
+        rows.append(row.ravel())
+        columns.append(column.ravel())
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    upper, entry = np.unique(
+        np.where((row <= column) & (column < n), column * n + row, n * n), return_inverse=True
     )
+    upper = upper[upper < n * n]
+    first = np.searchsorted(upper // n, np.arange(n + 1)).tolist()
+    pattern = ca.Sparsity(n, n, first, (upper % n).tolist())
+    curvature = _summed(entry.ravel(), len(upper), curves)
+    curvature *= scale[(upper % n).tolist()] * scale[(upper // n).tolist()]
+    gradient = scale * _summed(np.concatenate(places), n, slopes)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
+    options = _OPTIONS | {
+        "grad_f": ca.Function(
+            "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]
+        ),
+        "hess_lag": ca.Function(
+            "nlp_hess_l",
+            [z, p, lam_f, lam_g],
+            [lam_f * ca.MX(pattern, curvature)],
+            ["x", "p", "lam_f", "lam_g"],
+            ["triu_hess_gamma_x_x"],
+        ),
+    }
+    return ca.nlpsol("solver", "ipopt", {"x": z, "p": p, "f": cost}, options)
 
 
-def _minimum(compiled: _Compiled, z: Array, parameters: ca.DM) -> tuple[Array, dict[str, Any]]:
-    """Return the solution of IPOPT and its statistics; raise KeyboardInterrupt after a signal.
+def _summed(place: IntArray, n: int, entries: Sequence[ca.MX]) -> ca.MX:
+    """Return sums (n,) of entries by their places; those of a place n are dropped."""
+    kept = np.flatnonzero(place < n)
+    pattern = ca.Sparsity.triplet(n, len(place), place[kept].tolist(), kept.tolist())
+    return ca.densify(ca.mtimes(ca.DM(pattern, 1.0), ca.vertcat(*entries)))
 
-    No exception passes through IPOPT. An exception of a signal handler while CasADi checks for
-    signals ends it with a status of no other cause here: failed evaluations have other ones.
-    """
-    compiled.watch.is_stopped = False
-    solution = compiled.solver(x0=z, p=parameters)
-    stats = compiled.solver.stats()
-    if compiled.watch.is_stopped or stats["return_status"] in _INTERRUPTED:
-        raise KeyboardInterrupt
-    return _dense(solution["x"]), stats
+
+@lru_cache(maxsize=64)
+def _half_square(
+    function: ca.Function, has_weights: bool, exact: bool
+) -> tuple[ca.Function, ca.Function]:
+    """Return (local, W, *observed) -> half the squared residuals and gradient; Hessian, or J'J."""
+    inputs = [ca.SX.sym(f"i{k}", *function.size_in(k)) for k in range(function.n_in())]
+    local, error, *observed = inputs
+    residuals = ca.substitute(function(*inputs), error, ca.SX.zeros(*error.shape))
+    W = ca.SX.sym("W", *[residuals.size1()] * 2)
+    weighted = W @ residuals if has_weights else residuals
+    value, J = 0.5 * ca.sumsqr(weighted), ca.jacobian(weighted, local)
+    hessian = ca.hessian(value, local)[0] if exact else J.T @ J
+    inputs = [local, *([W] if has_weights else []), *observed]
+    return (
+        ca.Function("half_square", inputs, [value, ca.densify(J.T @ weighted)]),
+        ca.Function("curvature", inputs, [ca.densify(hessian)]),
+    )
 
 
 def _cauchy(chi: Array) -> Array:
     """Return the square roots (n,) of Cauchy's weights of residuals of size chi (n,)."""
     limit = max(_OUTLIER * float(np.median(chi)), _MIN_THRESHOLD)
     return np.asarray(1.0 / np.sqrt(1.0 + (chi / limit) ** 2))
-
-
-# Compiled problems
-
-
-# Function, whether its weights are all one, shape and bytes of the index, and shapes of the values
-# of one observation
-_TermKey = tuple[ca.Function, bool, tuple[int, ...], bytes, tuple[tuple[int, ...], ...]]
-_Structure = tuple[int, tuple[_TermKey, ...], bool]  # unknowns, terms, exact Hessian
-
-
-class _Compiled(NamedTuple):
-    """The functions of a structure."""
-
-    solver: ca.Function  # parameters: weights, start, scale, observed
-    residuals: ca.Function  # (x, observed) -> (m,)
-    jacobian: ca.Function  # (x, observed) -> sparse (m, n)
-    watch: _Watch  # of the solver
-
-
-class _Watch(ca.Callback):
-    """Called by IPOPT in every iteration: stops it when a signal waits."""
-
-    def __init__(self, n_unknowns: int) -> None:
-        super().__init__()
-        self.is_stopped = False
-        self._sizes = {"x": n_unknowns, "lam_x": n_unknowns, "f": 1}
-        self.construct("watch")
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        size = self._sizes.get(ca.nlpsol_out(i))
-        return ca.Sparsity(0, 0) if size is None else ca.Sparsity.dense(size)
-
-    def eval(self, _found: Sequence[ca.DM]) -> list[int]:
-        """Return 1 to stop."""
-        try:
-            self.is_stopped = self.is_stopped or is_waiting()
-        except KeyboardInterrupt:  # from the signal handler of Python, which runs here
-            self.is_stopped = True
-        return [int(self.is_stopped)]
-
-
-@lru_cache(maxsize=_CACHE_SIZE)
-def _compiled(structure: _Structure) -> _Compiled:
-    """Return the functions of a structure, the solver in scaled unknowns."""
-    n, terms, exact_hessian = structure
-    residuals, jacobian = _residuals_and_jacobian(n, terms)
-    blocks = list[ca.Sparsity]()
-    for function, is_plain, (n_of_term, _), _, _ in terms:
-        r = function.size1_out(0)
-        block = ca.Sparsity.diag(n_of_term * r) if is_plain else ca.Sparsity.dense(r, r)
-        blocks += [block] * (1 if is_plain else n_of_term)
-    pattern = ca.diagcat(*blocks)
-    n_weights = pattern.nnz()
-    z, p = ca.MX.sym("z", n), ca.MX.sym("p", n_weights + 2 * n + residuals.size1_in(1))
-    weights, start, scale, observed = ca.vertsplit(
-        p, [0, n_weights, n_weights + n, n_weights + 2 * n, p.size1()]
-    )
-    W = ca.MX(pattern, weights)
-    x = start + scale * z
-    weighted = ca.mtimes(W, residuals(x, observed))
-    slope = ca.mtimes(W, jacobian(x, observed)) @ ca.diag(scale)
-    cost = 0.5 * ca.sumsqr(weighted)
-    gradient = ca.densify(ca.mtimes(slope.T, weighted))  # IPOPT reads it as full
-    options: dict[str, Any] = dict(_OPTIONS)
-    options["grad_f"] = ca.Function(
-        "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]
-    )
-    if not exact_hessian:
-        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
-        options["hess_lag"] = ca.Function(
-            "nlp_hess_l",
-            [z, p, lam_f, lam_g],
-            [lam_f * ca.triu(ca.mtimes(slope.T, slope))],
-            ["x", "p", "lam_f", "lam_g"],
-            ["triu_hess_gamma_x_x"],
-        )
-    watch = _Watch(n)
-    options["iteration_callback"] = watch
-    nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
-    return _Compiled(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian, watch)
-
-
-def _residuals_and_jacobian(
-    n_unknowns: int, terms: Sequence[_TermKey]
-) -> tuple[ca.Function, ca.Function]:
-    """Return (x, observed) -> residuals of all terms, and their sparse derivative by x."""
-    n_observed = sum(shape[0] * a * b for *_, shape, _, sizes in terms for a, b in sizes)
-    x, all_observed = ca.MX.sym("x", n_unknowns), ca.MX.sym("observed", n_observed)
-    residuals, values = [ca.MX(0, 1)], [ca.MX(0, 1)]
-    rows, columns = [_NONE], [_NONE]
-    n_before = place = 0
-    for function, _, (n, n_local), content, sizes in terms:
-        observed = []
-        for a, b in sizes:
-            size = n * a * b
-            observed.append(ca.reshape(all_observed[place : place + size], a, n * b))
-            place += size
-        index = np.frombuffer(content, dtype=np.int64).reshape(n, n_local)
-        padded = np.where(index >= 0, index, n_unknowns).ravel().tolist()
-        local = ca.reshape(ca.vertcat(x, 0.0)[padded], n_local, n)
-        arguments = local, ca.MX.zeros(function.size1_in(1), n), *observed
-        residuals.append(ca.vec(function.map(n)(*arguments)))
-        values.append(ca.vec(_derivative(function, 0).map(n)(*arguments)))
-        # CasADi stores columns: of one observation all residuals by its first unknown come first.
-        n_rows = int(function.size1_out(0))
-        of_observation = n_before + np.arange(n * n_rows).reshape(n, 1, n_rows)
-        rows.append(np.repeat(of_observation, n_local, axis=1).ravel())
-        columns.append(np.repeat(index.ravel(), n_rows))
-        n_before += n * n_rows
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    order = np.lexsort((row, column))
-    order = order[column[order] >= 0]
-    first = np.searchsorted(column[order], np.arange(n_unknowns + 1))
-    pattern = ca.Sparsity(n_before, n_unknowns, first.tolist(), row[order].tolist())
-    jacobian = ca.MX(pattern, ca.vertcat(*values)[order.tolist()])
-    return (
-        ca.Function("residuals", [x, all_observed], [ca.vertcat(*residuals)]),
-        ca.Function("jacobian", [x, all_observed], [jacobian]),
-    )
 
 
 @lru_cache(maxsize=64)
@@ -438,46 +364,15 @@ def _derivative(function: ca.Function, input_index: int) -> ca.Function:
     return ca.Function("derivative", inputs, [jacobian])
 
 
-def _matrix(weights: Sequence[Array]) -> csc_array[np.float64]:
-    """Return the weights of all terms as one matrix of blocks."""
-    entries, rows, columns, first = [np.zeros(0)], [_NONE], [_NONE], 0
-    for W in weights:
-        n, r = W.shape[:2]
-        place = first + np.arange(n * r).reshape(n, r)
-        entries.append(W.ravel())
-        rows.append((place if W.ndim == 2 else np.repeat(place, r, axis=1)).ravel())
-        columns.append((place if W.ndim == 2 else np.tile(place, (1, r))).ravel())
-        first += n * r
-    indices = np.concatenate(rows), np.concatenate(columns)
-    return csc_array((np.concatenate(entries), indices), shape=(first, first))
-
-
-def _entries(weights: Sequence[Array]) -> ca.DM:
-    """Return the weights of all terms as CasADi stores their matrix: column by column."""
-    return ca.DM(np.concatenate([np.swapaxes(W, 1, W.ndim - 1).ravel() for W in weights]))
-
-
-def _change(weights: Sequence[Array], before: Sequence[Array]) -> float:
+def _change(weights: Weights, before: Weights) -> float:
     """Return the largest relative change of a weight."""
-    return max(
-        (
-            float(np.max(np.linalg.norm(W - V, axis=(1, 2)) / np.linalg.norm(V, axis=(1, 2))))
-            for W, V in zip(weights, before, strict=True)
-            if V.ndim == 3  # others depend on nothing
-        ),
-        default=0.0,
-    )
-
-
-def _dense(column: ca.DM) -> Array:
-    """Return a CasADi column as an array."""
-    return np.asarray(column.full()).ravel()
-
-
-def _sparse(matrix: ca.DM) -> csc_array[np.float64]:
-    """Return a CasADi matrix as a sparse array."""
-    first, row = matrix.sparsity().get_ccs()
-    return csc_array((np.array(matrix.nonzeros()), row, first), shape=matrix.shape)
+    pairs = [
+        (W, V) for W, V in zip(weights, before, strict=True) if W is not None and V is not None
+    ]
+    changes = [
+        np.linalg.norm(W - V, axis=(1, 2)) / np.linalg.norm(V, axis=(1, 2)) for W, V in pairs
+    ]
+    return max((float(change.max()) for change in changes), default=0.0)
 
 
 def _column_scale(jacobian: csc_array[np.float64]) -> Array:

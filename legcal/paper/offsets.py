@@ -28,9 +28,7 @@ from legcal.paper.least_squares import (
     solve_least_squares,
     undetermined,
 )
-from legcal.paper.nominal import NominalMachine
-from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal
+from legcal.paper.unknowns import NominalMachine, Unknowns, hold_at_nominal, left_near_nominal
 
 _APART = 1e-3  # [mean leg lengths] minimum distance of separate platform joints
 
@@ -42,13 +40,12 @@ class LegDirections:
     group: IntArray  # (n,): index of the pose and view of each leg
     view: IntArray  # (n,)
     leg: IntArray  # (n,)
-    A: Array  # (n, 3): base joint centres in the frame of the group [m], at the readings
-    of_A: Array  # (n, 3, 3): covariances of A [m^2]; zero where actuators move A
+    A: Array  # (n, 3): base joint centres in the frame of the group [m]
+    of_A: Array  # (n, 3, 3): covariances of A [m^2]
     u: Array  # (n, 3): unit directions from base to platform
     basis: Array  # (n, 2, 3): e1, e2 normal to u
     reading: Array  # (n,) sign * q [m], length less offset; zero if constant, NaN if passive
     covariance: Array  # (n, 3, 3) of u along e1 and e2 [rad^2], and of the reading [m^2]
-    turn: Array  # (n, 3, 3): rotation of the carriage or arm in R_b
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -83,27 +80,22 @@ def leg_directions(
     u = total / np.linalg.norm(total, axis=1, keepdims=True)
     v, k, j = distinct.T
     q = measurements.q[axes.row[first], j]
-    basis, turn = normal_basis(u), np.tile(np.eye(3), (len(j), 1, 1))
+    basis = normal_basis(u)
     onto = basis @ np.swapaxes(axes.basis[first], 1, 2)
     covariance = np.zeros((len(j), 3, 3))
     of_u = axes.covariance[first, :2, :2] / count[:, None, None]
     covariance[:, :2, :2] = onto @ of_u @ np.swapaxes(onto, 1, 2)
     covariance[:, 2, 2] = measurements.sigma_q**2
-    of_A = joints.covariance[v, j, :3, :3]
-    for leg, actuator in machine.actuators.items():
-        of_A[j == leg] = 0.0
-        turn[j == leg] = actuator.rotations(q[j == leg])
     return LegDirections(
         group=v * measurements.n_poses + k,
         view=v,
         leg=j,
-        A=joints.A_at(v, j, q),
-        of_A=of_A,
+        A=joints.A[v, j],
+        of_A=joints.covariance[v, j, :3, :3],
         u=u,
         basis=basis,
         reading=machine.sign[j] * np.where(machine.constant[j], 0.0, q),
         covariance=covariance,
-        turn=turn,
     )
 
 

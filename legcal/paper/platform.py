@@ -24,14 +24,16 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
 from legcal.machine.parameters import tied_twist, twist_after
 from legcal.paper.equations import (
+    angles_of,
+    axis_frames,
     closure_of_leg,
     distance_of_ends,
     end_of_leg,
     end_on_axis,
     end_on_ray,
     mean_distance,
+    stepped_poses,
 )
-from legcal.paper.gibbs import angles_of, axis_frames, stepped_poses
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import AcrossAxes
 from legcal.paper.least_squares import (
@@ -41,11 +43,15 @@ from legcal.paper.least_squares import (
     evaluated,
     solve_least_squares,
 )
-from legcal.paper.nominal import NominalMachine
 from legcal.paper.offsets import LegDirections, pairs_of_legs
 from legcal.paper.platform_pose import PlatformPoses, across_rays, locate_platform
-from legcal.paper.unknowns import Unknowns
-from legcal.paper.weak_directions import hold_at_nominal, left_near_nominal, with_prior
+from legcal.paper.unknowns import (
+    NominalMachine,
+    Unknowns,
+    hold_at_nominal,
+    left_near_nominal,
+    with_prior,
+)
 
 _APART = 1e-3  # [mean leg lengths] minimum distance of separate joints
 _SAME_DIRECTION = 1e-9  # minimum eigenvalue of the normalised information of different directions
@@ -79,7 +85,7 @@ def locate_platform_joints(
         for name, leg in zip(machine.leg_names, legs, strict=True)
         if leg.kind is LegKind.PASSIVE or leg.platform_axis is not None or leg.twist is not None
     ]
-    on_rays = weighted and machine.spatial and not machine.actuators
+    on_rays = weighted and machine.spatial
     if not unposed and not on_rays:
         left = left_near_nominal("Step 4 (16)", machine, unknowns, held)
         return replace(machine, legs=legs), left
@@ -410,7 +416,7 @@ def _build_closure(
             directions.u[rows],
             directions.basis[rows],
             seen_legs.poses.R[seen_legs.poses.pose[rows]],
-            directions.turn[rows] @ base,
+            base,
             platform,
             np.array([float(legs[j].twist or 0.0) for j in leg]),
             np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),

@@ -24,8 +24,7 @@ import numpy as np
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.motions import register_groups, register_in_plane
 from legcal.geometry.types import Array, IntArray
-from legcal.paper.equations import point_on_ray
-from legcal.paper.gibbs import stepped_poses
+from legcal.paper.equations import point_on_ray, stepped_poses
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 
 _FLAT = 1e-3  # maximum deviation of collinear points, relative to their distance from the centre

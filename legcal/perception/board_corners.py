@@ -44,32 +44,18 @@ _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """The corners of a board in an image.
+    """The corners of a board in an image."""
 
-    Attributes
-    ----------
-    kind : str
-        Of the board.
-    ij : (k, 2) array of int
-        Columns and rows of the corners: those of the board, but of a chessboard from the first
-        that is seen.
-    px, sigma_px : (k, 2) and (k,) array
-        Where they are, and the standard deviation of either coordinate [px].
-    black : (k,) array of int
-        1 where the square at greater column and row is black, else -1.
-    tags : (m,) array of int
-        Numbers of markers or tags of the dictionary, also those that are not on the board.
-    tags_px : (m, 2) array
-        Their middles [px].
-    """
-
-    kind: str
+    kind: str  # of the board
+    # (k, 2) columns and rows of the corners: those of the board, but of a chessboard from the first
+    # that is seen
     ij: IntArray
-    px: Array
-    sigma_px: Array
-    black: IntArray
+    px: Array  # (k, 2) where they are [px]
+    sigma_px: Array  # (k,) standard deviation of either coordinate [px]
+    black: IntArray  # (k,) 1 where the square at greater column and row is black, else -1
+    # (m,) numbers of markers or tags of the dictionary, also those that are not on the board
     tags: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    tags_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    tags_px: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (m, 2) their middles [px]
 
     @property
     def extent(self) -> tuple[int, int]:

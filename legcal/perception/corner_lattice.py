@@ -34,21 +34,11 @@ _STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], dtype=np.intp)
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Crossings that hang together.
+    """Crossings that hang together."""
 
-    Attributes
-    ----------
-    ij : (k, 2) array of int
-        Their columns and rows; the first ones are 0.
-    px : (k, 2) array
-        Where they are [px]; x, y and the line of sight are right-handed.
-    black : (k,) array of int
-        1 where the square at greater column and row is black, else -1.
-    """
-
-    ij: IntArray
-    px: Array
-    black: IntArray
+    ij: IntArray  # (k, 2) their columns and rows; the first ones are 0
+    px: Array  # (k, 2) where they are [px]; x, y and the line of sight are right-handed
+    black: IntArray  # (k,) 1 where the square at greater column and row is black, else -1
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -247,23 +237,13 @@ _MAX_ROUNDS = 40  # of corners beside those that are known
 
 @dataclass(frozen=True, eq=False)
 class Print:
-    """Lattice of corners of a board, by columns and rows.
+    """Lattice of corners of a board, by columns and rows."""
 
-    Attributes
-    ----------
-    x, y : array or None
-        Coordinates of columns and rows; None where they are whole numbers, and go on.
-    length, band : float
-        How far edges through a corner are straight, and free of other print beside.
-    pitch : float
-        The longest step from a corner to the next.
-    """
-
-    x: Array | None
-    y: Array | None
-    length: float
-    band: float
-    pitch: float
+    x: Array | None  # coordinates of columns; None where they are whole numbers, and go on
+    y: Array | None  # coordinates of rows, the same
+    length: float  # how far edges through a corner are straight
+    band: float  # how far beside them nothing else is printed
+    pitch: float  # the longest step from a corner to the next
 
     def xy(self, ij: IntArray) -> Array:
         """Return the places of corners on the board (k, 2)."""

@@ -5,16 +5,12 @@ In: a mechanism, a camera, and the noise of outlines; the information of images 
 session. :func:`plan` checks the request, ``planner`` is the method from top to bottom. The paper
 names it as future work: "a better selection of the end-effector poses".
 
-==================== ===================================================================
-``request``          options and their checks; the fewest images for a target error
-``planner``          poses, places and images: selection, exchange, local search, evaluation
-``poses``            poses within reach for all machines within tolerance
-``places``           camera places, and tolerances of tripods
-``exchange``         greedy selection and exchanges by low-rank updates of the covariance
-``goals``            criteria to minimise
-``order``            order of poses and paths between them
-``laid_board``       place of a board, and images that show it
-``planned_session``  the plan and its document
-``session``          the folder of a planned session
-==================== ===================================================================
+============ ===========================================================================
+``request``  options and their checks; the fewest images for a target error
+``planner``  poses, places and images: selection, exchange, local search, evaluation
+``poses``    poses within reach for all machines within tolerance; their order
+``places``   camera places, tolerances of tripods, place of a board
+``exchange`` greedy selection and exchanges by low-rank updates of the covariance
+``session``  the plan, its document, the folder of a planned session
+============ ===========================================================================
 """

@@ -28,23 +28,37 @@ from legcal.machine.configurations import Configurations
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.planning.exchange import Chosen, Criterion, Session, choose, exchange
-from legcal.planning.goals import Workspace, criterion_of, workspace_of
-from legcal.planning.laid_board import LaidBoard, lying
-from legcal.planning.order import shortest_order, ways
+from legcal.planning.exchange import (
+    Chosen,
+    Criterion,
+    Session,
+    Workspace,
+    choose,
+    criterion_of,
+    exchange,
+    workspace_of,
+)
 from legcal.planning.places import (
+    LaidBoard,
     Place,
     Setting,
     all_points,
+    lying,
     near,
     places_around,
 )
-from legcal.planning.planned_session import Plan, PlannedView, pose_labels
-from legcal.planning.poses import candidate_poses, drawn_legs, poses_near, some_of
+from legcal.planning.poses import (
+    candidate_poses,
+    drawn_legs,
+    poses_near,
+    shortest_order,
+    some_of,
+    ways,
+)
+from legcal.planning.session import Plan, PlannedView, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
 from legcal.vision.sight import Bodies, Seen, visible_parts
-from legcal.vision.visibility import in_picture, least_length
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
@@ -331,59 +345,29 @@ def _visible_places(
     if not visible or (scene.task.places and len(visible) < n_needed):
         used = {id(place) for place, _ in visible}
         blind = [place for place in places if id(place) not in used]
-        raise NotVisible(_no_visible_places(scene, blind, len(places), n_needed, in_Rb))
+        raise NotVisible(_no_visible_places(scene.task, blind, len(places), n_needed))
     return visible
 
 
-_REMEDIES = {
-    "elsewhere": "point {} at the machine, or move further away",
-    "near": "move {} further away, or use a camera with a wider view",
-    "far": "move {} nearer, or use a camera with a longer focal length or more pixels",
-    "hidden": "move {} to where no plate or other leg is in front of the legs",
-    "board": "move {} so that the whole board is in the image, or use a smaller one",
-    "small": "use a board with larger squares, or a camera with a longer focal length or more "
-    "pixels",
-}
-
-
-def _no_visible_places(
-    scene: Scene,
-    blind: Sequence[Place],
-    n_places: int,
-    needed: int,
-    poses: Sequence[RigidTransform],
-) -> str:
-    """Describe that too few places see legs, with the remedy for the most frequent cause."""
-    setting = scene.task.setting
-    board = "" if scene.task.board is None else " and the board"
-    causes = [_cause_of_invisibility(scene, place.T_base_camera, poses) for place in blind]
-    remedy = _REMEDIES[max(_REMEDIES, key=causes.count)]
-    names = ", ".join(place.name for place in blind if place.name)
-    return (
-        f"{scene.task.machine.yaml_path}: no session could be planned: only "
-        f"{n_places - len(blind)} of {n_places} camera positions see legs{board} with the tripod "
-        f"tolerance of {1e2 * setting.shift:.2g} cm and {np.degrees(setting.turn):g} deg; {needed} "
-        f"{'are' if needed > 1 else 'is'} needed; {remedy.format(names or 'the cameras')}."
+def _no_visible_places(task: Task, blind: Sequence[Place], n_places: int, needed: int) -> str:
+    """Describe that too few places see legs, and the board."""
+    names = ", ".join(place.name for place in blind if place.name) or "the cameras"
+    remedy = (
+        f"point {names} at the machine, from where no plate or other leg hides the legs, near "
+        "enough for 30 px of a leg and far enough for the tolerance"
     )
-
-
-def _cause_of_invisibility(scene: Scene, T: RigidTransform, poses: Sequence[RigidTransform]) -> str:
-    """Cause why a camera sees no legs, or no board, at poses T_Rb_Re: a key of the remedies."""
-    camera = scene.task.predictor.camera
-    if len(scene.seen(T, poses, surely=True).leg):  # the board alone is missing
-        is_in_view = scene.board_is_shown(T, poses, surely=True, is_read=False).any()
-        return "small" if is_in_view else "board"
-    bodies = scene.bodies(poses).before(T)
-    points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
-    if not in_picture(camera, points, bodies.nearest).any():
-        return "elsewhere"
-    nearest = float(points[:, 2].min())
-    if nearest > bodies.nearest:
-        stretch = camera.project(bodies.A) - camera.project(bodies.B)
-        if np.linalg.norm(stretch, axis=-1).max() < least_length(0.0):
-            return "far"
-    margin = scene.task.setting.margin(camera, max(nearest, bodies.nearest))
-    return "hidden" if in_picture(camera, points, bodies.nearest, margin).all() else "near"
+    if task.board is not None:
+        remedy = (
+            "use a board with larger squares, or a smaller one that is whole in the image from "
+            f"{names}"
+        )
+    return (
+        f"{task.machine.yaml_path}: no session could be planned: only {n_places - len(blind)} of "
+        f"{n_places} camera positions see legs{' and the board' * (task.board is not None)} with "
+        f"the tripod tolerance of {1e2 * task.setting.shift:.2g} cm and "
+        f"{np.degrees(task.setting.turn):g} deg; {needed} {'are' if needed > 1 else 'is'} needed; "
+        f"{remedy}."
+    )
 
 
 def choose_places(

@@ -28,8 +28,8 @@ from legcal.planning.places import (
     Setting,
     default_setting,
 )
-from legcal.planning.planned_session import Plan
 from legcal.planning.planner import Candidates, Task, plan_session
+from legcal.planning.session import Plan
 from legcal.progress import Progress, Report, shown_progress
 from legcal.vision.board import Board
 from legcal.vision.board_file import board_document, board_of, parse_board
@@ -132,17 +132,13 @@ def plan(
     _check_visible(machine)
     setting = default_setting(machine.size) if setting is None else setting
     listed = tuple(replace(place, fixed=True) for place in places)
-    n_views = _n_views(cameras, len(listed), hand_held=hand_held)
-    n_images = _n_images(images, images_per_view, n_views, target)
-    _check(target, bounds, listed, board, hand_held, setting, seed, machine.size)
-    given_dataset = (
-        given if isinstance(given, Dataset) or given is None else _load_given(Path(given))
+    n_images, n_views = _counts(
+        images, images_per_view, cameras, target, len(listed), hand_held=hand_held
     )
-    given_views = () if given_dataset is None else _given_candidates(machine, given_dataset)
+    _check(target, bounds, listed, board, hand_held, setting, seed, machine.size)
+    shot = given if isinstance(given, Dataset | None) else load_dataset(given, check_images=False)
     if camera is None:
-        selected_camera = (
-            sample_camera() if given_dataset is None else given_dataset.measurements.views[0].camera
-        )
+        selected_camera = sample_camera() if shot is None else shot.measurements.views[0].camera
     else:
         selected_camera = camera if isinstance(camera, Camera) else read_camera(Path(camera))
     usual_q = SIGMA_READING * machine.size
@@ -151,9 +147,9 @@ def plan(
         sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
         sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]
         sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=usual_q)
-    elif given_dataset is not None:
-        sigma_q = given_dataset.measurements.sigma_q
-        sigma_by_joint = dict(given_dataset.measurements.sigma_by_joint)
+    elif shot is not None:
+        sigma_q = shot.measurements.sigma_q
+        sigma_by_joint = dict(shot.measurements.sigma_by_joint)
     predicted_noise = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
     lengths, scale_notes = _measured_length(machine, board=board is not None)
     task = Task(
@@ -163,8 +159,8 @@ def plan(
         setting,
         bounds,
         listed,
-        given_views,
-        "" if given_dataset is None else str(given_dataset.folder),
+        () if shot is None else _given_candidates(machine, shot),
+        "" if shot is None else str(shot.folder),
         None if board is None else _load_board(board),
         hand_held,
         seed,
@@ -175,9 +171,7 @@ def plan(
             result = plan_session(task, report, stop, run)
         else:
             result = _plan_for_target(task, target, report, stop, run)
-        return replace(
-            result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(given_dataset))
-        )
+        return replace(result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(shot)))
 
 
 def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
@@ -265,47 +259,47 @@ def _unreachable_target(task: Task, planned: Plan, target: float) -> str:
     )
 
 
-def _n_views(cameras: int | None, n_places: int, *, hand_held: bool) -> int:
-    """Return the checked number of camera places."""
-    n = min(3, n_places) if cameras is None and n_places else (cameras or 3)
-    n = _checked_number("--cameras", n if cameras is None else cameras, 1, MOST_VIEWS)
-    if n_places and n > n_places:
+def _counts(
+    images: int | None,
+    per_view: int | None,
+    cameras: int | None,
+    target: float | None,
+    n_places: int,
+    *,
+    hand_held: bool,
+) -> tuple[int, int]:
+    """Return the checked numbers of photographs of the session and of camera places."""
+    numbers = {"--images": images, "--images-per-view": per_view, "--target": target}
+    given = [name for name, number in numbers.items() if number is not None]
+    if len(given) > 1:
         raise UsageError(
-            f"The plan could not be made: found {n_places} place{'s' * (n_places != 1)} for {n} "
-            "cameras, needed one for each; add places or give fewer --cameras."
+            f"{' and '.join(given)} cannot be combined, each says how many photographs there are; "
+            "leave out all but one."
+        )
+    usual = min(3, n_places) if n_places else 3
+    n_views = _checked_number("--cameras", usual if cameras is None else cameras, 1, MOST_VIEWS)
+    if n_places and n_views > n_places:
+        raise UsageError(
+            f"The plan could not be made: found {n_places} place{'s' * (n_places != 1)} for "
+            f"{n_views} cameras, needed one for each; add places or give fewer --cameras."
         )
     if hand_held and cameras is not None and cameras > 1:
         raise UsageError(
             f"--hand-held and --cameras {cameras} cannot be combined: a hand-held camera has a new "
             "pose for every image; leave out --cameras."
         )
-    return 1 if hand_held else n
-
-
-def _n_images(images: int | None, per_view: int | None, n_views: int, target: float | None) -> int:
-    """Return the checked number of photographs of the session."""
-    if images is not None and per_view is not None:
-        raise UsageError(
-            f"--images {images} and --images-per-view {per_view} cannot be combined; leave out one "
-            "of them."
-        )
-    if target is not None and (images is not None or per_view is not None):
-        raise UsageError(
-            "--target and a number of images cannot be combined; leave out --target, or the number."
-        )
+    n_views = 1 if hand_held else n_views
     if per_view is not None:
-        return n_views * _checked_number("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
-    n = (
-        3 * IMAGES_PER_VIEW
-        if images is None
-        else _checked_number("--images", images, 1, MOST_IMAGES)
-    )
-    if n < n_views:
+        each = _checked_number("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
+        return n_views * each, n_views
+    usual = 3 * IMAGES_PER_VIEW
+    n_images = _checked_number("--images", usual if images is None else images, 1, MOST_IMAGES)
+    if n_images < n_views:
         raise UsageError(
-            f"The plan could not be made: found {n} images for {n_views} cameras, needed one for "
-            f"each at least; give {n_views} --images or more, or fewer --cameras."
+            f"The plan could not be made: found {n_images} images for {n_views} cameras, needed "
+            f"one for each at least; give {n_views} --images or more, or fewer --cameras."
         )
-    return n
+    return n_images, n_views
 
 
 def _check_visible(machine: Machine) -> None:
@@ -381,11 +375,6 @@ def _load_board(board: str | Path | Board) -> Board:
     loaded = board_of(board)
     parse_board(board_document(loaded), Path("--board"))
     return loaded
-
-
-def _load_given(folder: Path) -> Dataset:
-    """Load a dataset without reading its images."""
-    return load_dataset(folder, check_images=False)
 
 
 def _notes_on_missing_images(shot: Dataset | None) -> tuple[str, ...]:

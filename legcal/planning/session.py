@@ -7,13 +7,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
+from pydantic import Field
+from scipy.spatial.transform import RigidTransform
 
+from legcal.brief import brief
+from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.calibration.joint_fit.platform import PlatformError
+from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
+from legcal.calibration.quantities import mm_deg
 from legcal.calibration.verdict import PLAN_NAME, POSES_NAME
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
@@ -25,17 +33,24 @@ from legcal.files.folder import (
     output_path,
     result_folder,
 )
-from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.motions import Pose, motion_to_xyz_quat
 from legcal.files.published import with_schema
 from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import Document, Number, Version
 from legcal.files.table import format_table
 from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.types import Array, BoolArray
+from legcal.machine.configurations import Configurations
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
-from legcal.planning.order import HOME
-from legcal.planning.planned_session import Plan
+from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, LaidBoard, Setting
+from legcal.planning.poses import HOME
+from legcal.version import __version__
 from legcal.vision.board_file import board_document
+from legcal.vision.camera import Camera
 from legcal.vision.camera_export import camera_info
+from legcal.vision.sight import Seen
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
 HAND = "hand"  # the view of a hand-held camera
@@ -69,8 +84,7 @@ def write_session(
         yaml_path, _ = write_model(plan.machine, folder)
         texts = {
             CAMERA: camera_info(plan.camera, "camera"),
-            DATASET_YAML: _dataset(plan, yaml_path.relative_to(folder).as_posix()),
-            MEASUREMENTS: _measurements(plan),
+            **_dataset(plan, yaml_path.relative_to(folder).as_posix()),
             POSES_NAME: _poses(plan),
             PLAN_NAME: json.dumps(plan.document(), indent=1, allow_nan=False) + "\n",
             **(pictures or {}),
@@ -97,32 +111,59 @@ def images_of(plan: Plan) -> list[tuple[str, str, str, int, int]]:
     return images
 
 
-def _dataset(plan: Plan, model: str) -> str:
-    """Return ``dataset.yaml``."""
+def _dataset(plan: Plan, model: str) -> dict[str, str]:
+    """Return ``dataset.yaml``, and ``measurements.csv`` with the planned readings."""
     views: dict[str, Any] = {}
     for view in plan.views:
-        entry: dict[str, Any] = {"camera": CAMERA}
-        if plan.hand_held:
-            views[HAND] = entry | {"hand_held": True}
-            continue
-        motion = motion_to_xyz_quat(view.T_base_camera)
-        entry["T_base_camera"] = {key: [round(x, 5) for x in motion[key]] for key in motion}
-        shown = np.asarray(view.shows.any(axis=0))
-        if not shown.all():
-            names = plan.machine.leg_names
-            entry["legs"] = [names[j] for j in np.flatnonzero(shown).tolist()]
+        shown = np.flatnonzero(view.shows.any(axis=0)).tolist()
+        legs = [plan.machine.leg_names[j] for j in shown]
+        entry = {"camera": CAMERA} | rough_view(view.T_base_camera, legs, plan.machine)
         views[view.name] = entry
-    document: dict[str, Any] = {
+    if plan.hand_held:
+        views = {HAND: {"camera": CAMERA, "hand_held": True}}
+    motors = list(plan.machine.motors)
+    rows = [
+        [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
+        for name, image, label, v, k in images_of(plan)
+    ]
+    board = {} if plan.board is None else {"board": board_document(plan.board.board)}
+    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), **board)
+
+
+def rough_view(
+    T_base_camera: RigidTransform | None, legs: Sequence[str] | None, machine: Machine
+) -> dict[str, Any]:
+    """Return the rough pose of a view, to five digits, and the legs that it shows, if not all."""
+    entry: dict[str, Any] = {}
+    if T_base_camera is not None:
+        motion = motion_to_xyz_quat(T_base_camera)
+        entry["T_base_camera"] = {key: [round(x, 5) for x in motion[key]] for key in motion}
+    if legs is not None and len(legs) < machine.n_legs:
+        entry["legs"] = list(legs)
+    return entry
+
+
+def dataset_texts(
+    machine: Machine,
+    model: str,  # path of its YAML in the dataset
+    views: Mapping[str, Any],
+    rows: Iterable[Sequence[Any]],  # view, image, pose, readings
+    encoder_sigma: float | dict[str, float],
+    **blocks: Any,
+) -> dict[str, str]:
+    """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
+    document = {
         "legcal_dataset": 1,
         "mechanism": model,
         "measurements": MEASUREMENTS,
-        "encoder_sigma": _encoder_sigma(plan),
-        "views": views,
+        "encoder_sigma": encoder_sigma,
+        "views": dict(views),
+        **blocks,
     }
-    if plan.board is not None:
-        document["board"] = board_document(plan.board.board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    return with_schema("dataset", text)
+    joints = [column.name for column in reading_columns(machine.legs)]
+    table = format_table(["view", "image", "pose", *joints], rows)
+    return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}
 
 
 def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
@@ -133,17 +174,6 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     if any(leg.reads_angle for leg in legs) or set(sigma_of_motor.values()) - {plan.sigma_q}:
         return sigma_of_motor
     return plan.sigma_q
-
-
-def _measurements(plan: Plan) -> str:
-    """Return ``measurements.csv`` with the planned readings, to be replaced by measured ones."""
-    motors = list(plan.machine.motors)
-    rows = [
-        [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
-        for name, image, label, v, k in images_of(plan)
-    ]
-    joints = [column.name for column in reading_columns(plan.machine.legs)]
-    return format_table(["view", "image", "pose", *joints], rows)
 
 
 def _poses(plan: Plan) -> str:
@@ -169,3 +199,246 @@ def _poses(plan: Plan) -> str:
     camera = [f"camera {x} [mm]" for x in "xyz"]
     header = ["view", "pose", "image", "on the way", *joints, *pose, *camera]
     return format_table(header, rows)
+
+
+# The plan
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedView:
+    """A camera place and the images to take from it."""
+
+    name: str
+    T_base_camera: RigidTransform
+    poses: Configurations  # in the order to take them
+    via: tuple[str, ...]  # intermediate pose before each: "" for none, home, or the 1-based number
+    # of an earlier pose of the session
+    seen: Seen  # of the nominal machine, from the nominal place
+
+    @property
+    def shows(self) -> BoolArray:
+        """Which legs each image shows, (n_images, n_legs)."""
+        return self.seen.visible_legs(len(self.poses.poses), self.poses.readings.shape[1])
+
+
+def pose_labels(n_images: int, n_given: int = 0) -> list[str]:
+    """Return labels of the poses of a session, in the order to take them.
+
+    Numbers continue those of the given session, since the same label means the same pose.
+    """
+    width = max(2, len(str(n_given + n_images)))
+    return [f"p{k + 1:0{width}d}" for k in range(n_given, n_given + n_images)]
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned session.
+
+    Attributes
+    ----------
+    machine : Machine
+        The nominal model.
+    camera : Camera
+        The camera.
+    views : tuple of PlannedView
+        Camera places, each with its poses. Of a hand-held camera every image is a view.
+    value : float
+        The criterion of the session as planned: the mean error of the platform over the workspace
+        [m], or where readings do not give its pose, the determinant's root.
+    error : PlatformError or None
+        Expected error of the platform over the workspace, one standard deviation: the root mean
+        square over the draws; None if readings do not determine its pose.
+    sigma : (p,) array
+        Expected standard deviation of each kinematic parameter [m, rad].
+    growth : (n, 2) array
+        Numbers of images, and the criterion with that many, most useful images first; beyond the
+        planned number, with copies of the planned images.
+    limits : dict
+        Sources of error that limit a plan: the criterion [m] without each of them.
+    """
+
+    machine: Machine
+    camera: Camera
+    setting: Setting
+    noise: PredictedNoise
+    sigma_q: float  # [m] of a reading of a motor that slides
+    views: tuple[PlannedView, ...]
+    value: float
+    error: PlatformError | None
+    sigma: Array
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    growth: Array
+    limits: dict[str, float]
+    seed: int = 0
+    board: LaidBoard | None = None  # on the base, in every image
+    hand_held: bool = False
+    given: str = ""  # the dataset that the plan extends
+    n_given: int = 0  # number of its photographs
+    notes: tuple[str, ...] = ()
+    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
+
+    @property
+    def n_images(self) -> int:
+        """Number of photographs."""
+        return sum(len(view.poses.poses) for view in self.views)
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels of the poses, in the order to take them."""
+        return pose_labels(self.n_images, self.n_given)
+
+    @property
+    def sentence(self) -> str:
+        """The expected error, in words."""
+        if self.error is None:
+            return "The error of the platform is not predicted: readings do not determine its pose."
+        beside = f" beside those of {self.given}" if self.given else ""
+        return (
+            f"Expected of {self.n_images} photographs{beside}: predicted error "
+            f"{mm_deg(self.error.mean_displacement, self.error.mean_rotation)} (1 sigma) over the "
+            "workspace, "
+            f"the mean of {self.setting.draws} sessions with tripods up to "
+            f"{1e2 * self.setting.shift:.2g} cm and {np.degrees(self.setting.turn):g} deg off and "
+            f"the machine {1e3 * self.setting.length:.2g} mm."
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the document of ``legcal plan --json``, a :class:`PlanDocument`."""
+        error, names, setting, noise = self.error, self.machine.leg_names, self.setting, self.noise
+        expected = None
+        if error is not None:
+            expected = ExpectedError(
+                dX_m=error.mean_displacement,
+                dE_rad=error.mean_rotation,
+                dX_max_m=error.max_displacement,
+                dE_max_rad=error.max_rotation,
+            )
+        rows = zip(self.names, self.sigma.tolist(), self.units, strict=True)
+        return PlanDocument(
+            legcal_plan=1,
+            legcal=__version__,
+            mechanism=self.machine.name,
+            images=self.n_images,
+            seed=self.seed,
+            criterion="d" if error is None else "mean",
+            value=self.value,
+            expected=expected,
+            tolerance=Tolerance(
+                camera_m=setting.shift,
+                camera_rad=setting.turn,
+                machine_m=setting.length,
+                machine_rad=setting.angle,
+                draws=setting.draws,
+            ),
+            noise=NoiseOfPlan(
+                sigma_px=noise.sigma_px,
+                correlation=noise.correlation,
+                common_px=dict(zip(KINDS, noise.common_px, strict=True)),
+                places_px=dict(zip(PLACES, noise.places_px, strict=True)),
+                gamma_px=noise.gamma_px,
+                source=noise.source,
+            ),
+            board=self.board is not None,
+            T_base_board=None if self.board is None else Pose.of(self.board.T_base_board),
+            hand_held=self.hand_held,
+            given=self.given or None,
+            views={
+                view.name: ViewOfPlan(
+                    T_base_camera=Pose.of(view.T_base_camera),
+                    images=len(view.poses.poses),
+                    legs=dict(zip(names, view.shows.sum(axis=0).tolist(), strict=True)),
+                )
+                for view in self.views
+            },
+            parameters=[ExpectedSigma(name=n, sigma=sigma, unit=u) for n, sigma, u in rows],
+            growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
+            limits=self.limits,
+            notes=list(self.notes),
+        ).document()
+
+
+class ExpectedError(Document):
+    """The expected error of the platform over the workspace, one standard deviation."""
+
+    dX_m: Number  # mean
+    dE_rad: Number
+    dX_max_m: Number
+    dE_max_rad: Number
+
+
+class Tolerance(Document):
+    """Tolerances of the session and of the machine."""
+
+    camera_m: Annotated[Number, Field(ge=0.0)]
+    camera_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
+    machine_m: Annotated[Number, Field(ge=0.0)]
+    machine_rad: Annotated[Number, Field(ge=0.0, le=MAX_ANGLE)]
+    draws: Annotated[int, Field(ge=1, le=MAX_DRAWS)]  # sessions that were drawn to judge the plan
+
+
+class NoiseOfPlan(Document):
+    """The errors of outlines that were counted on."""
+
+    sigma_px: Number
+    correlation: Number
+    common_px: dict[str, Number]  # standard deviations of common-mode edge biases, by kind
+    places_px: dict[str, Number] = Field(
+        default_factory=dict
+    )  # of errors of an edge that come back with a place
+    gamma_px: Number
+    source: str
+
+
+class ViewOfPlan(Document):
+    """A camera place; of a camera in the hand, an image."""
+
+    T_base_camera: Pose
+    images: int
+    legs: dict[str, int]  # in how many of its images each is seen
+
+
+class ExpectedSigma(Document):
+    """The expected standard deviation of a parameter."""
+
+    name: str
+    sigma: Number
+    unit: str
+
+
+class Growth(Document):
+    """The criterion with so many images."""
+
+    images: int
+    value: Number
+
+
+class PlanDocument(Document):
+    """What ``plan.json`` holds and ``legcal plan --json`` prints."""
+
+    legcal_plan: Version
+    legcal: str  # the version that planned
+    mechanism: str
+    images: int
+    seed: int
+    criterion: Literal["mean", "worst", "d", "parameters"]  # two of them from earlier versions
+    value: Number  # of the criterion [m; the determinant's root without a unit]
+    expected: ExpectedError | None  # None where readings do not give the pose of the platform
+    tolerance: Tolerance
+    noise: NoiseOfPlan
+    board: bool  # on the base, in every image
+    T_base_board: Pose | None
+    hand_held: bool
+    given: str | None  # the dataset that it adds to
+    views: dict[str, ViewOfPlan]
+    parameters: list[ExpectedSigma]
+    growth: list[Growth]
+    limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
+    notes: list[str]
+
+
+def views_in_words(views: Sequence[PlannedView]) -> str:
+    """Describe the numbers of images and places."""
+    n = sum(len(view.poses.poses) for view in views)
+    return f"{n} photographs from {len(views)} place{'s' * (len(views) != 1)}"

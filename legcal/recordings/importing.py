@@ -55,15 +55,6 @@ _WIDTH = 160  # width of compared frames [px]
 _SHOTS, _TABLE = "shots", "readings.csv"
 
 
-class StillBlock(Document):
-    """An interval in which the machine was at rest."""
-
-    begin_s: Number
-    end_s: Number
-    frame: int | None  # the used frame
-    why_not: str  # reason for not using it; "" if used
-
-
 class RecordingBlock(Document):
     """The recording of a view."""
 
@@ -74,7 +65,7 @@ class RecordingBlock(Document):
     offset_s: Number  # offset between the clocks
     offset_sigma_s: Number
     agreement: Number | None  # correlation of motions; None if the offset was stated
-    stills: list[StillBlock]
+    stills: list[Still]
     notes: list[str]
 
 
@@ -89,61 +80,19 @@ class ImportDocument(Document):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The evaluated recording of one camera position.
+    """The evaluated recording of one camera position."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the view, from the file.
-    recording : Recording
-        Its frames.
-    n_frames : int
-        Number of frames.
-    offset : Offset
-        Clock of the camera minus clock of the readings.
-    stills : tuple of Still
-        Intervals without motion in the frames.
-    readings : (n_used, n_motors) array
-        Means over the used intervals [m or rad].
-    scatter : (n_motors,) array
-        Standard deviation of a reading around them [m or rad].
-    series : Series
-        All readings.
-    notes : tuple of str
-        Notes on irregularities.
-    """
-
-    name: str
+    name: str  # from the file
     recording: Recording
-    n_frames: int
-    offset: Offset
-    stills: tuple[Still, ...]
-    readings: Array
-    scatter: Array
-    series: Series
-    notes: tuple[str, ...]
+    readings: Array  # (n_used, n_motors) means over the used intervals [m or rad]
+    scatter: Array  # (n_motors,) standard deviation of a reading around them [m or rad]
+    unit: str  # of the readings, in words
+    block: RecordingBlock
 
     @property
     def used(self) -> list[int]:
         """Indices of the used frames."""
-        return [still.frame for still in self.stills if still.frame is not None]
-
-    def block(self) -> RecordingBlock:
-        """Return the block of the view in ``legcal import --json``."""
-        return RecordingBlock(
-            recording=str(self.recording.path),
-            readings=self.series.source,
-            frames=self.n_frames,
-            used=len(self.used),
-            offset_s=self.offset.seconds,
-            offset_sigma_s=self.offset.sigma,
-            agreement=self.offset.agreement,
-            stills=[
-                StillBlock(begin_s=s.begin, end_s=s.end, frame=s.frame, why_not=s.why_not)
-                for s in self.stills
-            ],
-            notes=list(self.notes),
-        )
+        return [still.frame for still in self.block.stills if still.frame is not None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +125,7 @@ class Import:
         return ImportDocument(
             dataset=str(self.destination),
             encoder_sigma=self.encoder_sigma,
-            views={view.name: view.block() for view in self.views},
+            views={view.name: view.block for view in self.views},
             written=[str(path) for path in written],
         ).document()
 
@@ -332,7 +281,7 @@ def _view(
     _check_overlap(times - apart.seconds, series, start)
     stills, kept = still_frames(times, frames_move, series.times, moves, apart, LEAST_STILL)
     if not kept:
-        reasons = few([f"{s.why_not} from {s.begin:.1f} s" for s in stills]) or "no rest"
+        reasons = few([f"{s.why_not} from {s.begin_s:.1f} s" for s in stills]) or "no rest"
         raise DatasetError(
             f"{start} found no frame to use ({reasons}), needed rests of {LEAST_STILL:g} s and "
             "more with readings; record longer rests."
@@ -341,11 +290,18 @@ def _view(
     rest = np.concatenate([series.q[rows] - q[k] for k, rows in enumerate(kept)])
     freedoms = max(len(rest) - len(kept), 1)
     scatter = np.sqrt((rest**2).sum(axis=0) / freedoms)
-    return View(
-        name=name, recording=recording, n_frames=len(times), offset=apart, stills=tuple(stills),
-        readings=q, scatter=scatter, series=series,
-        notes=(*recording.notes(), *series.notes),
-    )  # fmt: skip
+    block = RecordingBlock(
+        recording=str(recording.path),
+        readings=series.source,
+        frames=len(times),
+        used=len(kept),
+        offset_s=apart.seconds,
+        offset_sigma_s=apart.sigma,
+        agreement=apart.agreement,
+        stills=stills,
+        notes=[*recording.notes(), *series.notes],
+    )
+    return View(name, recording, q, scatter, series.unit, block)
 
 
 def _check_overlap(times: Array, series: Series, start: str) -> None:

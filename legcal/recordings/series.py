@@ -33,27 +33,13 @@ def unix_seconds(number: float) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Readings of all encoders at times.
+    """Readings of all encoders at times."""
 
-    Attributes
-    ----------
-    source : str
-        Source of the readings, for messages.
-    times : (n,) array
-        Increasing times [s], by their own clock.
-    q : (n, n_motors) array
-        Readings [m or rad], in the order of the actuated legs.
-    taken : mapping
-        Interpretation of each heading.
-    unit : str
-        Unit in the table and its origin, in words.
-    """
-
-    source: str
-    times: Array
-    q: Array
-    taken: Mapping[str, str] = field(default_factory=dict)
-    unit: str = "m"
+    source: str  # source of the readings, for messages
+    times: Array  # (n,) increasing times [s], by their own clock
+    q: Array  # (n, n_motors) readings [m or rad], in the order of the actuated legs
+    taken: Mapping[str, str] = field(default_factory=dict)  # interpretation of each heading
+    unit: str = "m"  # unit in the table and its origin, in words
     notes: tuple[str, ...] = ()
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import correlate
 
+from legcal.files.schema import Document, Number
 from legcal.geometry.types import Array, BoolArray
 
 MIN_CONTRAST = 5.0  # least contrast of motion and rest, in scatters of rest (a normal has 2.7)
@@ -24,14 +25,13 @@ _LEAST_OVERLAP = 0.5  # least overlap, relative to the shorter recording
 _MOST_SAMPLES = 200_000
 
 
-@dataclass(frozen=True)
-class Still:
+class Still(Document):
     """An interval without motion in the frames, and its use."""
 
-    begin: float  # [s] by the clock of the camera
-    end: float
-    frame: int | None  # the frame that is used
-    why_not: str = ""  # reason why none is used, in words
+    begin_s: Number  # by the clock of the camera
+    end_s: Number
+    frame: int | None = None  # the used frame
+    why_not: str = ""  # reason for not using it; "" if used
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def still_frames(
             continue
         inside = np.flatnonzero((shifted >= begin + margin) & (shifted <= end - margin))
         if not len(inside):
-            stills.append(Still(begin, end, None, "no reading"))
+            stills.append(Still(begin_s=begin, end_s=end, why_not="no reading"))
             continue
         rests = max(
             ((a, b) for a, b in runs(moves[inside[0] : inside[-1]])),
@@ -220,15 +220,15 @@ def still_frames(
             default=(0, 0) if len(inside) == 1 else None,
         )
         if rests is None:
-            stills.append(Still(begin, end, None, "readings moved"))
+            stills.append(Still(begin_s=begin, end_s=end, why_not="readings moved"))
             continue
         kept = inside[rests[0] : rests[1] + 1]
         low, high = max(begin, shifted[kept[0]] - margin), min(end, shifted[kept[-1]] + margin)
         middle = 0.5 * (low + high) if len(kept) > 1 else float(shifted[kept[0]])
         if len(inside) > 1 and high - low < least:
-            stills.append(Still(begin, end, None, "readings moved"))
+            stills.append(Still(begin_s=begin, end_s=end, why_not="readings moved"))
             continue
         frame = first + int(np.argmin(np.abs(frame_times[first : last + 1] - middle)))
-        stills.append(Still(begin, end, frame))
+        stills.append(Still(begin_s=begin, end_s=end, frame=frame))
         used.append(kept.tolist())
     return stills, used

@@ -12,7 +12,6 @@ from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccurac
 from legcal.calibration.link_joints import joints_title, mark_in_words
 from legcal.calibration.quantities import DIGITS, FRAMES, joints_of, parameters_of
 from legcal.calibration.summary import (
-    NUMBERS,
     brief_sentences,
     residuals_in_words,
     sentences,
@@ -20,7 +19,7 @@ from legcal.calibration.summary import (
 )
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.parameter_id import ParameterId
-from legcal.pages.document import Table
+from legcal.pages.document import Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
@@ -48,22 +47,19 @@ def summary(calibration: Calibration, output: Path, *, verbose: bool = False) ->
     if not verbose:
         return report(
             verdict,
-            None if result.platform is None else _platform(result.platform),
+            None if result.platform is None else platform_table(result.platform),
             _largest_changes(result),
-            [*brief_sentences(result), f"{written} All parameters: --verbose, or the files there."],
+            [
+                *brief_sentences(result),
+                *(f"Note: {note}" for note in result.notes),
+                f"{written} All parameters: --verbose, or the files there.",
+            ],
         )
-    tables_of_result = [
-        table(
-            *(f">{name}" if name in NUMBERS else name for name in parameter_table.columns),
-            rows=parameter_table.cells(),
-            title=title,
-        )
-        for title, parameter_table in tables(result)
-    ]
-    return report(*tables_of_result, [*sentences(result, verbose=True), written, verdict])
+    shown = [parameters.as_table(title) for title, parameters in tables(result)]
+    return report(*shown, [*sentences(result, verbose=True), written, verdict])
 
 
-def _platform(platform: PlatformBlock) -> Table:
+def platform_table(platform: PlatformBlock) -> Table:
     """Return the platform error before the calibration, and the predicted error after it."""
     after: PlatformBlock | WorkspaceAccuracy = platform.workspace or platform
     scope = "poses" if platform.workspace is None else "workspace"
@@ -205,3 +201,10 @@ def _left_out(evaluation: Evaluation) -> list[Text | Table]:
     title = f"{n} of {n + len(evaluation.displacement)} poses are left out"
     cells = [(str(row.row), row.view, row.image, " and ".join(row.by)) for row in rows]
     return [table(">row", "view", "image", "not reached by", rows=cells, title=title)]
+
+
+def check_verdict(check: Check) -> Verdict:
+    """Return whether anything has moved: green or red."""
+    if check.movement.moved:
+        return Verdict("bad", "Something has moved", check.sentence, [])
+    return Verdict("good", "No change was detected", check.sentence, [])

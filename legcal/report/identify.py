@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 from math import degrees
 
@@ -10,13 +11,14 @@ from rich.text import Text
 from legcal.calibration.identify.report import (
     BoardReport,
     CameraIntrinsics,
+    ConditionBlock,
     Identifiability,
     Ranks,
     WeakDirection,
     views_in_words,
 )
 from legcal.machine.directions import leg_labels, legs_in_words, list_in_words
-from legcal.pages.document import Table
+from legcal.pages.document import Table, Verdict
 from legcal.report.render import Part, Report, table
 from legcal.report.render import report as blocks
 from legcal.vision.board import Link
@@ -27,7 +29,6 @@ CONDITIONS = {
     "eq17": "platform joints (17)",
     "every_leg_seen": "every leg seen",
     "two_directions": "two directions of every leg",
-    "enough_readings": "readings of every carried joint (6')",
     "three_legs_at_once": "three legs at once (18, 19)",
 }
 _LEGEND = "length known: leg with an encoder (length = reading + offset), or of constant length"
@@ -42,7 +43,7 @@ def identify_table(report: Identifiability) -> Report:
     return blocks(
         _heading(report),
         None if report.recommendation is None else _recommendation(report),
-        [_conditions(report), Text(_LEGEND, style="dim")],
+        [conditions_table(report.conditions, report.legs), Text(_LEGEND, style="dim")],
         _weak(report.full) if report.full.weak else None,
         _remedies(report) if report.remedies else None,
         _scale(report) if report.scale else None,
@@ -97,13 +98,14 @@ def _recommendation(report: Identifiability) -> list[Part]:
     return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
-def _conditions(report: Identifiability) -> Table:
+def conditions_table(conditions: Sequence[ConditionBlock], leg_names: Sequence[str]) -> Table:
     """Return the paper's conditions."""
     rows = []
-    for c in report.conditions:
-        legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
+    for c in conditions:
+        failing = [leg_names.index(name) for name in c.failing or ()]
+        legs = f": {legs_in_words(failing, leg_names)}" if failing else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
-        remark = "" if c.needed else ", not needed with the board"
+        remark = ", not needed with the board" if c.needed is False else ""
         remark += ", by analogy" if c.by_analogy else ""
         rows.append((CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
     return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
@@ -138,7 +140,7 @@ def _two_digits(value: float) -> str:
 def _scale(report: Identifiability) -> list[Part]:
     """Return the possible sources of scale with their precision."""
     rows = []
-    for source in report.scale:
+    for source in report.scale or ():
         scale = "not fixed" if source.sigma is None else f"{100 * source.sigma:.2g} %"
         motion = source.platform_sigma
         rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
@@ -229,8 +231,9 @@ def _verdict(report: Identifiability) -> list[Part]:
             f"{_two_digits(degrees(sigma.dE_rad))} deg."
         )
         lines.append(Text(expected, style="dim"))
-        ways = [s.assumed for s in report.scale if s.sigma is not None and s.source != "radii"]
-        for radii in (s.platform_sigma for s in report.scale if s.source == "radii"):
+        scale = report.scale or ()
+        ways = [s.assumed for s in scale if s.sigma is not None and s.source != "radii"]
+        for radii in (s.platform_sigma for s in scale if s.source == "radii"):
             if radii is not None:
                 lines.append(
                     f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm: the scale is the "
@@ -243,3 +246,21 @@ def _verdict(report: Identifiability) -> list[Part]:
     if failed:
         lines.append(f"The paper's conditions fail: {list_in_words(failed)}.")
     return [*lines, *(f"note: {note}" for note in report.notes)]
+
+
+def identify_verdict(report: Identifiability) -> Verdict:
+    """Return whether a session determines its machine: amber where a condition fails."""
+    full = report.full
+    sentence = f"The joint fit determines {full.rank} of {full.of} parameters."
+    if not report.identifiable:
+        word = "These images cannot determine the machine"
+        reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
+        return Verdict("bad", word, sentence, reasons)
+    if report.scale:
+        word = "These images can determine all of the machine but its scale"
+        ways = ", or ".join(one.assumed for one in report.scale if one.sigma is not None)
+        return Verdict("doubtful", word, sentence, [f"To fix the scale: {ways}."] if ways else [])
+    if not report.conditions_hold:
+        word = "The joint fit can determine it, but conditions of the paper fail"
+        return Verdict("doubtful", word, sentence, [])
+    return Verdict("good", "These images determine the machine", sentence, [])

@@ -1,24 +1,33 @@
-"""Text reports of a machine, and of the location of its base and tool."""
+"""Text reports of a machine, its camera, and the location of its base and tool."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import degrees
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
+from legcal.calibration.camera_calibration.document import CameraCalibration
+from legcal.calibration.camera_calibration.projection import CameraComparison
 from legcal.calibration.location.document import Location
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
 from legcal.report.render import Report, heading, report, table
+from legcal.vision.camera import intrinsic_unit
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
+_PARTS = (
+    ("top left", "top", "top right"),
+    ("left", "middle", "right"),
+    ("bottom left", "bottom", "bottom right"),
+)
 _MAX_ROWS = 60  # rows of residuals shown; the file has all
 
 
@@ -249,4 +258,90 @@ def _noise_line(location: Location) -> str:
     return (
         f"Noise of a component: {words}{counted}. chi2 {location.chi2:.1f} at {location.dof} "
         f"degrees of freedom{p_value}."
+    )
+
+
+def camera_table(calibration: CameraCalibration, output: Path) -> Report:
+    """Return a calibrated camera and its file."""
+    used = [image for image in calibration.images if image.rms_px is not None]
+    camera = calibration.camera
+    title = heading(
+        camera.model,
+        f", {camera.width} x {camera.height} px: {len(used)} of {len(calibration.images)} images, "
+        f"{sum(image.used for image in used)} corners, {calibration.rms_px:.3f} px off (rms), "
+        f"{100.0 * calibration.coverage:.0f} % of the image covered",
+    )
+    images = [
+        (
+            image.image,
+            f"{image.used}/{image.corners}",
+            "left out" if image.rms_px is None else f"{image.rms_px:.3f} px",
+            "" if image.tilt_rad is None else f"{np.degrees(image.tilt_rad):.0f} deg",
+        )
+        for image in calibration.images
+    ]
+    numbers = []
+    for name, value, sigma in zip(
+        calibration.names, calibration.values, calibration.sigma, strict=True
+    ):
+        unit = " px" if intrinsic_unit(name) else ""
+        numbers.append((name, f"{value:.{3 if unit else 5}f}{unit}", f"{sigma:.2g}{unit}"))
+    warnings = [Text(f"warning: {warning}", style="yellow") for warning in calibration.warnings]
+    return report(
+        title,
+        table("image", ">corners", ">residual", ">tilt", rows=images),
+        table("", ">value", ">sigma", rows=numbers),
+        _model_and_sheet(calibration),
+        [*warnings, f"Written to {output}."],
+    )
+
+
+def comparison_table(comparison: CameraComparison) -> Report:
+    """Return the difference of two cameras in the nine parts of the image."""
+    px, pixels = comparison.px, comparison.pixels
+    worst = int(np.argmax(px))
+    cell = np.minimum((3.0 * pixels / (pixels.max(axis=0) + 1.0)).astype(np.intp), 2)
+    rows = []
+    for y, names in enumerate(_PARTS):
+        for x, name in enumerate(names):
+            inside = (cell[:, 0] == x) & (cell[:, 1] == y)
+            if not inside.any():
+                continue
+            lengths = [px] if comparison.sigma_px is None else [px, comparison.sigma_px]
+            rms = [f"{np.sqrt(np.mean(length[inside] ** 2)):.3f} px" for length in lengths]
+            rows.append((name, *rms, *[""] * (2 - len(rms))))
+    u, v = pixels[worst]
+    compared = f"{100.0 * comparison.reached:.3g} % of the image compared"
+    if comparison.reached < 1.0:
+        compared += ", as the lens model of the first camera does not reach the rest"
+    return report(
+        heading("difference", f": {np.sqrt(np.mean(px**2)):.3f} px (rms) over the image"),
+        table("part of the image", ">difference", ">sigma", rows=rows),
+        [
+            f"At most {px[worst]:.3f} px, at ({u:.0f}, {v:.0f}); {1e3 * comparison.off.max():.2g} "
+            f"mm at 1 m. A turn of {np.degrees(comparison.turn):.3f} deg is taken out, as the pose "
+            "of a camera takes it up.",
+            f"{compared}.",
+        ],
+    )
+
+
+def _model_and_sheet(calibration: CameraCalibration) -> str:
+    """Return the lens model with its reason, and the shape of the board, in sentences."""
+    cross_validation = (
+        ""
+        if calibration.validated_px is None
+        else f", {calibration.validated_px:.3f} px off in new images"
+    )
+    k = int(np.argmax(np.abs(calibration.sheet[:3])))
+    bend, sigma = 1e3 * abs(calibration.sheet[k]), 1e3 * calibration.sheet_sigma[k]
+    wider, wider_sigma = 100.0 * calibration.sheet[3], 100.0 * calibration.sheet_sigma[3]
+    sigma_px = calibration.projection_sigma
+    middle = np.sqrt(np.mean(sigma_px[3:10, 4:13] ** 2))
+    worst = sigma_px[np.isfinite(sigma_px)].max()
+    return (
+        f"Lens model {calibration.lens}{cross_validation}. Pixels are known to {middle:.2g} px (1 "
+        f"sigma) in the middle of the image, {worst:.2g} px at worst. The board is bent by "
+        f"{bend:.2g} +- {sigma:.2g} mm, and printed {wider:+.2g} +- {wider_sigma:.2g} % wider than "
+        "high."
     )

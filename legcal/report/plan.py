@@ -3,42 +3,32 @@
 from __future__ import annotations
 
 import base64
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from legcal.errors import printable
-from legcal.figures import new_figure, plain
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.configurations import poses_at
-from legcal.machine.drawing import BASE_COLOUR, LEG_COLOUR, PLATFORM_COLOUR
-from legcal.machine.model import vectors_A_to_B
-from legcal.pages.document import Drawing, Items, Picture, Row
-from legcal.pages.html import page_html
-from legcal.planning.laid_board import LaidBoard
-from legcal.planning.planned_session import Plan, views_in_words
+from legcal.machine.picture import Mark, draw_machine
+from legcal.pages.document import Drawing, Items, Picture, Row, page_html
+from legcal.pages.svg import Canvas, Points, scatter
+from legcal.planning.places import LaidBoard
+from legcal.planning.session import Plan, views_in_words
 from legcal.report.machine import scale_option
-from legcal.report.page.text_page import text_page
-from legcal.report.render import Report, heading, report, table
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from legcal.report.render import Report, heading, report, table, text_page
+from legcal.scene.motions import pyramid
 
 PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # least certain parameters shown, equally many of each unit
-_PANEL = (6.0, 5.6)  # [inch]
 _LEAST = 6  # smallest number of images drawn; fewer determine next to nothing
-_FEW_TICKS = 5.0  # largest ratio of errors with linear ticks
-_WIDTH = 9.0  # width of the picture of places [inch]
-_MOST_NAMES = 4  # largest number of names in one label
-_ROOM = 0.1  # margin around the drawing, relative to its width
+_SIDE = 560.0  # width of a picture of camera places [px]
+_DEPTH = 0.1  # depth of the pyramid of a camera, relative to its distance from the machine
 
 
 def plan_table(plan: Plan, output: Path | None) -> Report:
@@ -234,7 +224,8 @@ def _board_in_words(plan: Plan, board: LaidBoard) -> str:
 
 def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[str, str | bytes]:
     """Return the pictures, the checklist and the page of a session, by their names."""
-    places, growth = _svg(_draw_places(plan)), _svg(_draw_growth(plan))
+    growth = _draw_growth(plan).markup()
+    places, in_page = (_draw_places(plan, in_page=x).markup() for x in (False, True))
     images = [
         Picture(
             Markup(f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"),
@@ -243,8 +234,8 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
         for name, data in previews.items()
     ]
     blocks: list[Any] = [
-        Drawing(Markup(places), "Camera places from above and from the side."),
-        Drawing(Markup(growth), "Expected error vs. number of images."),
+        Drawing(in_page, "Camera places from above and from the side."),
+        Drawing(growth, "Expected error vs. number of images."),
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),
     ]
@@ -262,137 +253,43 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     }
 
 
-def _draw_places(plan: Plan) -> Figure:
-    """Return a figure of machine and cameras from above and from the side, with distances."""
-    machine = plan.machine
-    B = np.asarray(machine.home.apply(machine.B_platform))
-    A = B - vectors_A_to_B(machine, machine.home)
-    with new_figure(2, 1, (_WIDTH, _WIDTH)) as (figure, axes):
-        for ax, (i, j), title in zip(
-            axes, ((0, 1), (0, 2)), ("from above: x, y [mm]", "from the side: x, z [mm]"),
-            strict=True,
-        ):  # fmt: skip
-            _draw_panel(ax, plan, A, B, i, j)
-            ax.set_title(title, fontsize="medium")
-        heights = [_WIDTH * np.ptp(ax.get_ylim()) / np.ptp(ax.get_xlim()) + 0.6 for ax in axes]
-        axes[0].get_gridspec().set_height_ratios(heights)  # type: ignore[union-attr]
-        figure.set_size_inches(_WIDTH, sum(heights))
-    return figure
-
-
-def _draw_panel(ax: Axes, plan: Plan, A: Array, B: Array, i: int, j: int) -> None:
-    """Draw one panel: coordinates i and j."""
-    for a, b in zip(1e3 * A, 1e3 * B, strict=True):
-        ax.plot([a[i], b[i]], [a[j], b[j]], color=LEG_COLOUR, linewidth=2.0)
-    for joints, colour in ((A, BASE_COLOUR), (B, PLATFORM_COLOUR)):
-        ax.scatter(1e3 * joints[:, i], 1e3 * joints[:, j], s=16.0, color=colour, zorder=3)
+def _draw_places(plan: Plan, *, in_page: bool) -> Canvas:
+    """Draw machine, cameras and board, with the distances to measure [mm]."""
+    machine, marks = plan.machine, list[Mark]()
     if plan.board is not None:
-        outer = 1e3 * plan.board.corners[[0, 1, 2, 3, 0]]
-        ax.plot(outer[:, i], outer[:, j], color=_BOARD_COLOUR, linewidth=1.5)
-        ax.annotate("board", (outer[0, i], outer[0, j]), (3.0, 3.0), color=_BOARD_COLOUR,
-                    textcoords="offset points", fontsize="small")  # fmt: skip
+        outer = plan.board.corners[[0, 1, 2, 3, 0]]
+        marks.append(Mark(outer, _BOARD_COLOUR, "board"))
     for view in plan.views:
-        centre = 1e3 * view.T_base_camera.translation
-        sight = view.T_base_camera.rotation.as_matrix()[:, 2]
-        tip = centre + 250.0 * sight
-        arrow = {"arrowstyle": "->", "color": _CAMERA_COLOUR}
-        ax.annotate("", (tip[i], tip[j]), (centre[i], centre[j]), arrowprops=arrow)
-        ax.scatter(centre[i], centre[j], marker="s", s=40.0, color=_CAMERA_COLOUR, zorder=4)
-        if (i, j) == (0, 1) and not plan.hand_held:
-            _draw_distances(ax, centre, 1e3 * _measured_joints(plan))
-    ax.set_aspect("equal")
-    ax.margins(0.0)
-    room = _ROOM * float(np.ptp(ax.get_xlim()))
-    joints_of_base = [f"A{k + 1}" for k in range(len(A))]
-    for n, (name, position) in enumerate(_together(joints_of_base, 1e3 * A[:, [i, j]], 0.4 * room)):
-        ax.annotate(name, position, (5.0, -12.0 if n % 2 else 5.0), color=BASE_COLOUR,
-                    textcoords="offset points", fontsize="small")  # fmt: skip
-    lenses = 1e3 * np.array([view.T_base_camera.translation for view in plan.views])
-    for n, (name, position) in enumerate(
-        _together([view.name for view in plan.views], lenses[:, [i, j]], 0.2 * room)
-    ):
-        ax.annotate(name, position, (7.0, -16.0 if n % 2 else 7.0), color=_CAMERA_COLOUR,
-                    textcoords="offset points")  # fmt: skip
-    for limits, put in ((ax.get_xlim(), ax.set_xlim), (ax.get_ylim(), ax.set_ylim)):
-        put(limits[0] - room, limits[1] + room)
-    ax.grid(alpha=0.2)
+        T = view.T_base_camera
+        away = float(np.linalg.norm(T.translation - machine.home.translation))
+        eye, *rim = pyramid(plan.camera, T, _DEPTH * away)
+        outline = np.array([eye, *(p for corner in rim for p in (corner, eye)), *rim, rim[0]])
+        marks.append(Mark(outline, _CAMERA_COLOUR, view.name))
+        for part, joint in zip((0.4, 0.55, 0.7), _measured_joints(plan), strict=False):
+            if not plan.hand_held:
+                line = np.array([eye, eye + part * (joint - eye), joint])
+                distance = f"{1e3 * np.linalg.norm(joint - eye):.0f}"
+                marks.append(Mark(line, _CAMERA_COLOUR, distance, 1, 0.5, only_plan=True))
+    title = "at home, with the cameras; distances in mm"
+    return draw_machine(machine, in_page=in_page, marks=marks, title=title, side=_SIDE)
 
 
-def _together(
-    names: Sequence[str], points: Array, near: float
-) -> list[tuple[str, tuple[float, float]]]:
-    """Return labels of points (n, 2) with their positions, one label for points near each other.
-
-    Labels are ordered from left to right, so that they can alternate above and below.
-    """
-    groups: list[list[int]] = []
-    for k in range(len(points)):
-        near_groups = [
-            g for g in groups if np.linalg.norm(points[g] - points[k], axis=1).min() < near
-        ]
-        groups = [g for g in groups if g not in near_groups]
-        groups.append(sorted([k, *(i for g in near_groups for i in g)]))
-    labels = []
-    for group in groups:
-        of_group = [names[k] for k in group]
-        if len(group) > _MOST_NAMES:
-            of_group = [of_group[0], "...", of_group[-1]]
-        x, y = points[group[int(np.argmax(points[group, 0]))]].tolist()
-        labels.append((plain(", ".join(of_group)), (x, y)))
-    return sorted(labels, key=lambda text: text[1])
-
-
-def _draw_distances(ax: Axes, lens: Array, joints: Array) -> None:
-    """Draw the distances of a lens from joints (rings) from above, as text along lines [mm]."""
-    ax.scatter(joints[:, 0], joints[:, 1], s=70.0, facecolors="none", edgecolors=_CAMERA_COLOUR)
-    for part, joint in zip(np.linspace(0.2, 0.6, len(joints)), joints, strict=True):
-        ax.plot([lens[0], joint[0]], [lens[1], joint[1]], color=_CAMERA_COLOUR,
-                linewidth=0.6, linestyle=":")  # fmt: skip
-        x, y = (part * lens[:2] + (1.0 - part) * joint[:2]).tolist()
-        slope = np.degrees(np.arctan2(lens[1] - joint[1], lens[0] - joint[0]))
-        ax.text(x, y, f"{np.linalg.norm(lens - joint):.0f}", color=_CAMERA_COLOUR,
-                fontsize="x-small", ha="center", va="center", rotation_mode="anchor",
-                rotation=(slope + 90.0) % 180.0 - 90.0,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
-
-
-def _draw_growth(plan: Plan) -> Figure:
-    """Return a figure of the expected error over the number of images."""
+def _draw_growth(plan: Plan) -> Canvas:
+    """Draw the expected error over the number of images."""
     planned = plan.growth[:, 0] <= plan.n_images
     min_images = 1 if plan.given else min(_LEAST, plan.n_images)
     is_known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min_images)
     scale, unit = _scaled(plan, 1.0)
     quantity = "expected error of the platform" if unit == "mm" else "determinant's root"
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
-
-    with new_figure(1, 1, _PANEL) as (figure, (ax,)):
-        extrapolated = is_known & (~planned | (plan.growth[:, 0] == plan.n_images))
-        for chosen, style, label, above in (  # planned images in front
-            (is_known & planned, "-o", "planned", 3.0),
-            (extrapolated, "--o", "more of their kind", 2.0),
-        ):
-            n, value = plan.growth[chosen].T
-            ax.loglog(n, scale * value, style, markersize=3.0, label=label, zorder=above)
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(NullFormatter())
-        drawn = plan.growth[is_known, 1]
-        if drawn.max() < _FEW_TICKS * drawn.min():
-            ax.yaxis.set_major_locator(MaxNLocator(6))
-        ax.set_xlabel("images")
-        ax.set_ylabel(f"{quantity} [{unit}]")
-        ax.grid(which="both", alpha=0.2)
-        ax.legend()
-    return figure
-
-
-def _svg(figure: Figure) -> str:
-    """Return a figure as reproducible SVG."""
-    import matplotlib as mpl
-
-    text = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": "legcal", "svg.fonttype": "none"}):
-        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": "legcal plan"})
-    svg = text.getvalue()
-    return svg[svg.index("<svg") :]
+    extrapolated = is_known & (~planned | (plan.growth[:, 0] == plan.n_images))
+    images, error = plan.growth[:, 0], scale * plan.growth[:, 1]
+    lines = [
+        Points(images[chosen], error[chosen], group=k, label=label, line=line)
+        for k, (chosen, label, line) in enumerate(
+            (
+                (extrapolated, "more of their kind", "5 4"),
+                (is_known & planned, "planned", ""),
+            )
+        )
+    ]
+    return scatter(quantity, lines, "images", f"{quantity} [{unit}]", log="xy")

@@ -1,19 +1,34 @@
-"""Reports: groups of tables and lines, shown on a terminal or, by ``page.text_page``, on a page."""
+"""Reports: groups of tables and lines, which a terminal shows, or a page in the common style."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text
 
 from legcal.errors import escaped
-from legcal.pages.document import Cell, Number, Table
+from legcal.pages.document import (
+    Cell,
+    Facts,
+    Items,
+    Number,
+    Page,
+    Section,
+    Table,
+    Verdict,
+    time_of_page,
+)
+from legcal.pages.document import Text as Paragraphs
+from legcal.version import __version__
 
 Part = str | Text | Table
+_ITEM = "- "
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
 
 
@@ -108,3 +123,44 @@ def _on_terminal(table: Table) -> RichTable:
     for row in table.rows:
         text.add_row(*(safe_text(cell if isinstance(cell, str) else cell.text) for cell in row))
     return text
+
+
+def text_page(
+    title: str,
+    report: Report,
+    *,
+    verdict: Verdict | None = None,
+    blocks: Sequence[Any] = (),
+    command: str = "",
+) -> Page:
+    """Return a page with the tables and sentences of a report, followed by further blocks.
+
+    The sentence of the verdict is not repeated.
+    """
+    when = time_of_page()
+    record = {"Version": f"legcal {__version__}", "Command": command or "from Python", "Time": when}
+    omitted = verdict.sentence if verdict is not None else ""
+    sections = [Section("result", "Result", _blocks(report, omitted))]
+    if blocks:
+        sections.append(Section("figures", "Figures", blocks))
+    sections.append(Section("record", "Reproducibility", [Facts(record)]))
+    return Page(title, when, verdict, sections)
+
+
+def _blocks(report: Report, omitted: str) -> list[Any]:
+    """Return the parts of a report as blocks, without an omitted line."""
+    blocks: list[Any] = []
+    for part in (part for group in report.groups for part in group):
+        if isinstance(part, Table):
+            blocks.append(part)
+            continue
+        lines = [line for line in part.plain.splitlines() if line.strip() and line != omitted]
+        for is_item, group in groupby(lines, lambda line: line.startswith(_ITEM)):
+            kind, texts = (
+                (Items if is_item else Paragraphs),
+                [line_of_group.removeprefix(_ITEM) for line_of_group in group],
+            )
+            if blocks and type(blocks[-1]) is kind:
+                texts = [*(blocks.pop().items if is_item else blocks.pop().paragraphs), *texts]
+            blocks.append(kind(texts))
+    return blocks

@@ -1,8 +1,8 @@
-"""A machine beside another model of it: nominal and calibrated, or moved along a direction."""
+"""A machine beside another model of it, ellipsoids at its joints, pyramids of cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -10,15 +10,15 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array
-from legcal.machine.drawing import around, corners_of_base, motor_lines
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, moved_legs, parametrization_of
+from legcal.machine.picture import around, corners_of_base, motor_lines
 from legcal.machine.rods import ends_in_base, first_rods
-from legcal.scene.shapes import ellipsoids
 
 if TYPE_CHECKING:
     from legcal.calibration.documents import Result
+    from legcal.vision.camera import Camera
 
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # default displayed size of the largest change, relative to the machine
@@ -144,3 +144,34 @@ def _steps(result: Result, parameters: Parametrization, length: float) -> list[t
         step = _HELD * length * np.array(row)[order]
         steps.append((f"{1e3 * _HELD * length:.2g} mm along a held direction: {words}", step))
     return steps
+
+
+def ellipsoids(result: Result) -> dict[str, Array]:
+    """Return half axes of one sigma at the joints of base and platform, (n, 3, 3) [m].
+
+    Columns are axes, in the link; they are zero along fixed coordinates and those that define a
+    frame.
+    """
+    half_axes = {}
+    for side, block in (result.links or {}).items():
+        value, vector = np.linalg.eigh(np.array([joint.covariance for joint in block.joints]))
+        half_axes[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
+    return half_axes
+
+
+def enlargement(axes: Mapping[str, Array], radius: float) -> float:
+    """Return the factor 1, 2, 5, 10, ... that enlarges the median ellipsoid to nearly *radius*."""
+    longest = [np.linalg.norm(of_side, axis=1).max(axis=1) for of_side in axes.values()]
+    seen = np.concatenate([*longest, np.zeros(0)])
+    usual = float(np.median(seen[seen > 0.0])) if np.any(seen > 0.0) else 1.0
+    wanted = radius / usual
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(s for s in (1, 2, 5) if s * power <= wanted))
+
+
+def pyramid(camera: Camera, T_base_camera: RigidTransform, depth: float) -> Array:
+    """Return the centre of a camera and the corners of its view at a depth [m], (5, 3)."""
+    w, h = camera.width - 0.5, camera.height - 0.5
+    corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+    rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
+    return np.asarray(T_base_camera.apply(np.concatenate([np.zeros((1, 3)), rays])))

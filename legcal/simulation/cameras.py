@@ -1,8 +1,7 @@
 """Simulated cameras and the board: poses chosen so that images show the legs.
 
 Places around a machine are scored by the lengths of its legs in the images. A board lies flat near
-the base joints, among the legs or beside them; for cameras with given poses it may also be raised
-and turned.
+the base joints, among the legs or beside them, and cameras are placed to see it.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from legcal.geometry.lines import direction_above, normal_basis
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
-from legcal.planning.laid_board import feet
+from legcal.planning.places import feet
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.rays import in_view, surrounding_points
@@ -60,8 +59,6 @@ _MIN_DISTANCE = 0.3  # minimum distance between camera and machine, in machine s
 _N_BOARD_CANDIDATES = 2  # places of a board with cameras, of which the better is taken
 _LEVELS = (0.0, -0.08, 0.25)  # heights above the base joints, in machine sizes
 _PLATFORM_LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3)  # heights above the joints of the platform
-_TILTS = (0.0, 0.6, 1.1)  # [rad] from horizontal, towards cameras with given places
-_MIN_LEGS_SHARE = 0.9  # minimum share of the visible lengths of legs that a board leaves visible
 
 
 def mild_lens() -> Camera:
@@ -186,84 +183,36 @@ def board_and_cameras(
     return placed, views
 
 
-def board_before(
-    board: Board,
-    machine: Machine,
-    posed_machines: Sequence[PosedMachine],
-    views: Sequence[Viewpoint],
-) -> PlacedBoard:
-    """Return a board in view of given cameras."""
-    tried = _some(posed_machines)
-    towards = np.mean([view.T_base_camera.translation for view in views], axis=0)
-    most, best = 0.0, None
-    for placed in _lying(board, machine, tried, towards):
-        together = [placed.beside(posed) for posed in tried]
-        visible_share = min(_share(placed, together, view) for view in views)
-        if visible_share > most and not any(
-            _hides(machine, tried, together, view) for view in views
-        ):
-            most, best = visible_share, placed
-    if best is None:
-        raise _nowhere(
-            board, "all of the given cameras", "turn or move the cameras, or use another"
-        )
-    return best
-
-
 def board_on_platform(
     board: Board,
     machine: Machine,
     posed_machines: Sequence[PosedMachine],
     T_base_platform: Sequence[RigidTransform],
-    views: Sequence[Viewpoint],  # cameras that must see it; without any it faces up
 ) -> RigidTransform:
-    """Return T_platform_board of a board on top of the platform, free of the machine."""
-    home = machine.home
-    up = home.rotation.inv().apply(machine.upward)
-    middle = machine.B_platform.mean(axis=0)
+    """Return T_platform_board of a board that lies on top of the platform, free of the machine."""
+    up = machine.home.rotation.inv().apply(machine.upward)
     size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
     side = normal_basis(up)[0]
-    towards = None
-    if views:
-        centre = np.mean([view.T_base_camera.translation for view in views], axis=0)
-        towards = home.inv().apply(centre)
-    some = np.unique(np.linspace(0, len(posed_machines) - 1, _N_POSES).astype(int)).tolist()
-    most, best = 0.0, None
-    for tilt in _TILTS if views else _TILTS[:1]:
-        for level in _PLATFORM_LEVELS:
-            place = middle + level * size * up
-            T = facing_board(board, place, _tilted(up, towards, place, tilt), side)
-            placed = [PlacedBoard(board, T_base_platform[k] * T) for k in some]
-            bodies = [posed_machines[k] for k in some]
-            if any(
-                p.runs_through(body) or p.is_covered(body)
-                for p, body in zip(placed, bodies, strict=True)
-            ):
-                continue
-            if not views:
-                return T
-            together = [p.beside(body) for p, body in zip(placed, bodies, strict=True)]
-            visible_share = np.mean(
-                [
-                    p.is_enough(p.seen(body, view.camera, view.T_base_camera))
-                    for view in views
-                    for p, body in zip(placed, together, strict=True)
-                ]
-            )
-            if visible_share > most:
-                most, best = float(visible_share), T
-            break  # one level at each tilt
-    if best is None or most < _MIN_BOARD_SHARE:
-        raise _nowhere(board, "the cameras", "use a smaller board, or other cameras", "platform")
-    return best
+    for level in _PLATFORM_LEVELS:
+        place = machine.B_platform.mean(axis=0) + level * size * up
+        T = facing_board(board, place, up, side)
+        placed = [PlacedBoard(board, T_base_platform[k] * T) for k in _few(posed_machines)]
+        if not any(
+            p.runs_through(body) or p.is_covered(body)
+            for p, body in zip(placed, _some(posed_machines), strict=True)
+        ):
+            return T
+    raise _nowhere(board, "the cameras", "use a smaller board", "platform")
+
+
+def _few(posed_machines: Sequence[PosedMachine]) -> list[int]:
+    """Return the indices of a few poses."""
+    return list(map(int, np.unique(np.linspace(0, len(posed_machines) - 1, _N_POSES).astype(int))))
 
 
 def _some(posed_machines: Sequence[PosedMachine]) -> list[PosedMachine]:
     """Return a machine in a few of its poses."""
-    return [
-        posed_machines[i]
-        for i in np.unique(np.linspace(0, len(posed_machines) - 1, _N_POSES).astype(int))
-    ]
+    return [posed_machines[i] for i in _few(posed_machines)]
 
 
 def _joints(posed_machines: Sequence[PosedMachine]) -> Array:
@@ -303,17 +252,6 @@ def _before(
         p = p - aside
         target = target + rotation.apply(aside)
     return look_at(target + further * distance * toward, target, roll, up=up)
-
-
-def _lengths(
-    machine: Machine, posed_machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
-) -> list[float]:
-    """Return the length of every leg in every image [px], zero where it does not count as seen."""
-    return [
-        leg.length_px if leg.is_seen else 0.0
-        for posed in posed_machines
-        for leg in legs_in_image(machine.legs, posed, camera, T, samples=_SAMPLES)
-    ]
 
 
 def _best(
@@ -362,60 +300,27 @@ def _score(
         share *= float(np.mean(shown))
         if np.mean(shown) < _MIN_BOARD_SHARE:
             return 0.0
-    return share * float(np.mean(_lengths(machine, posed_machines, camera, T)))
+    lengths = [
+        leg.length_px if leg.is_seen else 0.0
+        for posed in posed_machines
+        for leg in legs_in_image(machine.legs, posed, camera, T, samples=_SAMPLES)
+    ]
+    return share * float(np.mean(lengths))
 
 
 def _lying(
-    board: Board,
-    machine: Machine,
-    posed_machines: Sequence[PosedMachine],
-    towards: Array | None = None,
+    board: Board, machine: Machine, posed_machines: Sequence[PosedMachine]
 ) -> Iterator[PlacedBoard]:
-    """Yield places near the base that the machine leaves free, also tilted towards a point."""
-    up, A = machine.upward, machine.A_base
-    middle = A.mean(axis=0)
+    """Yield places near the base that the machine leaves free, one at each foot."""
+    up, middle = machine.upward, machine.A_base.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
-    for foot, side in feet(board, A, up):
-        places = (
-            PlacedBoard(board, facing_board(board, place, _tilted(up, towards, place, tilt), side))
-            for place in (middle + foot + level * size * up for level in _LEVELS)
-            for tilt in (_TILTS if towards is not None else _TILTS[:1])
-        )
-        for placed in places:
+    for foot, side in feet(board, machine.A_base, up):
+        for level in _LEVELS:
+            T = facing_board(board, middle + foot + level * size * up, up, side)
+            placed = PlacedBoard(board, T)
             if not any(placed.runs_through(posed) for posed in posed_machines):
                 yield placed
-                break  # a single place at each foot
-
-
-def _tilted(up: Array, towards: Array | None, place: Array, tilt: float) -> Array:
-    """Return a direction that leans from *up* by an angle, from a place towards a point if any."""
-    if towards is None:
-        return up
-    level = towards - place - ((towards - place) @ up) * up
-    length = float(np.linalg.norm(level))
-    if length < 1e-9:
-        return up
-    return np.asarray(np.cos(tilt) * up + np.sin(tilt) * level / length)
-
-
-def _share(placed: PlacedBoard, together: Sequence[PosedMachine], view: Viewpoint) -> float:
-    """Return the share of corners in a view, zero if there are too few in one of the poses."""
-    shown = [placed.seen(posed, view.camera, view.T_base_camera) for posed in together]
-    return float(np.mean(shown)) if all(map(placed.is_enough, shown)) else 0.0
-
-
-def _hides(
-    machine: Machine,
-    alone: Sequence[PosedMachine],
-    together: Sequence[PosedMachine],
-    view: Viewpoint,
-) -> bool:
-    """Return whether a board beside a machine hides much of its legs from a view."""
-    free, left = (
-        sum(_lengths(machine, posed_machines, view.camera, view.T_base_camera))
-        for posed_machines in (alone, together)
-    )
-    return left < _MIN_LEGS_SHARE * free
+                break
 
 
 def _nowhere(board: Board, who: str, remedy: str, link: Link = "base") -> NotVisible:

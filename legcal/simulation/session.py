@@ -12,20 +12,30 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from uuid import uuid4
 
+import cv2
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.corners import Corners
+from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
-from legcal.errors import NotVisible, UsageError
-from legcal.machine.configurations import Configurations
+from legcal.errors import DidNotConverge, NotVisible, UsageError
+from legcal.files.reading import read_json
+from legcal.files.schema import validate
+from legcal.geometry.types import Array
+from legcal.machine.configurations import Configurations, poses_at
+from legcal.machine.kinematics import follow_each
 from legcal.machine.model import Machine
+from legcal.planning.places import LaidBoard, Setting
+from legcal.planning.request import difference
+from legcal.planning.session import PlanDocument
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
     MAX_HAND_DRAWS,
     board_and_cameras,
-    board_before,
     board_on_platform,
     camera_in_hand,
     cameras_around,
@@ -42,14 +52,13 @@ from legcal.simulation.observe import (
     corners_in_images,
     outlines_of,
 )
-from legcal.simulation.planned import PlannedSession, read_plan
 from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
 from legcal.simulation.settings import Distribution, Level, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
 from legcal.simulation.visibility import Images, Viewpoint, take_images
-from legcal.vision.board import Board, FixedBoard
+from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera
 from legcal.workers import Workers, worker_pool
 
@@ -195,15 +204,16 @@ class _Simulator:
         posed = pose_machine(self.truth, solids, poses)
         on_base, views, groups = None, self.given_views, tuple[str, ...]()
         if self.plan is not None:
-            on_base = self._board_of_plan(self.plan)
-            posed = _beside(on_base, posed)
+            on_base = self.plan.board
+            if on_base is not None:
+                posed = tuple(map(on_base.beside, posed))
             views = self.plan.viewpoints(self.rngs["cameras"], posed)
             groups = (self.plan.hand,) * len(views) if self.plan.hand else ()
         board = chosen_board(self.settings.board, posed)
         board_of_platform = chosen_board(self.settings.platform_board, posed, "platform")
         boards: tuple[FixedBoard, ...] = ()
         if board_of_platform is not None:
-            T = board_on_platform(board_of_platform, self.truth, posed, poses.poses, views)
+            T = board_on_platform(board_of_platform, self.truth, posed, poses.poses)
             first = 0 if board is None else board.n_corners
             boards = (FixedBoard(board_of_platform, "platform", T, first),)
             posed = tuple(
@@ -211,8 +221,14 @@ class _Simulator:
                 for T, posed_machine in zip(poses.poses, posed, strict=True)
             )
         if board is not None:
-            on_base, views = self._with_board(board, posed, views)
-            posed = _beside(on_base, posed)
+            in_order: Sequence[PosedMachine] = posed
+            if self.settings.hand_held:
+                views_of = range(len(self.cameras))
+                in_order = [posed[p] for v in views_of for p in self.poses_of(v, len(posed))]
+            on_base, views = board_and_cameras(
+                board, self.truth, in_order, self.cameras, self.rngs["cameras"], self.progress
+            )
+            posed = tuple(map(on_base.beside, posed))
         elif not views:
             views = self._cameras_around(posed, with_board=bool(boards))
         if on_base is not None:
@@ -222,32 +238,6 @@ class _Simulator:
         if self.settings.level == Level.PHOTOGRAPHS:
             views = _encoding(views, self.settings.appearance.gamma, self.settings.tell_gamma)
         return _Setup(poses, posed, boards, views, groups)
-
-    def _board_of_plan(self, plan: PlannedSession) -> PlacedBoard | None:
-        """Return the board of a plan; refuse another beside it."""
-        if plan.board is not None and self.settings.board is not None:
-            raise UsageError(
-                "The plan could not be shot: found --board and a plan with a board, needed one of "
-                "them; leave out --board."
-            )
-        return plan.board
-
-    def _with_board(
-        self,
-        board: Board,
-        posed: tuple[PosedMachine, ...],
-        views_in_settings: tuple[Viewpoint, ...],
-    ) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
-        """Return a board on the base in view of the given cameras, or with cameras to see it."""
-        if views_in_settings:
-            return board_before(board, self.truth, posed, views_in_settings), views_in_settings
-        bodies: Sequence[PosedMachine] = posed
-        if self.settings.hand_held:
-            views = range(len(self.cameras))
-            bodies = [posed[p] for v in views for p in self.poses_of(v, len(posed))]
-        return board_and_cameras(
-            board, self.truth, bodies, self.cameras, self.rngs["cameras"], self.progress
-        )
 
     def _cameras_around(
         self, posed: tuple[PosedMachine, ...], *, with_board: bool
@@ -340,13 +330,6 @@ class _Simulator:
             measurements, outlines, axes, corners, self.truth, setup.poses, labels, posed, scene,
             left_out, setup.boards, setup.groups,
         )  # fmt: skip
-
-
-def _beside(
-    board: PlacedBoard | None, posed_machines: tuple[PosedMachine, ...]
-) -> tuple[PosedMachine, ...]:
-    """Return machines with a board beside them, if there is one."""
-    return posed_machines if board is None else tuple(map(board.beside, posed_machines))
 
 
 def exact_outlines(scene: Scene) -> Outlines:
@@ -487,3 +470,142 @@ def _rendered_view(studio: _Studio) -> RenderedView:
     """Return the surroundings, painted once in each process."""
     view, nearby = studio.viewpoint, next(iter(studio.machines.values()), ())
     return prepare_view(nearby, view.camera, view.T_base_camera, studio.appearance, studio.rng)
+
+
+# A session planned by ``legcal plan``, the tripods a little off the planned poses
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSession:
+    """A plan: its rows, tolerances, and board."""
+
+    measurements: Measurements  # one row an image, with planned poses of views
+    setting: Setting  # tolerances of tripods
+    board: PlacedBoard | None  # on the base
+    hand: str  # name of the view of a hand-held camera; "" for fixed cameras
+
+    @property
+    def poses_of(self) -> list[list[int]]:
+        """The poses that each view sees."""
+        m = self.measurements
+        return [m.pose[m.view == v].tolist() for v in range(len(m.views))]
+
+    def viewpoints(
+        self,
+        rng: np.random.Generator,
+        posed_machines: Sequence[PosedMachine],  # in all poses, with the board
+    ) -> tuple[Viewpoint, ...]:
+        """Return the views with actual camera poses, within the tolerance of the plan.
+
+        A hand-held camera is moved until it shows the board. Raises NotVisible if it never does.
+        """
+        viewpoints = []
+        for view, poses in zip(self.measurements.views, self.poses_of, strict=True):
+            T = view.T_base_camera
+            if T is None:
+                raise UsageError(
+                    f"The plan could not be shot: found no T_base_camera of view {view.name}, "
+                    "needed where its camera stands; write it into dataset.yaml, or plan again."
+                )
+            for _ in range(MAX_HAND_DRAWS if self.hand else 1):
+                moved, board = self.setting.perturbed_camera(T, rng), self.board
+                if not self.hand or board is None:
+                    break
+                if board.is_enough(board.seen(posed_machines[poses[0]], view.camera, moved)):
+                    break
+            else:
+                raise NotVisible(
+                    f"The plan could not be shot: found that image {view.name} shows the board "
+                    f"from none of {MAX_HAND_DRAWS} places near that of the plan, needed all of "
+                    "it; plan with a smaller board."
+                )
+            viewpoints.append(Viewpoint(view.name, view.camera, moved))
+        return tuple(viewpoints)
+
+    def poses(self, truth: Machine) -> Configurations:
+        """Return the poses of the true machine at the planned readings."""
+        m = self.measurements
+        reached: list[Array] = []
+        try:
+            for configuration in follow_each(truth, m.q_of_poses[:, list(truth.motors)]):
+                reached.append(configuration)
+        except DidNotConverge as error:
+            raise DidNotConverge(
+                f"The plan could not be shot: found that the true machine does not reach pose "
+                f"{len(reached) + 1}, needed all of them; draw smaller --error, or plan again."
+            ) from error
+        return poses_at(truth, reached)
+
+
+def read_plan(folder: Path, nominal: Machine) -> PlannedSession:
+    """Return a planned session. Raises UsageError if it is invalid, or of another machine."""
+    try:
+        document = read_json(folder / PLAN_NAME)
+        if not isinstance(document, dict) or "legcal_plan" not in document:
+            raise ValueError("another document")
+        plan = validate(PlanDocument, document, folder / PLAN_NAME)
+        places = [view.T_base_camera.motion() for view in plan.views.values()]
+        laid = None if plan.T_base_board is None else plan.T_base_board.motion()
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(
+            f"{folder}: the plan could not be shot: found no {PLAN_NAME} in it that can be read, "
+            "needed the folder that legcal plan wrote; correct --plan."
+        ) from error
+    tolerance = plan.tolerance
+    setting = Setting(
+        tolerance.camera_m, tolerance.machine_m, tolerance.camera_rad, tolerance.machine_rad
+    )
+    dataset = load_dataset(folder, check_images=False)
+    if difference_in_words := difference(nominal, dataset.machine):
+        raise UsageError(
+            f"{folder}: the plan could not be shot: found {difference_in_words}, needed a plan of "
+            f"{nominal.name}; correct MODEL or --plan."
+        )
+    if not nominal.is_determined:
+        raise UsageError(
+            f"{folder}: the plan could not be shot: found a machine whose readings do not tell its "
+            "pose, needed one whose do; simulate it without --plan."
+        )
+    m, on_base, hand = dataset.measurements, dataset.board_on("base"), ""
+    board = None if on_base is None or laid is None else PlacedBoard(on_base.board, laid)
+    if any(view.hand_held for view in m.views):
+        if board is None or len(places) != len(m.views):
+            raise UsageError(
+                f"{folder}: the plan could not be shot: found {len(places)} camera places and "
+                f"{'no' if board is None else 'a'} place of the board for {len(m.views)} images of "
+                f"a camera in the hand, needed one for each image and that of the board in "
+                f"{PLAN_NAME}; plan again."
+            )
+        hand = m.views[0].name.rpartition("-")[0]
+        views_and_places = zip(m.views, places, strict=True)
+        m = replace(m, views=tuple(replace(view, T_base_camera=T) for view, T in views_and_places))
+    return PlannedSession(m, setting, board, hand)
+
+
+# A small photograph from a planned camera
+
+
+_WIDTH = 400  # [px] of a preview
+
+
+def preview(
+    machine: Machine,
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    poses: Configurations,
+    board: LaidBoard | None = None,
+) -> bytes:
+    """Return a JPEG of a machine in the first of some poses, without noise and clutter."""
+    scale = min(_WIDTH / camera.width, 1.0)
+    K = camera.K * [[scale], [scale], [1.0]]
+    small = replace(
+        camera, K=K, width=round(camera.width * scale), height=round(camera.height * scale)
+    )
+    first = Configurations(poses.configurations[:1], poses.readings[:1], poses.poses[:1])
+    (posed,) = pose_machine(machine, dressed(machine, meshes_needed=False), first)
+    if board is not None:
+        posed = PlacedBoard(board.board, board.T_base_board).beside(posed)
+    rng = np.random.default_rng(0)
+    look = replace(Appearance(), clutter=0)
+    image = prepare_view(posed.solids, small, T_base_camera, look, rng).render(posed.solids, rng)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -14,13 +15,15 @@ import numpy as np
 from legcal.calibration.joint_fit.parameter_choices import joints_of_length
 from legcal.data.axes import SIGMA_RANGE
 from legcal.errors import UsageError
-from legcal.files.schema import is_plain_name
+from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
+from legcal.files.schema import closest, describe, is_plain_name
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import parametrization_of
+from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
-from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.appearance import CAMERAS, Appearance
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board
 
@@ -67,17 +70,18 @@ class Spread:
     Raises
     ------
     UsageError
-        If the size is no number, or there is no such distribution.
+        If the size is no number from 0 to 1, or there is no such distribution.
     """
 
     size: float = 0.0
     distribution: Distribution | str = Distribution.UNIFORM
 
     def __post_init__(self) -> None:
-        if not isinstance(self.size, Real) or self.distribution not in list(Distribution):
+        is_size = isinstance(self.size, Real) and 0.0 <= self.size <= MAX_SIZE
+        if not is_size or self.distribution not in list(Distribution):
             raise UsageError(
                 f"A spread could not be used: found the size {self.size!r} and the distribution "
-                f"{self.distribution!r}, needed a number [m, rad] and "
+                f"{self.distribution!r}, needed 0 to {MAX_SIZE:g} [m, rad] and "
                 f"{' or '.join(Distribution)}; correct it."
             )
 
@@ -322,14 +326,7 @@ class SimulationSettings:
             "images": (self.images, 1, MAX_IMAGES, ""),
             "the seed": (self.seed, 0, math.inf, ""),
             "the noise of edge points": (self.sigma_px, 0.0, MAX_SIGMA_PX, " px"),
-            "the noise of readings": (self.readings.size, 0.0, MAX_SIZE, " m"),
         }
-        if self.angles is not None:
-            limits["the noise of angles"] = (self.angles.size, 0.0, MAX_SIZE, " rad")
-        for name in KINDS:
-            unit = " rad" if name in ANGLES else " m"
-            size = getattr(self.errors, name).size
-            limits[f"the errors of {name.replace('_', ' ')}"] = (size, 0.0, MAX_SIZE, unit)
         for name, sigma in vars(self.table).items():
             unit = " rad" if name in ("psi", "theta") else " m"
             limits[f"the noise of {name}"] = (sigma, *SIGMA_RANGE, unit)
@@ -353,10 +350,12 @@ class SimulationSettings:
                     f"found views named {', '.join(map(repr, names))}, needed different names that "
                     "can be those of files; rename some."
                 )
-        if self.hand_held and isinstance(self.views, Sequence):
+        if (self.board, self.platform_board) != (None, None) and (
+            self.plan is not None or isinstance(self.views, Sequence)
+        ):
             yield (
-                "found a camera in the hand and places of cameras, needed a number of views; "
-                "leave out one of the two."
+                "found a board, and cameras that stand already, needed cameras that are placed to "
+                "see it; leave out the board, or plan with one (legcal plan --board)."
             )
         if self.hand_held and self.images > 1:
             yield (
@@ -380,3 +379,144 @@ def joint_distance(machine: Machine, name: str) -> float | None:
         return None
     points = machine.A_base if side == "base" else machine.B_platform
     return float(np.linalg.norm(points[first_leg] - points[second_leg]))
+
+
+# The options of ``legcal simulate``
+
+
+_ERROR_KINDS = {"joints": ("base_joints", "platform_joints")} | {
+    kind.replace("_", "-"): (kind,) for kind in KINDS
+}
+
+
+def requested(
+    nominal: Machine,
+    *,
+    level: str = Level.PHOTOGRAPHS,
+    camera: Sequence[str] = (),
+    poses: str | None = None,
+    error: Sequence[str] = (),
+    board: str | None = None,
+    hand_held: bool = False,
+    plan: Path | None = None,
+    seed: int = 0,
+) -> SimulationSettings:
+    """Return the settings of options; Python has more (:class:`SimulationSettings`)."""
+    for option, is_given in (("--poses", poses is not None), ("--hand-held", hand_held)):
+        if plan is not None and is_given:
+            raise UsageError(
+                f"The plan could not be shot: found --plan and {option}, needed one of them, a "
+                f"plan says poses and cameras; leave out {option}."
+            )
+    if hand_held and board is None:
+        raise UsageError(
+            "--hand-held could not be used: found no --board, needed a board on the base; add "
+            "--board charuco."
+        )
+    file, appearance = _camera(camera, level)
+    return SimulationSettings(
+        level=level,
+        errors=parameter_errors(error, nominal),
+        poses=15 if poses is None else _poses(poses),
+        camera=file,
+        appearance=appearance,
+        board=_board(board),
+        hand_held=hand_held,
+        plan=plan,
+        seed=seed,
+    )
+
+
+def _camera(choices: Sequence[str], level: str) -> tuple[Path | None, Appearance]:
+    """Return the camera file, and the appearance of photographs for the kind of camera."""
+    files, looks = list[Path](), list[Appearance]()
+    for choice in choices:
+        kind, colon, quality = choice.partition(":")
+        if kind in CAMERAS and (not colon or quality.isdecimal()):
+            jpeg = int(quality) if colon else None
+            looks.append(Appearance(camera=kind, jpeg=jpeg, colour=CAMERAS[kind].colour))
+        elif kind not in CAMERAS and (Path(choice).exists() or re.search(r"[./\\]", choice)):
+            files.append(Path(choice))
+        else:
+            raise UsageError(
+                f"--camera could not be used: found {describe(choice)}, neither a kind of camera "
+                f"nor a file, needed {', '.join(CAMERAS)}, one of them with the quality of its "
+                f"JPEG files such as webcam:60, or the path of a file; {closest(kind, CAMERAS)}"
+            )
+    if max(len(files), len(looks)) > 1:
+        raise UsageError(
+            f"--camera could not be used: found {len(files)} files and {len(looks)} kinds, needed "
+            "at most one of each; leave out the others."
+        )
+    if looks and level != Level.PHOTOGRAPHS:
+        raise UsageError(
+            f"--camera {looks[0].camera} could not be used: found --level {level}, needed "
+            "photographs, which a kind of camera changes; leave it out."
+        )
+    return files[0] if files else None, looks[0] if looks else Appearance()
+
+
+def _poses(text: str) -> int | Path:
+    """Return a number of poses, or the path of a CSV."""
+    if text.isdecimal():
+        return int(text)
+    if re.fullmatch(r"[-+]?[\d.]+", text) or not Path(text).exists():
+        raise UsageError(
+            f"--poses could not be used: found {describe(text)}, neither a whole number nor a "
+            "file, needed the number of poses for each view or the path of a CSV; correct it."
+        )
+    return Path(text)
+
+
+def _board(choice: str | None) -> str | Path | None:
+    """Return a kind of board, or the path of a file."""
+    if choice is None or choice in BOARD_KINDS:
+        return choice
+    if not Path(choice).exists():
+        raise UsageError(
+            f"--board could not be used: found {describe(choice)}, neither a kind of board nor a "
+            f"file, needed {', '.join(BOARD_KINDS)} or the path of a YAML file; "
+            f"{closest(choice, BOARD_KINDS)}"
+        )
+    return Path(choice)
+
+
+def parameter_errors(texts: Sequence[str], nominal: Machine) -> ParameterErrors:
+    """Return the errors of parameters from words such as ``joints=2mm``."""
+    errors, possible = DEFAULT_ERRORS, kinds_of(nominal)
+    for text in texts:
+        if text == "none":
+            errors = ParameterErrors()
+            continue
+        kind, equals, size = text.partition("=")
+        units = ANGLE if kind in ANGLES else LENGTH
+        if kind in _ERROR_KINDS and not size:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)} without a size, needed "
+                f"KIND=SIZE; write {kind}={'2mm' if units is LENGTH else '0.1deg'}."
+            )
+        if not equals or kind not in _ERROR_KINDS:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)}, needed KIND=SIZE or none, "
+                f"such as joints=2mm; {closest(kind, _ERROR_KINDS)}"
+            )
+        kinds, spread = _ERROR_KINDS[kind], _spread(size, units, f"--error {kind}")
+        if spread.size > 0.0 and not possible & set(kinds):
+            raise UsageError(
+                f"--error {kind} could not be used: found none in the mechanism "
+                f"'{nominal.name}', needed one that has them; leave it out."
+            )
+        errors = replace(errors, **dict.fromkeys(kinds, spread))  # type: ignore[arg-type]
+    return errors
+
+
+def _spread(text: str, units: Mapping[str, float], option: str) -> Spread:
+    """Return a spread such as ``2mm`` or ``2mm:normal``."""
+    size, colon, name = text.partition(":")
+    if colon and name not in list(Distribution):
+        raise UsageError(
+            f"{option} could not be used: found the distribution {describe(name)}, needed uniform "
+            "(the size is half the width) or normal (the size is one standard deviation); "
+            "correct it."
+        )
+    return Spread(parse_quantity(size, units, option), name if colon else Distribution.UNIFORM)

@@ -8,6 +8,7 @@ written as runs end; a run with an incomplete line, after a kill, is done again.
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +19,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from legcal.brief import brief
 from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
 from legcal.files.schema import SparseDocument
@@ -32,10 +32,7 @@ DOCUMENT_NAME = "study.json"
 _STUDY = OutputKind("result of the study", "", "")  # in a folder with checkpoint and other files
 _KEY, _VERSION = "legcal_study", 1
 _MOST_RUNS = 1_000_000
-_LARGEST_CHUNK = 10  # maximum number of runs between two writes to the checkpoint
 _PROCESSES = 4  # maximum number of processes for each core; more only wait for each other
-_MANY = 64  # assumed number of workers of a cluster
-_CHUNKS = 16  # chunks for each process, so that the work is shared evenly to the end
 
 Record = dict[str, Any]
 """The result of one run as a JSON document: numbers, texts, lists, null; never NaN."""
@@ -83,28 +80,16 @@ class StudyHeading(SparseDocument):
     failures: dict[str, int]  # runs that failed as a whole, by kind of error
 
 
-@brief
 @dataclass(frozen=True, eq=False)
 class StudyResult:
     """A finished study."""
 
-    study: str  # its name
-    settings: dict[str, Any]  # its settings
-    seed: int  # seed, n_runs: seed and number of runs
-    n_runs: int
-    failures: dict[str, int]  # number of failed runs by kind of error
-    summary: Summary  # result of the other runs
+    heading: StudyHeading
+    summary: Summary  # result of the runs that did not fail
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
-        heading = StudyHeading(
-            study=self.study,
-            settings=self.settings,
-            seed=self.seed,
-            runs=self.n_runs,
-            failures=self.failures,
-        )
-        return self.summary.document() | heading.document()
+        return self.summary.document() | self.heading.document()
 
 
 def run_study(
@@ -153,24 +138,30 @@ def run_study(
         If a file cannot be written or a process is ended from outside.
     """
     _check_numbers(n_runs, seed, workers)
-    checkpoint, stage = _Checkpoint(output, _header(study, seed)), f"Study {study.name}"
+    about = {"study": study.name, "version": __version__, "seed": seed, "settings": study.settings}
+    heading = _parsed(_encoded({_KEY: _VERSION, **about}))
+    checkpoint, stage = _Checkpoint(output, heading), f"Study {study.name}"
     missing = [run for run in range(n_runs) if run not in checkpoint.lines]
     with shown_progress(progress) as report:
         done = n_runs - len(missing)
         report(stage, done, n_runs)
         if missing:
-            slots = _MANY
             if is_number(workers):
-                workers = slots = min(workers, len(missing), _PROCESSES * processors())
+                workers = min(workers, len(missing), _PROCESSES * processors())
             with worker_pool(workers, "The study could not be finished", in_order=False) as run:
-                for lines in run(partial(run_chunk, study, seed), _chunks(missing, slots)):
-                    checkpoint.add(lines)
-                    done += len(lines)
+                for line in run(partial(_line_of_run, study, seed), missing):
+                    checkpoint.add(line)
+                    done += 1
                     report(stage, done, n_runs)
     in_order = [checkpoint.lines[run] for run in range(n_runs)]
     result = _result(study, seed, in_order)
     if output is not None:
-        _write(result, output, beside)
+        document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
+        with result_folder(output, _STUDY) as folder:
+            for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
+                (folder / name).write_bytes(content)
+            if beside is not None:
+                beside(result, folder)
     return result
 
 
@@ -182,36 +173,30 @@ def _result(study: Study, seed: int, lines: Sequence[Record]) -> StudyResult:
             f"The study {study.name} found nothing: all of its {len(lines)} runs failed, needed "
             f"one that does not; the first one says: {failures[0]['message']}"
         )
-    kinds = dict(Counter(failure["kind"] for failure in failures))
-    summary = study.summary(line["record"] for line in lines if "record" in line)
-    return StudyResult(study.name, study.settings, seed, len(lines), kinds, summary)
-
-
-def _write(
-    result: StudyResult, folder: Path, beside: Callable[[StudyResult, Path], None] | None
-) -> None:
-    """Write the document and the figures, all of them or nothing."""
-    document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
-    with result_folder(folder, _STUDY) as new:
-        for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
-            (new / name).write_bytes(content)
-        if beside is not None:
-            beside(result, new)
+    heading = StudyHeading(
+        study=study.name,
+        settings=study.settings,
+        seed=seed,
+        runs=len(lines),
+        failures=dict(Counter(failure["kind"] for failure in failures)),
+    )
+    records = (line["record"] for line in lines if "record" in line)
+    return StudyResult(heading, study.summary(records))
 
 
 def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
     """Refuse numbers out of range."""
-    if n_runs > _MOST_RUNS:
-        raise UsageError(
-            f"The study could not be run: found runs = {n_runs}, needed {_MOST_RUNS} at most; give "
-            "another number."
-        )
     processes = workers if is_number(workers) else 1
-    for name, number, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", processes, 1)):
-        if number < least:
+    for name, number, least, most in (
+        ("runs", n_runs, 1, _MOST_RUNS),
+        ("seed", seed, 0, math.inf),
+        ("workers", processes, 1, math.inf),
+    ):
+        if not least <= number <= most:
+            needed = f"{least} or more" if number < least else f"{most} at most"
             raise UsageError(
-                f"The study could not be run: found {name} = {number}, needed {least} or more; "
-                "give another number."
+                f"The study could not be run: found {name} = {number}, needed {needed}; give "
+                "another number."
             )
 
 
@@ -221,51 +206,51 @@ def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
 class _Checkpoint:
     """The lines of completed runs, kept in the file of an output folder if there is one."""
 
-    def __init__(self, output: Path | None, first: Record) -> None:
+    def __init__(self, output: Path | None, heading: Record) -> None:
         self.lines: dict[int, Record] = {}
-        self._path = None
-        if output is not None:
-            _prepare_folder(output)
-            self._path = output / CHECKPOINT_NAME
+        self._path = None if output is None else output / CHECKPOINT_NAME
+        if output is not None and self._path is not None:
+            _check_folder(output, self._path)
             with _writing(self._path):
-                self._read(self._path, first)
+                output.mkdir(parents=True, exist_ok=True)
+                self._read(self._path, heading)
 
-    def add(self, lines: Sequence[Record]) -> None:
-        """Add the lines of some runs; nothing once a signal was heard."""
+    def add(self, line: Record) -> None:
+        """Add the line of a run; nothing once a signal was heard."""
         raise_if_stopped()
         if self._path is not None:
             with _writing(self._path), self._path.open("ab") as file:
-                file.write(b"".join(map(_encoded, lines)))
-        self.lines |= {line["run"]: line for line in lines}
+                file.write(_encoded(line))
+        self.lines[line["run"]] = line
 
-    def _read(self, path: Path, first: Record) -> None:
+    def _read(self, path: Path, heading: Record) -> None:
         """Read existing lines, and drop an incomplete line at the end; or begin the file."""
         content = path.read_bytes() if path.exists() else b""
-        heading, end, body = content.partition(b"\n")
-        if not end and _encoded(first).startswith(heading):  # new, or killed while it was begun
-            path.write_bytes(_encoded(first))
+        first, end, body = content.partition(b"\n")
+        if not end and _encoded(heading).startswith(first):  # new, or killed while it was begun
+            path.write_bytes(_encoded(heading))
             return
-        _check_header(path, heading, first)
-        *runs, unfinished = body.split(b"\n")
-        if runs and not unfinished and not _parsed(runs[-1]):  # zeros, after a power cut
-            unfinished = runs.pop()
-        for number, line in enumerate(runs, 2):
-            run = _parsed(line)
-            if not _is_run(run):
+        _check_heading(path, _parsed(first), heading)
+        *lines, unfinished = body.split(b"\n")
+        if lines and not unfinished and not _parsed(lines[-1]):  # zeros, after a power cut
+            unfinished = lines.pop()
+        for number, line in enumerate(lines, 2):
+            entry = _parsed(line)
+            outcome = entry.get("record", entry.get("failure"))
+            if type(entry.get("run")) is not int or entry["run"] < 0 or type(outcome) is not dict:
                 raise UsageError(
                     f"{path}: the study could not be continued: found line {number} damaged, "
                     "needed a complete JSON object of a run on every line; remove that line, or "
                     "give another output folder."
                 )
-            self.lines.setdefault(run["run"], run)
+            self.lines.setdefault(entry["run"], entry)
         if unfinished:
-            path.write_bytes(b"".join(line + b"\n" for line in (heading, *runs)))
+            path.write_bytes(b"".join(line + b"\n" for line in (first, *lines)))
 
 
-def _prepare_folder(output: Path) -> None:
-    """Make the output folder; refuse a folder with other content than a study."""
+def _check_folder(output: Path, checkpoint: Path) -> None:
+    """Refuse a folder with other content than a study."""
     check_path(output, _STUDY)
-    checkpoint = output / CHECKPOINT_NAME
     is_begun = checkpoint.is_file() and (
         checkpoint.stat().st_size > 0 or list(output.iterdir()) == [checkpoint]
     )
@@ -275,8 +260,6 @@ def _prepare_folder(output: Path) -> None:
             f"{CHECKPOINT_NAME} of a study, needed a new or empty folder or that of the same "
             "study; give another output folder."
         )
-    with _writing(output):
-        output.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
@@ -292,46 +275,25 @@ def _writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _header(study: Study, seed: int) -> Record:
-    """Return the first line of the checkpoint of a study."""
-    first = {"study": study.name, "version": __version__, "seed": seed, "settings": study.settings}
-    return _parsed(_encoded({_KEY: _VERSION, **first}))
-
-
-def _check_header(path: Path, line: bytes, expected: Record) -> None:
-    """Refuse an unexpected first line."""
-    header = _parsed(line)
-    if header == expected:
+def _check_heading(path: Path, heading: Record, expected: Record) -> None:
+    """Refuse the runs of another study."""
+    if heading == expected:
         return
-    if _KEY not in header:
+    if _KEY not in heading:
         raise UsageError(
             f"{path}: the study could not be continued: found a file that is no checkpoint of "
             "legcal, needed one or none; give another output folder."
         )
-    flat, needed = ({**first, **dict(first.get("settings") or {})} for first in (header, expected))
-    different = [name for name in needed if name != "settings" and flat.get(name) != needed[name]]
+    flat, needed = ({**h, **dict(h.get("settings") or {})} for h in (heading, expected))
     differences = "; ".join(
-        f"{name} {flat.get(name)!r} instead of {needed[name]!r}" for name in different
+        f"{name} {flat.get(name)!r} instead of {needed[name]!r}"
+        for name in needed
+        if name != "settings" and flat.get(name) != needed[name]
     )
     raise UsageError(
         f"{path}: the study could not be continued: found the runs of another command "
         f"({differences}), needed those of the same; give another output folder, or this one the "
         "command that began it."
-    )
-
-
-def _is_run(entry: Record) -> bool:
-    """Return whether a line has the record of a run, or its failure."""
-    run, failure = entry.get("run"), entry.get("failure")
-    if type(run) is not int or not 0 <= run < _MOST_RUNS:
-        return False
-    if entry.keys() == {"run", "record"}:
-        return isinstance(entry["record"], dict)
-    return (
-        entry.keys() == {"run", "failure"}
-        and isinstance(failure, dict)
-        and failure.keys() == {"kind", "message"}
-        and all(isinstance(text, str) for text in failure.values())
     )
 
 
@@ -349,30 +311,17 @@ def _parsed(line: bytes) -> Record:
     return value if isinstance(value, dict) else {}
 
 
-# Runs in processes
+def _line_of_run(study: Study, seed: int, run: int) -> Record:
+    """Return the line of a run, with child ``run`` of the study's seed.
 
-
-def child_seed(seed: int, run: int) -> np.random.SeedSequence:
-    """Return the seed of a run: child ``run`` of the study's seed, however many there are."""
-    return np.random.SeedSequence(seed, spawn_key=(run,))
-
-
-def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[Record]:
-    """Return the line of each run; a LegcalError is a failure, any other error is raised."""
-    lines: list[Record] = []
-    for run in runs:
-        try:
-            lines.append({"run": run, "record": study.one_run(child_seed(seed, run))})
-        except LegcalError as error:
-            lines.append({"run": run, "failure": failure_of(error)})
-    return lines
+    A LegcalError is a failure; any other error is raised.
+    """
+    try:
+        return {"run": run, "record": study.one_run(np.random.SeedSequence(seed, spawn_key=(run,)))}
+    except LegcalError as error:
+        return {"run": run, "failure": failure_of(error)}
 
 
 def failure_of(error: LegcalError) -> dict[str, str]:
     """Return a failure as a record."""
     return {"kind": type(error).__name__, "message": str(error)}
-
-
-def _chunks(runs: Sequence[int], workers: int) -> Iterator[Sequence[int]]:
-    size = min(max(len(runs) // (_CHUNKS * workers), 1), _LARGEST_CHUNK)
-    return (runs[first : first + size] for first in range(0, len(runs), size))

@@ -6,7 +6,6 @@ the closed pose nearest to the nominal home.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +15,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
-from legcal.files.quantity import SHOWN_IN
 from legcal.files.reading import MAX_TEXT, read_bytes
 from legcal.machine.home import home_of_legs
 from legcal.machine.leg import Leg
@@ -33,10 +31,7 @@ from legcal.machine.parameters import (
 from legcal.machine.ties import machine_ties, on_ties
 from legcal.machine.urdf import UrdfPatch
 from legcal.simulation.settings import (
-    ANGLES,
     ERRORS_OF,
-    KINDS,
-    MAX_SIZE,
     Distribution,
     ParameterErrors,
     Spread,
@@ -59,7 +54,6 @@ def draw_errors(
     do not depend on errors of another kind. B of a leg that is fixed to the platform then slides
     along the leg to its place in models, the foot of the platform link's origin.
     """
-    _check(errors)
     parametrization, legs = parametrization_of(nominal, twists=True), geometries(nominal)
     uniform, normal = (
         rng.uniform(-1.0, 1.0, len(parametrization)),
@@ -87,21 +81,6 @@ def _spread(errors: ParameterErrors, name: str) -> Spread:
         return Spread()
     spread: Spread = getattr(errors, ERRORS_OF[kind])
     return spread
-
-
-def _check(errors: ParameterErrors) -> None:
-    """Refuse sizes out of range."""
-    problems = []
-    for kind in KINDS:
-        size = getattr(errors, kind).size
-        if not (math.isfinite(size) and 0.0 <= size <= MAX_SIZE):
-            scale, unit = SHOWN_IN["rad" if kind in ANGLES else "m"]
-            problems.append(
-                f"The errors of {kind.replace('_', ' ')} could not be drawn: found a size of "
-                f"{scale * size:g} {unit}, needed 0 to {scale * MAX_SIZE:.3g} {unit}; correct it."
-            )
-    if problems:
-        raise UsageError(problems)
 
 
 def draw_radii(

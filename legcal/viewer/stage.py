@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine.drawing import corners_of_base, motor_lines
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
-from legcal.scene.motions import FACTORS, MachineScene, PlacedModel
-from legcal.scene.shapes import enlargement
+from legcal.machine.picture import corners_of_base, motor_lines
+from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, enlargement
 from legcal.viewer.motion import Posture
 from legcal.viewer.source import Source
 

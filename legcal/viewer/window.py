@@ -27,8 +27,7 @@ from legcal.machine.coordinates import COORDINATES
 from legcal.scene.motions import FACTORS
 from legcal.viewer.address import Address, check_address
 from legcal.viewer.motion import Motion
-from legcal.viewer.photographs import Photographs, Place
-from legcal.viewer.source import Source
+from legcal.viewer.source import Photographs, Place, Source
 from legcal.viewer.stage import Seen, Stage
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ class Window:
                 "/motors", vertices, faces, seen.motors.wxyz, seen.motors.position,
                 batched_scales=seen.motors.scale, batched_colors=colours, lod="off",
             )  # fmt: skip
-        vertices, faces = _ball(12)
+        vertices, faces = _ball()
         radii = np.repeat(np.tile(stage.ball_radii, 2)[:, None], 3, axis=1)
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(radii), 1))
         n = self.source.machine.n_legs
@@ -207,7 +206,7 @@ class Window:
             )
             self._ellipsoid_turns = dict(zip(axes, rotations, strict=True))
             self._ellipsoids = scene.add_batched_meshes_simple(
-                "/uncertainty", *_ball(16), np.tile([1.0, 0, 0, 0], (2 * n, 1)),
+                "/uncertainty", *_ball(), np.tile([1.0, 0, 0, 0], (2 * n, 1)),
                 np.concatenate([seen.A, seen.B]),
                 batched_scales=np.maximum(np.concatenate(scales), 2e-4 * size),
                 batched_colors=_AMBER, opacity=0.85, lod="off",
@@ -548,21 +547,12 @@ def _cylinder(n: int) -> tuple[Array, Any]:
     return np.concatenate([sides, caps]), np.concatenate(faces)
 
 
-def _ball(n: int) -> tuple[Array, Any]:
+def _ball() -> tuple[Array, Any]:
     """Return vertices and faces of a ball of radius 1."""
-    up = np.linspace(0.0, np.pi, n)
-    turn = np.linspace(0.0, 2.0 * np.pi, 2 * n)
-    u, v = np.meshgrid(up, turn, indexing="ij")
-    vertices = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
-    i, j = np.meshgrid(np.arange(n - 1), np.arange(2 * n - 1), indexing="ij")
-    a = (i * 2 * n + j).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([a, a + 2 * n, a + 1], axis=1),
-            np.stack([a + 1, a + 2 * n, a + 2 * n + 1], axis=1),
-        ]
-    )
-    return vertices.reshape(-1, 3), faces
+    from trimesh.creation import icosphere
+
+    ball = icosphere(subdivisions=3)
+    return ball.vertices, ball.faces
 
 
 def _plate(joints: Array, rim: list[int]) -> tuple[Any, Any]:

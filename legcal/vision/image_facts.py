@@ -58,40 +58,20 @@ class UnreadableError(ValueError):
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """The metadata of an image file; "" and None for missing values.
+    """The metadata of an image file; "" and None for missing values."""
 
-    Attributes
-    ----------
-    jpeg_quality : int or None
-        Approximate quality of a JPEG on the scale of the IJG, 1 to 100, from its quantisation.
-    device, serial, lens, software : str
-        Make and model of the camera, its number, its lens, and the program that wrote the file.
-    focal_length, focal_length_35mm : float or None
-        Focal length of the lens, and of a lens with the same field of view on 35 mm film [mm].
-    focus_distance : float or None
-        Distance in focus [m].
-    digital_zoom : float or None
-        Magnification of the middle of the image.
-    orientation : int or None
-        EXIF orientation for display, 1 to 8; 1 is unrotated.
-    taken_size : tuple of int or None
-        Original width and height [px].
-    taken_at : str
-        Time by the clock of the camera, ``2026:11:23 10:15:00``.
-    """
-
-    jpeg_quality: int | None = None
-    device: str = ""
-    serial: str = ""
+    jpeg_quality: int | None = None  # about, on the scale of the IJG, 1 to 100
+    device: str = ""  # make and model of the camera
+    serial: str = ""  # its number
     lens: str = ""
-    software: str = ""
-    focal_length: float | None = None
-    focal_length_35mm: float | None = None
-    focus_distance: float | None = None
-    digital_zoom: float | None = None
-    orientation: int | None = None
-    taken_size: Size | None = None
-    taken_at: str = ""
+    software: str = ""  # the program that wrote the file
+    focal_length: float | None = None  # [mm]
+    focal_length_35mm: float | None = None  # with the same field of view on 35 mm film [mm]
+    focus_distance: float | None = None  # distance in focus [m]
+    digital_zoom: float | None = None  # magnification of the middle of the image
+    orientation: int | None = None  # EXIF orientation for display, 1 to 8; 1 is unrotated
+    taken_size: Size | None = None  # original width and height [px]
+    taken_at: str = ""  # time by the clock of the camera, ``2026:11:23 10:15:00``
 
 
 @contextmanager

@@ -24,8 +24,8 @@ from legcal.calibration.camera_calibration.diagnostics import (
 from legcal.calibration.camera_calibration.document import (
     CAMERA_FILE,
     PICTURE_FILE,
+    BoardImage,
     CameraCalibration,
-    ImageResult,
     write_camera,
     write_picture,
 )
@@ -170,8 +170,6 @@ def _check_options(
 
 @dataclass(frozen=True, eq=False)
 class _Photographs:
-    """Photographs of one size."""
-
     paths: tuple[Path, ...]
     facts: tuple[ImageFacts, ...]  # metadata of each file
     size: ImageSize
@@ -216,7 +214,6 @@ class _CornerSearch:
 
 
 def _search(board: Board, photographs: _Photographs, run: Run, progress: Report) -> list[SeenBoard]:
-    """Return the board features of every image."""
     n, results = len(photographs.paths), list[SeenBoard]()
     progress(_STAGE, 0, n)
     anywhere = replace(photographs, paths=tuple(path.absolute() for path in photographs.paths))
@@ -267,7 +264,6 @@ def _shown_instead(board: Board, photographs: _Photographs) -> str:
 
 
 def _not_visible(board: Board, instead: str) -> NotVisible:
-    """Return the error for images without the board."""
     hint = ""
     if board.kind == "chessboard":
         hint = f" (squares are counted: {board.columns - 1} x {board.rows - 1} inner corners)"
@@ -308,7 +304,6 @@ def _copies(
 def _result(
     photographs: _Photographs, board_in_images: _ShownBoard, lens: ChosenLens
 ) -> CameraCalibration:
-    """Return the result with its diagnostics."""
     fitted, paths, facts = lens.fit, photographs.paths, photographs.facts
     adjusted, corners = fitted.adjusted, fitted.corners
     used = {board_in_images.images[k]: i for i, k in enumerate(fitted.images)}
@@ -321,15 +316,17 @@ def _result(
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
-        n = len(board_in_images.corners[k].number)
         reason = left_out.get(k, "" if k in board_in_images.images else "the board was not found")
-        if i is None:
-            images.append(ImageResult(path.name, n, 0, None, None, reason))
-            continue
         of_image = corners.image == i
-        n_used = int(np.count_nonzero(of_image))
         images.append(
-            ImageResult(path.name, n, n_used, adjusted.rms_px(of_image), float(tilt[i]), "")
+            BoardImage(
+                image=path.name,
+                corners=len(board_in_images.corners[k].number),
+                used=int(np.count_nonzero(of_image)),
+                rms_px=None if i is None else adjusted.rms_px(of_image),
+                tilt_rad=None if i is None else float(tilt[i]),
+                reason=(reason or None) if i is None else None,
+            )
         )
     used_images = [k for k, image in enumerate(images) if image.used]
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
@@ -360,14 +357,13 @@ def _result(
     )
 
 
-def _left_out(images: Sequence[ImageResult]) -> list[str]:
+def _left_out(images: Sequence[BoardImage]) -> list[str]:
     """Return a sentence for each reason, with the images left out."""
-    by_reason = _by_reason((image.name, image.reason) for image in images if image.reason)
+    by_reason = _by_reason((image.image, image.reason) for image in images if image.reason)
     return [f"{', '.join(names)} left out: {reason}." for reason, names in by_reason.items()]
 
 
 def _by_reason(left_out: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the names of the left-out images by reason."""
     names_by_reason: dict[str, list[str]] = {}
     for name, reason in left_out:
         names_by_reason.setdefault(reason, []).append(name)

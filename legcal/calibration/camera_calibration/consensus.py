@@ -60,8 +60,6 @@ _MIN_INLIERS = 0.6  # smallest share of inlier corners in a used image
 
 @dataclass(frozen=True, eq=False)
 class _Agreement:
-    """Images that agree on a camera."""
-
     adjusted: AdjustedBoard  # camera fitted to these; poses and residuals of all images
     left_out: dict[int, str]  # the other images with their faults
     rival: tuple[int, ...]  # other images that agree among themselves
@@ -264,8 +262,6 @@ def _whole_picture(adjusted: AdjustedBoard) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fault:
-    """A possible fault of an image."""
-
     gain: float  # share of the excess cost of the image that it explains
     # (2,): relative change of both focal lengths, or shift of the principal point [px]
     change: Array

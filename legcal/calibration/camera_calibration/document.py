@@ -47,33 +47,15 @@ PICTURE_FILE = OutputFile(
 )
 
 
-@dataclass(frozen=True)
-class ImageResult:
-    """Corners, residuals and board tilt of an image.
+class BoardImage(Document):
+    """Corners, residuals and board tilt of an image."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the file.
-    corners : int
-        Number of corners of the board that were found.
-    used : int
-        Number of corners that were used.
-    rms_px : float or None
-        Root mean square of the residuals, both coordinates together [px]; None if the image was
-        left out.
-    tilt : float or None
-        Tilt of the board out of the image plane [rad].
-    reason : str
-        Reason for leaving the image out; "" if it was used.
-    """
-
-    name: str
-    corners: int
+    image: str  # name of the file
+    corners: int  # of the board that were found
     used: int
-    rms_px: float | None
-    tilt: float | None
-    reason: str
+    rms_px: float | None  # of the residuals, both coordinates together; None if left out
+    tilt_rad: float | None  # of the board out of the image plane
+    reason: str | None  # for leaving the image out
 
 
 @brief
@@ -89,7 +71,7 @@ class CameraCalibration:
         Covariance of its intrinsics, in the order of ``names`` [px, and without unit].
     board : Board
         The calibration board.
-    images : tuple of ImageResult
+    images : tuple of BoardImage
         All images in the given order.
     rms_px : float
         Root mean square of the residuals, both coordinates together [px].
@@ -119,7 +101,7 @@ class CameraCalibration:
     camera: Camera
     covariance: Array
     board: Board
-    images: tuple[ImageResult, ...]
+    images: tuple[BoardImage, ...]
     rms_px: float
     noise_px: float
     coverage: float
@@ -174,17 +156,7 @@ class CameraCalibration:
             rms_px=self.rms_px,
             noise_px=self.noise_px,
             coverage=self.coverage,
-            images=[
-                BoardImage(
-                    image=image.name,
-                    corners=image.corners,
-                    used=image.used,
-                    rms_px=image.rms_px,
-                    tilt_rad=image.tilt,
-                    reason=image.reason or None,
-                )
-                for image in self.images
-            ],
+            images=list(self.images),
             warnings=list(self.warnings),
             lens=self.lens,
             validated_px=self.validated_px,
@@ -200,17 +172,6 @@ class Intrinsic(Document):
     name: str
     value: float
     sigma: float
-
-
-class BoardImage(Document):
-    """Corners, residuals and board tilt of an image."""
-
-    image: str
-    corners: int
-    used: int
-    rms_px: float | None
-    tilt_rad: float | None
-    reason: str | None
 
 
 class CameraDocument(Document):
@@ -261,7 +222,7 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
         "names": list(names),
         "covariance": calibration.covariance.tolist(),
         "images": [
-            {"image": i.name, "corners": i.used, "rms_px": _short(i.rms_px)}
+            {"image": i.image, "corners": i.used, "rms_px": _short(i.rms_px)}
             for i in calibration.images
             if i.rms_px is not None
         ],

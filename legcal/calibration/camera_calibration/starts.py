@@ -39,7 +39,6 @@ def from_scratch(
 def _all_adjusted(
     camera: Camera, poses: Sequence[RigidTransform], sheet: Sheet, corners: BoardImages
 ) -> AdjustedBoard | None:
-    """Return the adjustment of poses, all intrinsics and the sheet from a start."""
     return adjust_board(camera, poses, corners, intrinsic_names(camera), sheet)
 
 

@@ -23,7 +23,13 @@ from legcal.calibration.identify.remedies import (
     judge_board,
     recommend,
 )
-from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
+from legcal.calibration.identify.report import (
+    ConditionBlock,
+    Identifiability,
+    PaperBlock,
+    Ranks,
+    Recommendation,
+)
 from legcal.calibration.identify.session import (
     THIN,
     Session,
@@ -56,7 +62,6 @@ from legcal.machine.ties import ties_in_words
 from legcal.paper.conditions import (
     Condition,
     count_conditions,
-    enough_readings,
     three_legs_at_once,
     two_directions,
 )
@@ -209,26 +214,31 @@ def identifiability_of_dataset(
     report = _report_on(dataset.machine, analysis, None, None)
     if dataset.axes is None:
         intrinsics = expected_intrinsics(analysis)
-        report = replace(report, intrinsics=intrinsics)
+        report = report.model_copy(update={"intrinsics": intrinsics})
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
-    return replace(report, notes=(*report.notes, note))
+    return report.model_copy(update={"notes": (*report.notes, note)})
 
 
 def ranks_of_dataset(
     dataset: Dataset, choices: Choices = NO_CHOICES
-) -> tuple[tuple[Condition, ...], Ranks]:
+) -> tuple[tuple[ConditionBlock, ...], Ranks]:
     """Return the paper's conditions and the rank of the joint fit for a dataset.
 
     As :func:`identifiability_of_dataset`, without remedies.
     """
     analysis = _analysis_of(dataset, choices)
-    return conditions_of(dataset.machine, analysis.session), analysis.full
+    return _named_conditions(dataset.machine, analysis.session), analysis.full
+
+
+def _named_conditions(machine: Machine, session: Session) -> tuple[ConditionBlock, ...]:
+    """Return the paper's conditions with the names of legs."""
+    conditions = conditions_of(machine, session)
+    return tuple(ConditionBlock.of(condition, machine.leg_names) for condition in conditions)
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
-    """Analysis of the recorded observations of a dataset."""
     chosen = (*choices.free, *choices.priors)
     twists = any(is_held_by_default(name) for name in chosen)
     return Analysis(recorded_session(dataset, twists=twists), choices)
@@ -268,9 +278,8 @@ def _report_on(
     recommendation: tuple[Recommendation, ...] | None,
     replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
-    """Report on a session."""
     session = analysis.session
-    conditions = conditions_of(machine, session)
+    conditions = _named_conditions(machine, session)
     board = judge_board(
         analysis,
         *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
@@ -304,7 +313,8 @@ def _report_on(
         remedies=() if full.complete else find_remedies(analysis, replanned),
         recommendation=recommendation,
         notes=tuple(notes),
-        scale=scale_sources(analysis),
+        scale=scale_sources(analysis) or None,
+        paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )
 
 
@@ -325,7 +335,6 @@ def _rough_notes(analysis: Analysis) -> list[str]:
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    """Return notes on a machine, independent of the views."""
     hidden = [j for j, leg in enumerate(machine.legs) if not leg.cylinders]
     notes = []
     if hidden:
@@ -357,9 +366,7 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
         actuators=session.on_actuators,
     )
     frame, pose = session.frame[session.view[image]], session.pose[image]
-    moves = session.carried_by[leg] >= 0
-    still, rods = np.flatnonzero(~moves), np.flatnonzero(moves)
-    q = session.q[pose[rods], session.carried_by[leg[rods]]]
+    still = np.flatnonzero(session.carried_by[leg] < 0)
     directions = two_directions(
         frame[still], leg[still], session.u[pose[still], leg[still]], session.n_legs
     )
@@ -367,7 +374,6 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
     return (
         *counts,
         replace(directions, ok=not standing, legs=standing),
-        *enough_readings(frame[rods], leg[rods], q, session.legs),
         three_legs_at_once(session.views, geometries(machine), spatial=session.spatial),
     )
 

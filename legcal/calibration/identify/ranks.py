@@ -224,7 +224,6 @@ def _direction(
 
 
 def _limit(session: Session, sigma: float = _MAX_SIGMA) -> float:
-    """Least singular value of a determined direction [1/m]."""
     return 1.0 / (sigma * session.mean_length)
 
 

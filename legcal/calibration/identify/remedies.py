@@ -201,7 +201,6 @@ def judge_board(
 
 
 def _ranks(analysis: Analysis) -> BoardRanks:
-    """Ranks of an analysis."""
     return BoardRanks(analysis.full.rank, analysis.full.complete)
 
 
@@ -332,14 +331,12 @@ def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:
-    """Legs with undetermined parameters."""
     touched = {p for d in _harmful(analysis) for p in d.parameters}
     names = analysis.session.leg_names
     return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
 
 
 def _harmful(analysis: Analysis) -> list[WeakDirection]:
-    """Return the open directions that move the platform."""
     return [d for d in analysis.full.weak if not d.harmless]
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from legcal.brief import brief
 from legcal.files.schema import Document, SparseDocument
 from legcal.paper.conditions import Condition
 
@@ -91,7 +90,7 @@ class BoardReport:
     # joint fit determines all that moves the platform)
     needed_for: tuple[str, ...]
     without: BoardRanks  # without, with_board: the ranks without and with a board in every image
-    with_board: BoardRanks
+    with_board: Annotated[BoardRanks, Field(alias="with")]
     # the directions that only a board determines, in words
     mends: tuple[str, ...]
 
@@ -127,10 +126,44 @@ class CameraIntrinsics:
     sigma: dict[str, float | None]
 
 
-@brief
-@dataclass(frozen=True)
-class Identifiability:
-    """An identifiability report."""
+class ConditionBlock(SparseDocument):
+    """A condition of the paper: a count with its numbers, or the legs that fail it."""
+
+    name: str
+    ok: bool
+    needed: bool | None = None  # left out where it is
+    by_analogy: bool | None = None  # left out where it is the paper's
+    equations: int | None = None
+    unknowns: int | None = None
+    failing: list[str] | None = None  # legs
+
+    @property
+    def fails(self) -> bool:
+        """Whether it is needed and does not hold."""
+        return self.needed is not False and not self.ok
+
+    @classmethod
+    def of(cls, condition: Condition, legs: Sequence[str]) -> ConditionBlock:
+        """Return a condition with the names of the legs that fail it."""
+        return cls(
+            name=condition.name,
+            ok=condition.ok,
+            needed=None if condition.needed else False,
+            by_analogy=condition.by_analogy or None,
+            equations=condition.equations,
+            unknowns=condition.unknowns,
+            failing=None if condition.equations is not None else [legs[j] for j in condition.legs],
+        )
+
+
+class PaperBlock(Document):
+    """Whether all of the paper's conditions hold that are needed."""
+
+    ok: bool
+
+
+class Identifiability(SparseDocument):
+    """An identifiability report, which ``legcal identify --json`` prints."""
 
     spatial: bool  # whether the platform moves in space and not in a plane
     legs: tuple[str, ...]  # their names
@@ -140,7 +173,7 @@ class Identifiability:
     n_d: int
     r: int
     n_ac: int
-    conditions: tuple[Condition, ...]  # the paper's, as printed
+    conditions: tuple[ConditionBlock, ...]  # the paper's, as printed
     full: Ranks  # of the joint fit
     # whether the joint fit determines all directions that move the platform
     identifiable: bool
@@ -160,87 +193,15 @@ class Identifiability:
     notes: tuple[str, ...]
     # intrinsics that the legs determine, of a dataset with images; empty without them
     intrinsics: tuple[CameraIntrinsics, ...] = ()
-    # sources of the scale where only radii determine it: readings are angles or missing
-    scale: tuple[ScaleSource, ...] = ()
+    # sources of the scale where only radii determine it: readings are angles or missing; else None
+    scale: tuple[ScaleSource, ...] | None = None
+    paper: PaperBlock
 
     @property
     def conditions_hold(self) -> bool:
         """Whether all of the paper's conditions hold that are needed."""
-        return not any(condition.fails for condition in self.conditions)
+        return self.paper.ok
 
     def document(self) -> dict[str, Any]:
         """Return the report as plain JSON types; see the documentation of the files."""
-        document = asdict(self) | {"paper": {"ok": self.conditions_hold}}
-        document["conditions"] = [_condition(c, self.legs) for c in self.conditions]
-        document["scale"] = document["scale"] or None
-        for board in ("board", "platform_board"):
-            document[board]["with"] = document[board].pop("with_board")
-        model = IdentifyDocument.model_validate(document)
-        return model.model_dump(mode="json", by_alias=True)
-
-
-class ConditionBlock(SparseDocument):
-    """A condition of the paper: a count with its numbers, or the legs that fail it."""
-
-    name: str
-    ok: bool
-    needed: bool | None = None  # left out where it is
-    by_analogy: bool | None = None  # left out where it is the paper's
-    equations: int | None = None
-    unknowns: int | None = None
-    failing: list[str] | None = None  # legs
-
-
-class PaperBlock(Document):
-    """Whether all of the paper's conditions hold that are needed."""
-
-    ok: bool
-
-
-class BoardBlock(Document):
-    """A :class:`BoardReport`."""
-
-    present: bool
-    needed_for: list[str]
-    without: BoardRanks
-    with_board: BoardRanks = Field(alias="with")
-    mends: list[str]
-
-
-class IdentifyDocument(SparseDocument):
-    """What ``legcal identify --json`` prints: an :class:`Identifiability`."""
-
-    spatial: bool
-    legs: list[str]
-    n: int
-    n_d: int
-    r: int
-    n_ac: int
-    conditions: list[ConditionBlock]
-    full: Ranks
-    identifiable: bool
-    views: list[list[str]]
-    images: list[int]
-    board: BoardBlock
-    platform_board: BoardBlock
-    platform_sigma: RmsMotion | None
-    remedies: list[Remedy]
-    recommendation: list[Recommendation] | None
-    notes: list[str]
-    intrinsics: list[CameraIntrinsics]
-    scale: list[ScaleSource] | None = None  # left out where readings carry lengths
-    paper: PaperBlock
-
-
-def _condition(condition: Condition, legs: Sequence[str]) -> ConditionBlock:
-    """Return a condition as a document."""
-    is_count = condition.equations is not None
-    return ConditionBlock(
-        name=condition.name,
-        ok=condition.ok,
-        needed=None if condition.needed else False,
-        by_analogy=condition.by_analogy or None,
-        equations=condition.equations,
-        unknowns=condition.unknowns,
-        failing=None if is_count else [legs[j] for j in condition.legs],
-    )
+        return self.model_dump(mode="json", by_alias=True)

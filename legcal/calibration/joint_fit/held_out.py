@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import HoldoutPlatform
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -243,40 +244,35 @@ class HeldOut:
     deviation, from the noise of outlines and readings and the covariance of the fit.
     """
 
-    n_images: int  # held-out images
-    n_poses: int
+    images: int  # held-out images
+    poses: int
     outlines: int  # in these images
     wrong: int  # outliers, excluded below
     rms_px: float | None  # of the offsets [px]; None without outlines
     expected_px: float | None
-    rms_px_of_view: dict[str, float]  # by name of the view
+    views: dict[str, float]  # rms by name of the view [px]
     displacement: Array  # (n_known,) between poses by readings and by outlines [m]
     rotation: Array  # (n_known,) [rad]
     expected_displacement: Array
     expected_rotation: Array
 
     @property
-    def at_platform(self) -> PlatformPair | None:
+    def platform(self) -> HoldoutPlatform | None:
         """Measured and expected errors at the platform; None without poses.
 
         Poses are weighted by their expected errors.
         """
         if len(self.displacement) == 0:
             return None
-        return PlatformPair(
-            *_weighted_rms(self.displacement, self.expected_displacement),
-            *_weighted_rms(self.rotation, self.expected_rotation),
+        dX, expected_dX = _weighted_rms(self.displacement, self.expected_displacement)
+        dE, expected_dE = _weighted_rms(self.rotation, self.expected_rotation)
+        return HoldoutPlatform(
+            poses=len(self.displacement),
+            dX_m=dX,
+            expected_dX_m=expected_dX,
+            dE_rad=dE,
+            expected_dE_rad=expected_dE,
         )
-
-
-@dataclass(frozen=True)
-class PlatformPair:
-    """Root mean squares over poses: measured, and expected as one standard deviation."""
-
-    displacement: float  # [m]
-    expected_displacement: float
-    rotation: float  # [rad]
-    expected_rotation: float
 
 
 def compare_held_out(
@@ -321,13 +317,13 @@ def compare_held_out(
     )
     variance = np.einsum("kii->ki", by_outlines.covariance)
     return HeldOut(
-        n_images=measurements.n_rows,
-        n_poses=measurements.n_poses,
+        images=measurements.n_rows,
+        poses=measurements.n_poses,
         outlines=len(problem.outlines),
         wrong=int(np.sum(~inliers)),
         rms_px=_rms(offsets[inliers]),
         expected_px=_rms(np.sqrt(pixels[inliers])),
-        rms_px_of_view=_rms_by_view(measurements, problem.outlines.view[inliers], offsets[inliers]),
+        views=_rms_by_view(measurements, problem.outlines.view[inliers], offsets[inliers]),
         displacement=displacement,
         rotation=rotation,
         expected_displacement=np.sqrt(variance[:, 3:].sum(axis=1)),

@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
+from legcal.data.dataset_file import Action, Override
 from legcal.data.measurements import View
-from legcal.data.overrides import Action, Override
 from legcal.errors import DatasetError, UsageError
 from legcal.files.schema import closest
 from legcal.geometry.types import Array

@@ -45,7 +45,6 @@ from legcal.calibration.joint_fit.sensitivity import (
     sensitivities,
 )
 from legcal.calibration.joint_fit.variables import State
-from legcal.calibration.notes import Note, Topic
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import Order, inverse, reorder_measurements
 from legcal.data.outlines import Outlines
@@ -298,18 +297,15 @@ def assemble_solution(
         left_out=legs_left_out(problem, fit.accepted),
         notes=(
             *fit.notes,
-            *Note.about(Topic.IMAGES, rejected_notes(problem, fit.accepted)),
-            *Note.about(Topic.BOARDS, corner_notes(problem)),
-            *Note.about(Topic.READINGS, reading_notes(quality.redundant_readings)),
-            *Note.about(Topic.READINGS, reversed_motors(problem, state)),
-            *Note.about(Topic.CAMERAS, map(str, gammas)),
-            *Note.about(
-                Topic.IMAGES,
-                notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
-            ),
-            *Note.about(Topic.MODEL, contradicted_radii(problem, state, normal)),
+            *rejected_notes(problem, fit.accepted),
+            *corner_notes(problem),
+            *reading_notes(quality.redundant_readings),
+            *reversed_motors(problem, state),
+            *map(str, gammas),
+            *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
+            *contradicted_radii(problem, state, normal),
             *(_misfit_of_axes(quality) if len(problem.axes) else ()),
-            *Note.about(Topic.CAMERAS, doubts.notes),
+            *doubts.notes,
         ),
     )
 

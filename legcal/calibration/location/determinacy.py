@@ -249,7 +249,6 @@ def _check_machine(
 
 
 def _scatter(measurements: ToolMeasurements, fit: FrameFit) -> str:
-    """Return the standard deviations of a measured component."""
     sigma = fit.noise.rms
     turn = f" and {np.degrees(sigma[1]):.2g} deg" if measurements.is_oriented else ""
     return f"{1e3 * sigma[0]:.2g} mm{turn}"

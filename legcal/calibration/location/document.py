@@ -1,8 +1,13 @@
-"""A location, its undetermined parts in words, and the location file: written and read back."""
+"""A location, its undetermined parts in words, the location file, and its frames in the URDF.
+
+In the URDF a ``world`` link above the root carries the machine, and a ``tool`` link is a child of
+the platform, on fixed joints; all else stays. If the links exist, as after an earlier location,
+only their origins are changed.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,12 +17,16 @@ from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, ModelError, UsageError
 from legcal.files.folder import OutputFile
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.published import with_schema
 from legcal.files.schema import FileSchema, Number, Version, read_yaml, validate
+from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
+from legcal.machine.model import Machine
+from legcal.machine.model_writer import write_model
+from legcal.machine.urdf import Urdf, UrdfPatch
 
 LocatedFrame = Literal["base", "tool"]
 PoseComponent = Literal["position", "orientation"]
@@ -37,6 +46,7 @@ _Vector = Annotated[
     tuple[Number, Number, Number], BeforeValidator(lambda v: tuple(v) if type(v) is list else v)
 ]
 _Size = Annotated[Number, Field(ge=0.0)]
+_WORLD, _TOOL = "world", "tool"  # names of the links
 
 
 class RowResidual(FileSchema):
@@ -197,12 +207,10 @@ def direction_of(v: Array) -> Direction:
 
 
 def _signed(v: Array) -> Array:
-    """Return a direction with its largest component positive."""
     return np.asarray(v if v[np.argmax(np.abs(v))] > 0.0 else -v)
 
 
 def _rms(vectors: list[tuple[float, float, float]]) -> float:
-    """Return the root mean square of components."""
     return float(np.sqrt(np.mean(np.square(vectors))))
 
 
@@ -224,8 +232,6 @@ class _Determined(FileSchema):
 
 
 class _ResidualsEntry(FileSchema):
-    """Residuals of the measured poses."""
-
     chi2: _Size
     dof: Annotated[int, Field(ge=0)]
     p_value: _Size | None
@@ -242,8 +248,6 @@ class _Tool(FileSchema):
 
 
 class _Covariance(FileSchema):
-    """The covariance of both frames."""
-
     names: list[str]
     matrix: list[list[Number]]
 
@@ -395,3 +399,105 @@ def _matrix(path: Path, entry: _Covariance) -> Array:
         f"{path}: covariance could not be read: found another matrix, needed a covariance of the "
         f"{n} components {NAMES[0]} to {NAMES[-1]}; give the file that legcal locate wrote."
     )
+
+
+# World and tool in the URDF
+
+
+def write_located_model(
+    machine: Machine,  # the machine that was located
+    location: Location,
+    folder: Path,  # parent of ``models`` and ``urdf``; existing files are not replaced
+) -> tuple[Path, Path]:
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` with the located frames in the URDF.
+
+    Returns tuple of Path: The YAML and the URDF.
+
+    Raises UsageError if files of these names are there, or the links have another meaning in the
+    URDF; ModelError if the URDF does not let a link carry the machine.
+    """
+    content = _with_frames(machine, location)
+    return write_model(replace(machine, urdf=replace(machine.urdf, content=content)), folder)
+
+
+def _with_frames(machine: Machine, location: Location) -> bytes:
+    urdf = machine.urdf
+    T_root_base = _from_root(urdf, machine.base)
+    patch = UrdfPatch(urdf.content)
+
+    def place(joint: str, T: RigidTransform) -> None:
+        patch.set_origin(joint, np.asarray(T.translation), roll_pitch_yaw(T.rotation.as_matrix()))
+
+    if _WORLD in urdf.links:
+        joint = _joint_of_world(machine)
+        T_child_base = urdf.joints[joint].T_parent_origin.inv() * T_root_base
+        place(joint, location.T_world_base * T_child_base.inv())
+    else:
+        T_world_root = location.T_world_base * T_root_base.inv()
+        patch.add_frame(
+            _WORLD, urdf.root, _WORLD, _unused_joint(urdf, _WORLD, urdf.root), T_world_root
+        )
+    if _TOOL in urdf.links:
+        place(_joint_of_tool(machine), location.T_platform_tool)
+    else:
+        joint = _unused_joint(urdf, machine.platform, _TOOL)
+        patch.add_frame(machine.platform, _TOOL, _TOOL, joint, location.T_platform_tool)
+    return patch.content()
+
+
+def _from_root(urdf: Urdf, base: str) -> RigidTransform:
+    """Return T_root_base; refuse a moving joint between them."""
+    above = {joint.child: joint for joint in urdf.joints.values()}
+    T, link = RigidTransform.identity(), base
+    while link != urdf.root:
+        joint = above[link]
+        if joint.moves:
+            raise ModelError(
+                f"{urdf.path}: the world could not be written: found the base '{base}' below the "
+                f"joint '{joint.name}', which moves, needed fixed joints between it and the root "
+                f"'{urdf.root}'; hang the platform from the base."
+            )
+        T, link = joint.T_parent_origin * T, joint.parent
+    return T
+
+
+def _joint_of_world(machine: Machine) -> str:
+    """Return the fixed joint below a world link that carries the whole machine."""
+    urdf = machine.urdf
+    below = [joint for joint in urdf.joints.values() if joint.parent == _WORLD]
+    if urdf.root == _WORLD != machine.base and len(below) == 1 and not below[0].moves:
+        return below[0].name
+    raise UsageError(
+        f"{urdf.path}: the world could not be written: found a link '{_WORLD}' that is not a "
+        "root with the machine on one fixed joint below it, needed such a link or none of that "
+        "name; rename it."
+    )
+
+
+def _joint_of_tool(machine: Machine) -> str:
+    """Return the fixed joint between the platform and a tool link without children."""
+    urdf = machine.urdf
+    joint = next((joint for joint in urdf.joints.values() if joint.child == _TOOL), None)
+    frames = {name for c in machine.chain.closures for name in (c.frame_1, c.frame_2)}
+    carries = any(other.parent == _TOOL for other in urdf.joints.values())
+    if (
+        joint is not None
+        and not joint.moves
+        and joint.parent == machine.platform
+        and not carries
+        and frames.isdisjoint((_TOOL, joint.name))
+    ):
+        return joint.name
+    raise UsageError(
+        f"{urdf.path}: the tool could not be written: found a link '{_TOOL}' that is not at the "
+        f"end of a fixed joint on the platform '{machine.platform}', needed such a link or none of "
+        "that name; rename it."
+    )
+
+
+def _unused_joint(urdf: Urdf, parent: str, child: str) -> str:
+    """Return a free name of a fixed joint between two links."""
+    joint = f"{parent}_{child}_frame"
+    while joint in urdf.links or joint in urdf.joints:
+        joint += "_"
+    return joint

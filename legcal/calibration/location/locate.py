@@ -138,7 +138,6 @@ def _check_numbers(
     tool_position: Sequence[float] | None,
     size: float,  # size of the machine [m]
 ) -> None:
-    """Refuse implausible options."""
     most_sigma, most_tool = _MAX_SIGMA * size, _MAX_TOOL * size
     for name, value, lower, upper, unit in (
         ("position sigma", position_sigma, MIN_SIGMA, most_sigma, "m"),
@@ -198,7 +197,6 @@ def _refuse_mistakes(
 def _check_outliers(
     measurements: ToolMeasurements, candidates: FrameCandidates, inliers: Inliers, name: str
 ) -> None:
-    """Refuse a table with too many outliers."""
     n, n_out = len(measurements.pairs), int(np.sum(~inliers.is_inlier))
     max_outliers = max(1, n // _MAX_OUTLIERS)
     if n_out <= max_outliers:
@@ -213,7 +211,6 @@ def _check_outliers(
 
 
 def _check_scatter(measurements: ToolMeasurements, frame_fit: FrameFit, name: str) -> None:
-    """Refuse to estimate a scatter without degrees of freedom."""
     for kind, (kind_name, option) in enumerate(
         (("positions", "--position-sigma"), ("orientations", "--angle-sigma"))
     ):
@@ -278,7 +275,6 @@ def _judge(
     determined: Determinacy,
     held_at: Array,  # (3,): position of the tool in the platform where it is not determined [m]
 ) -> Location:
-    """Return the location with its verdict."""
     frame_fit = determined.fit
     p_value, too_large = _tested(frame_fit)
     base, tool = transforms(frame_fit.frames)
@@ -334,7 +330,6 @@ def _tested(frame_fit: FrameFit) -> tuple[float | None, str]:
 
 
 def _noise(measurements: ToolMeasurements, frame_fit: FrameFit) -> MeasurementNoise:
-    """Return the stated or estimated standard deviations of the measurement."""
     rms = frame_fit.noise.rms
     oriented = measurements.is_oriented
     return MeasurementNoise(
@@ -394,7 +389,6 @@ def _at_the_tool(
 def _sentence(
     measurements: ToolMeasurements, determined: Determinacy, left_out: Sequence[int], too_large: str
 ) -> str:
-    """Return the verdict."""
     used = len(measurements.poses) - len(left_out)
     sigma = np.sqrt(np.maximum(np.diagonal(determined.covariance), 0.0)).reshape(4, 3)
     size = np.linalg.norm(sigma, axis=1)
@@ -430,7 +424,6 @@ def _sentence(
 
 
 def _notes(measurements: ToolMeasurements, inliers: Inliers) -> list[str]:
-    """Return further remarks."""
     notes = list(measurements.poses.notes)
     if measurements.by_model is None:
         notes.append(

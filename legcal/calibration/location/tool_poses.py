@@ -326,7 +326,6 @@ def tool_measurements(
 
 
 def _check_count(poses: ToolPoses, name: str, fewest: int) -> None:
-    """Refuse too few poses or too few different readings."""
     n = len(poses)
     columns = ~np.isnan(poses.q).any(axis=0)
     n_different = len(np.unique(poses.q[:, columns], axis=0))

@@ -1,9 +1,8 @@
 "use strict";
-// Scenes in space on a canvas. The content of a scene has its `unit`, whether it is `flat`, and `modes` to choose from:
-// - of a machine, `models` of joints A and B, anchors, standing and moving lines, by pose: the difference between both is
-//   exaggerated by one of the `factors`. Base and platform are lines around joints (`rims`), uncertainties half axes at
-//   joints (`rings`, those of the platform turned as it is), `cameras` an eye and the corners of its picture;
-// - of `marks`, their `values`.
+// A machine in space on a canvas. The content of a scene has its `unit`, whether it is `flat`, and `modes` to choose from:
+// `models` of joints A and B, anchors, standing and moving lines, by pose: the difference between both is exaggerated by
+// one of the `factors`. Base and platform are lines around joints (`rims`), uncertainties half axes at joints (`rings`,
+// those of the platform turned as it is), `cameras` an eye and the corners of its picture.
 (() => {
   const GREY = "#9aa1ab", BLUE = "#1f5fa8", AMBER = "#b26a00", GREEN = "#1e7d46", BROWN = "#8a6d3b";
   const INK = "#1d2126", DIM = "#667080", RULE = "#e4e8ec";
@@ -18,7 +17,7 @@
     return found;
   };
 
-  // What is drawn: layers of lines, marks, words, and points with a tip.
+  // What is drawn: layers of lines, words, and points with a tip.
   const machine = ({ rims, rings, cameras, names }, mode, pose, factor) => {
     const at = (poses) => poses[pose] ?? poses[0];
     const between = (a, b) => (typeof a === "number" ? a + factor * (b - a) : a.map((x, k) => between(x, b[k])));
@@ -40,26 +39,15 @@
     if (cameras.length) layers.push({ name: "cameras", colour: GREEN, width: 1.3, lines: cameras.flatMap(({ points }) =>
       [[...points.slice(1), points[1]], ...points.slice(1).map((p) => [points[0], p])]) });
     return {
-      layers, marks: [], words: names.map((text, j) => ({ text, at: shown.A[j] })),
+      layers, words: names.map((text, j) => ({ text, at: shown.A[j] })),
       tips: cameras.map(({ name, points }) => ({ text: `camera ${name}`, at: points[0] })),
-    };
-  };
-  const errors = ({ marks, unit }, { values }) => {
-    const low = Math.min(...values), high = Math.max(...values);
-    const shade = (x) => `rgb(${[[219, 26], [231, 74], [245, 134]].map(([a, b]) => Math.round(a + x * (b - a)))})`;
-    return {
-      layers: [], words: [], scale: { low, high, unit, shade },
-      marks: marks.map((at, k) => ({
-        at, radius: 1.5 + 4.5 * values[k] / Math.max(high, ZERO), colour: shade((values[k] - low) / Math.max(high - low, ZERO)),
-      })),
-      tips: marks.map((at, k) => ({ at, text: `(${at.join(", ")}) ${unit}: ${values[k].toFixed(4)} ${unit}` })),
     };
   };
 
   const show = (canvas, content) => {
     const form = document.querySelector(`form[data-for="${canvas.id}"]`), { elements } = form;
     const paper = canvas.getContext("2d");
-    const solid = content.marks ?? content.modes[0].models.flatMap((m) => [...m.A.flat(), ...m.B.flat(), ...m.standing.flat()]);
+    const solid = content.modes[0].models.flatMap((m) => [...m.A.flat(), ...m.B.flat(), ...m.standing.flat()]);
     const [[x0, x1], [y0, y1], [z0, z1]] = [0, 1, 2].map((k) => span(solid, k)), reach = 0.3 * Math.max(x1 - x0, y1 - y0);
     const xs = ticks(x0 - reach, x1 + reach), ys = ticks(y0 - reach, y1 + reach); // of the floor
     const corners = [xs[0], xs.at(-1)].flatMap((x) => [ys[0], ys.at(-1)].map((y) => [x, y]));
@@ -152,13 +140,7 @@
         const points = line.map(place);
         return points.slice(1).map((b, k) => ({ a: points[k], b, colour, thick, depth: (points[k][2] + b[2]) / 2 }));
       })).filter(({ a, b }) => visible(a) && visible(b));
-      items.push(...drawn.marks.map((mark) => ({ ...mark, a: place(mark.at) })).filter(({ a }) => visible(a))
-        .map((mark) => ({ ...mark, depth: mark.a[2] })));
-      for (const { a, b, colour, thick, radius } of items.sort((p, q) => q.depth - p.depth)) {
-        if (b) { stroke(a, b, colour, thick); continue; }
-        paper.beginPath(); paper.arc(a[0], a[1], radius * view.distance / a[2], 0, 7);
-        paper.fillStyle = colour; paper.fill(); paper.strokeStyle = DIM; paper.lineWidth = 0.6; paper.stroke();
-      }
+      for (const { a, b, colour, thick } of items.sort((p, q) => q.depth - p.depth)) stroke(a, b, colour, thick);
       for (const { text, at } of drawn.words) {
         const [x, y, depth] = place(at);
         if (depth > 0) write(text, x, y + 15, INK);
@@ -168,27 +150,19 @@
         stroke([8, 14 + 18 * k], [34, 14 + 18 * k], colour, thick);
         write(name, 42, 18 + 18 * k, INK, "left", 12);
       });
-      if (drawn.scale) {
-        const { low, high, unit, shade } = drawn.scale, size = 140, x = width - size - 40;
-        for (let k = 0; k < size; k++) { paper.fillStyle = shade(k / size); paper.fillRect(x + k, 6, 1.5, 12); }
-        write(unit, x + size + 8, 16, INK, "left");
-        [low, (low + high) / 2, high].forEach((v, k) => write(Number(v.toPrecision(3)), x + k * size / 2, 31, DIM));
-      }
     };
 
     const update = () => {
       const mode = content.modes[Number(elements.mode.value)];
-      if (mode.models) {
-        const pose = Number(elements.pose?.value ?? 0), factor = content.factors[Number(elements.factor.value)];
-        elements.factor_text.value = `${factor} times`;
-        if (elements.pose) elements.pose_text.value = content.poses[pose];
-        drawn = machine(content, mode, pose, factor);
-      } else drawn = errors(content, mode);
+      const pose = Number(elements.pose?.value ?? 0), factor = content.factors[Number(elements.factor.value)];
+      elements.factor_text.value = `${factor} times`;
+      if (elements.pose) elements.pose_text.value = content.poses[pose];
+      drawn = machine(content, mode, pose, factor);
       canvas.layers = drawn.layers;
       draw();
     };
     elements.mode.addEventListener("input", () => {
-      if (elements.factor) elements.factor.value = content.modes[Number(elements.mode.value)].step;
+      elements.factor.value = content.modes[Number(elements.mode.value)].step;
     });
     form.addEventListener("input", update);
     form.addEventListener("submit", (event) => event.preventDefault());
