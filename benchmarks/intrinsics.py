@@ -128,7 +128,7 @@ def main() -> None:
                 begin = time.perf_counter()
                 solution = one_fit(given, noise.radius_sigma)
                 took = time.perf_counter() - begin
-                doubted = bool(solution.camera_doubts.views)
+                doubted = bool(solution.camera_doubts)
                 found[k].append((*errors(design, given, solution), doubted, took))
         for kind, rows in zip(KINDS, found, strict=True):
             nse, error, predicted, doubted, took = np.mean(rows, axis=0)

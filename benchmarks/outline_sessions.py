@@ -31,6 +31,7 @@ from legcal.errors import DidNotConverge
 from legcal.files.schema import read_yaml
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import ActuatorColumns
+from legcal.machine.closing import solve_poses
 from legcal.machine.description_table import described_machine
 from legcal.machine.kinematics import platform_in_base, pose_differences
 from legcal.machine.leg import Leg, LegKind, radius_name
@@ -45,7 +46,6 @@ from legcal.machine.rods import (
     reading_legs,
     readings_of_rods,
 )
-from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import on_ties
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps

@@ -29,8 +29,7 @@ from scipy.stats import spearmanr
 
 import legcal
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
-from legcal.calibration.joint_fit.predicted import Predictor
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, WHITE
+from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, WHITE, Predictor
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry.lines import direction_above

@@ -47,7 +47,7 @@ from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines, read_observations, write_observations
 from legcal.geometry.types import Array
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import moved_outlines
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings, Spread

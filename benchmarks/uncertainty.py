@@ -22,8 +22,7 @@ from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
-from legcal.calibration.joint_fit.predicted import Predictor
-from legcal.calibration.joint_fit.predicted_noise import PredictedNoise, read_noise
+from legcal.calibration.joint_fit.predicted import PredictedNoise, Predictor, read_noise
 from legcal.calibration.pipeline import chosen_parameters
 from legcal.calibration.result import Calibration
 from legcal.data.dataset import Dataset

@@ -22,12 +22,12 @@ from legcal.machine.description_table import described_machine
 from legcal.machine.family import Dimensions, description_of
 from legcal.machine.home import home_of_legs
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import ARMS as ARM_KINDS
+from legcal.machine.leg import ParameterId
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
-from legcal.machine.parameter_id import ARMS as ARM_KINDS
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
     geometries,
     moved_legs,

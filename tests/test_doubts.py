@@ -29,9 +29,8 @@ from legcal import (
 )
 from legcal.calibration import doubts, verdict
 from legcal.calibration.doubts import Doubt, model_error
-from legcal.calibration.joint_fit.cross_validation import cross_validate
-from legcal.calibration.joint_fit.diagnostics import DoubtedCamera
-from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
+from legcal.calibration.joint_fit.held_out import cross_validate
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, FocalLength
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
@@ -222,9 +221,10 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
 def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
     solution = healthy.solution
     focal = next(s for s in solution.sensitivities if "focal" in s.what)
-    wrong = DoubtedCamera("c1", "fx", 500.0, 1.0, 510.0, 7.0)
+    fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
+    wrong = FocalLength("c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
-        "camera_doubts": replace(solution.camera_doubts, others=[wrong]),
+        "camera_doubts": (wrong,),
         "sensitivities": (*solution.sensitivities, replace(focal, what=FITTED_CAMERA)),
     }
     found = _judged(healthy, **changes)

@@ -33,8 +33,8 @@ from legcal.exports.formats import export, formats_of
 from legcal.exports.subject import ExportOptions, Subject, identifiers, load_subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_poses
-from legcal.machine.coordinates import COORDINATES, independent_coordinates
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.mobility import COORDINATES, independent_coordinates
 from legcal.machine.model import Machine
 from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.truth import write_true_model

@@ -16,7 +16,7 @@ import legcal
 from legcal.calibration.identify.ranks import Analysis, expected_intrinsics, is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.estimation.square_root import compress, eliminate
+from legcal.estimation.uncertainty import compress, eliminate
 from legcal.geometry.motions import motion_of
 from legcal.machine.equations import leg_equations as linearize_leg
 from legcal.machine.kinematics import forward_kinematics_many

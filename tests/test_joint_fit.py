@@ -54,8 +54,7 @@ from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.geometry.types import Array
-from legcal.machine.leg import Leg, parameters_of_legs, radius_name
-from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.leg import ARMS, Leg, ParameterId, parameters_of_legs, radius_name
 from legcal.machine.parameters import moved_legs, parametrize
 from legcal.simulation.observe import moved_outlines
 

@@ -24,9 +24,7 @@ from fit_sessions import (
 )
 from thinned import thinned
 
-from legcal.calibration.joint_fit.factors import observed_outlines
-from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.gammas import (
+from legcal.calibration.estimate import (
     GAMMA_RANGE,
     GAMMA_STEP,
     GAMMA_TOLERANCE,
@@ -35,6 +33,8 @@ from legcal.calibration.joint_fit.gammas import (
     most_likely,
     next_trial,
 )
+from legcal.calibration.joint_fit.factors import observed_outlines
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import (
     PLACES,
     RECOVERED_SHARE,

@@ -27,12 +27,12 @@ from legcal.errors import OutOfClass
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
+from legcal.machine.closing import solve_poses
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, moved_legs, parametrization_of
-from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import machine_ties, on_ties
 from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.truth import write_true_model

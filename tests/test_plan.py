@@ -21,11 +21,12 @@ from scipy.spatial.transform import RigidTransform
 
 import legcal
 from legcal.calibration.joint_fit.predicted import (
+    DEFAULT_NOISE,
+    WHITE,
     Contributions,
     Predictor,
     predicted_outlines,
 )
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, WHITE
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
@@ -175,7 +176,7 @@ def test_the_command_writes_what_python_plans(
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)
+    monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
     session = tmp_path / "session"
     assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -213,7 +214,7 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr("legcal.cli.sessions._previews", lambda _: {})
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.calibration.joint_fit.predicted_noise.DEFAULT_NOISE", WHITE)
+    monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
     assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
     printed = capsys.readouterr()
     assert json.loads(printed.out)["error"]["kind"] == "Interrupted"

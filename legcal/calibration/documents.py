@@ -36,7 +36,7 @@ from legcal.files.schema import (
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.inspection import ActuatorBlock
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 from legcal.vision.board import Link
 
 AxesByLeg = dict[str, Triple]  # unit vectors

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtri, stdtrit
 
 from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.joint_fit.cross_validation import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
-from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.held_out import CrossValidation, HeldOut, cross_validate
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
@@ -26,6 +26,7 @@ from legcal.calibration.joint_fit.platform import (
     platform_by_parameters,
     poses_at_readings,
 )
+from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.scale import (
     BOARD,
     MODEL,
@@ -39,15 +40,16 @@ from legcal.calibration.joint_fit.scale import (
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.session_changes import OF_MOTORS, Finding, SessionTests
+from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import few, few_views
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.parameters import geometries, vector_of
 from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
@@ -61,7 +63,6 @@ MOST_SQUARES = 2.0  # times what was expected of left-out images, in squared sig
 _SURE = 5.0  # standard deviations of these squares
 MIN_GAIN = 0.5  # of what a change claims to predict better, by its information on left-out images
 _LAST_DIGIT = 0.5e-6  # [m] half of the last digit of printed lengths
-_STUDENT_AT = 3.5  # standard deviations at which Student's distribution is compared
 MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
 
 
@@ -129,24 +130,28 @@ def doubts_of(
     of the session, or two scales, make outlines scatter, bend cameras and move parameters; a motor
     that is named explains the readings that disagree and the outlines of its own legs.
     """
-    if mistakes := _mistakes(diagnosis):
-        return tuple(mistakes)
-    changes = _Changes.of(dataset, solution)
-    noise = _noise(solution, session, platform)
-    course = _changes(dataset, solution, platform, session, scatters=bool(noise))
+    if diagnosis:
+        return tuple(Doubt("mistake", x.finding, x.remedies, is_grave=True) for x in diagnosis)
+    of = _Evidence(dataset, solution, platform, session)
+    noise = of.noise()
+    course = of.changes(scatters=bool(noise))
     # A scale that all motors share is one witness of the scale against the others
     is_of_scale = any(one.kind == "pitch" for one in session.findings)
-    scale = [] if course and not is_of_scale else _scale(dataset, solution, platform, changes)
+    scale = [] if course and not is_of_scale else of.scale()
     causes = [*scale, *(doubt for doubt in course if not (scale and doubt.code == "pitch"))]
-    predicted = cross_validate(solution.posterior.problem, solution.posterior.state)
     codes = {doubt.code for doubt in course}
     motors = {one.subject for one in session.findings if one.kind in codes}
-    is_of_motors = bool(codes & OF_MOTORS)
-    legs = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
+    explained = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
     symptoms = (
         []
         if causes
-        else [*_symptoms(dataset, solution, platform, changes, held_out, predicted), *noise]
+        else [
+            *of.moved_parameters(),
+            *_held_out(held_out),
+            *of.cameras(),
+            *of.left_out(),
+            *noise,
+        ]
     )
     if session.findings and any(one.code in OF_SCATTER for one in symptoms):
         # Certain changes, too small to count by themselves, are what makes outlines scatter
@@ -154,56 +159,27 @@ def doubts_of(
         symptoms = [one for one in symptoms if one.code not in OF_SCATTER]
     if {one.code for one in causes} == {READING_NOISE}:
         # A model that was led away scatters readings as well
-        symptoms = _left_out(predicted, platform)
+        symptoms = of.left_out()
+    readings = solution.quality.redundant_readings
+    contradicted = () if readings is None or codes & OF_MOTORS else readings.doubts
     return (
-        *([] if is_of_motors else _readings(solution)),
-        *_legs_left_out(solution, legs),
+        *(Doubt("readings", what, remedy, is_grave=True) for what, remedy in contradicted),
+        *_legs_left_out(solution, explained),
         *_clicks(dataset, solution),
         *(one for one in _strayed_cameras(dataset, solution) if one.is_grave or not causes),
         *_views(dataset, solution, corners),
         *([] if causes else _few_outlines(solution.outlines)),
-        *_nominal_lengths(dataset, solution, platform, changes),
-        *_no_better(predicted, platform),
+        *of.nominal_lengths(),
+        *of.no_better(),
         *causes,
         *symptoms,
     )
-
-
-def _symptoms(
-    dataset: Dataset,
-    solution: Solution,
-    platform: PlatformAccuracy | None,
-    changes: _Changes,
-    held_out: HeldOut | None,
-    predicted: CrossValidation | None,
-) -> list[Doubt]:
-    """Return the doubts that a change in the course of a session, or two scales, cause as well."""
-    return [
-        *_moved_parameters(dataset, solution, platform, changes),
-        *_held_out(held_out),
-        *_cameras(solution, platform),
-        *_left_out(predicted, platform),
-    ]
 
 
 def no_improvement(remedy: str) -> Doubt:
     """Return the doubt in a result whose predicted improvement is below two sigma."""
     what = "a predicted improvement below two sigma is no improvement"
     return Doubt("no_improvement", what, remedy, is_grave=True)
-
-
-def _mistakes(diagnosis: Sequence[Diagnosis]) -> list[Doubt]:
-    """Return the mistakes that explain the session better than it explains itself."""
-    return [Doubt("mistake", one.finding, one.remedies, is_grave=True) for one in diagnosis]
-
-
-def _readings(solution: Solution) -> list[Doubt]:
-    """Return what redundant motors contradict."""
-    readings = solution.quality.redundant_readings
-    return [
-        Doubt("readings", what, remedy, is_grave=True)
-        for what, remedy in (() if readings is None else readings.doubts)
-    ]
 
 
 def _legs_left_out(solution: Solution, explained: Collection[str]) -> list[Doubt]:
@@ -275,35 +251,11 @@ def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
     return [Doubt("strayed_camera", what, remedy, is_grave=True)]
 
 
-def _cameras(solution: Solution, platform: PlatformAccuracy | None) -> list[Doubt]:
-    """Return cameras that the measurements contradict, with what their files do to the platform."""
-    views = solution.camera_doubts.views
-    if not views:
-        return []
-    effects = () if platform is None else platform.effects
-    errors = [effect.error for effect in effects if effect.what == FITTED_CAMERA]
-    what = f"the measurements contradict the camera of {few_views(views)}"
-    remedy = (
-        "calibrate it again at the same focus and zoom, and look for photographs that were zoomed, "
-        "scaled or cropped"
-    )
-    return [Doubt(CAMERA, what, remedy, *_mean(errors[0] if errors else None))]
-
-
 def _mean(error: PlatformError | None, part: float = 1.0) -> tuple[float | None, float | None]:
     """Return a part of the mean displacement and rotation of the platform, where known."""
     if error is None:
         return None, None
     return part * error.mean_displacement, part * error.mean_rotation
-
-
-def _moved_platform(dataset: Dataset, solution: Solution, steps: Array) -> PlatformError:
-    """Return the motion of the platform by steps (p, 1) of all kinematic parameters."""
-    parametrization, frame_legs = solution.kinematic.parametrization, dataset.machine.frame_legs
-    by_parameters = platform_by_parameters(
-        solution.legs, parametrization, frame_legs, solution.T_Rb_Re
-    )
-    return moved_by(by_parameters, steps)
 
 
 def used_share(outlines: Outlines) -> float:
@@ -359,304 +311,317 @@ def _few_outlines(outlines: Outlines) -> list[Doubt]:
     return [Doubt("few_outlines", what, remedy)]
 
 
-def _left_out(found: CrossValidation | None, platform: PlatformAccuracy | None) -> list[Doubt]:
-    """Return whether images without a part in the fit are predicted as well as it claims."""
-    if found is None:
-        return []
-    most = np.maximum(MOST_SQUARES, 1.0 + _SURE * np.sqrt(2.0 / np.maximum(found.dof, 1)))
-    of_blocks = found.squares / np.maximum(found.dof, 1)
-    ratio = max(found.ratio, float(of_blocks.max()) if np.any(of_blocks > most) else 0.0)
-    if ratio <= MOST_SQUARES:
-        return []
-    what = (
-        f"images that are left out lie {np.sqrt(ratio):.1f} times as far from their prediction "
-        "by the others as is stated"
-    )
-    remedy = (
-        "the session does not agree with itself: look for what changed or moved between "
-        "images, for play and bending, and at the worst outlines"
-    )
-    error = _mean(None if platform is None else platform.sigma, float(np.sqrt(ratio - 1.0)))
-    return [Doubt("left_out", what, remedy, *error)]
-
-
-def _no_better(found: CrossValidation | None, platform: PlatformAccuracy | None) -> list[Doubt]:
-    """Return whether left-out images are predicted as much better as the change claims."""
-    if found is None or found.gain is None:
-        return []
-    if found.gain >= min(MIN_GAIN, 1.0 - _SURE * found.gain_sigma):
-        return []
-    what = (
-        "images that are left out are predicted better than by the nominal model by "
-        f"{100.0 * max(found.gain, 0.0):.0f} % of what the change of the model claims"
-    )
-    remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
-    error = _mean(None if platform is None else platform.change, 1.0 - max(found.gain, 0.0))
-    return [Doubt("no_better", what, remedy, *error)]
-
-
-def _changes(
-    dataset: Dataset,
-    solution: Solution,
-    platform: PlatformAccuracy | None,
-    session: SessionTests,
-    *,
-    scatters: bool,
-) -> list[Doubt]:
-    """Return what changed in the course of the session, and readings that do not follow motors.
-
-    It counts where it displaces the platform by more than that is known to; scatter of readings
-    also where outlines scatter by it, but not beside another cause, which leaves scatter behind.
-    """
-    doubts = []
-    for finding in session.findings:
-        effect = None if platform is None else _effect_of(finding, dataset, solution)
-        if platform is None or effect is None:
-            doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
-        elif effect[0] > platform.sigma.mean_displacement or (
-            scatters and finding.kind == READING_NOISE
-        ):
-            doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
-    return [doubt for doubt in doubts if doubt.code != READING_NOISE] or doubts
-
-
-def _effect_of(finding: Finding, dataset: Dataset, solution: Solution) -> tuple[float, float]:
-    """Return the mean displacement [m] and rotation [rad] of the platform by a number that lacks.
-
-    Of an encoder whose zero changed on the worse side of the change.
-    """
-    machine, parametrization = dataset.machine, solution.kinematic.parametrization
-    names = solution.posterior.problem.legs.parametrization.names
-    step_of = dict(zip(names, finding.steps, strict=True))
-    steps = np.array([step_of[name] for name in parametrization.names])
-    legs, poses = solution.legs, solution.T_Rb_Re
-    error = _moved_platform(dataset, solution, steps)
-    before = error.mean_displacement, error.mean_rotation
-    if finding.kind != "encoder":
-        return before
-    q = dataset.measurements.q_of_poses
-    is_of_motor = np.array([leg.motor_label == finding.subject for leg in machine.legs])
-    there = poses_at_readings(machine, legs, q, poses)
-    moved = poses_at_readings(machine, legs, q + finding.amount * is_of_motor, there)
-    displacement, rotation = pose_differences(moved, there)
-    return (
-        max(before[0], float(displacement.mean()) - before[0]),
-        max(before[1], float(rotation.mean()) - before[1]),
-    )
-
-
 @dataclass(frozen=True, eq=False)
-class _Changes:
-    """The kinematic parameters of a fit against those of the nominal model, (p,) each."""
+class _Evidence:
+    """A fit, and what it does to the platform: the doubts that are computed from these."""
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    nominal: Array
-    change: Array
-    covariance: Array  # (p, p)
-    tolerance: Array  # infinite without one
-    estimated: BoolArray
+    dataset: Dataset
+    solution: Solution
+    platform: PlatformAccuracy | None
+    session: SessionTests
 
-    @classmethod
-    def of(cls, dataset: Dataset, solution: Solution) -> _Changes:
-        """Collect them."""
-        machine, kinematic = dataset.machine, solution.kinematic
-        parametrization, legs = kinematic.parametrization, geometries(machine)
-        names, nominal = parametrization.names, vector_of(parametrization, legs, legs)
-        by_name = dict(zip(machine.leg_names, legs, strict=True))
-        tolerances = machine.tolerance.of_parameters(names, by_name, machine.size)
-        return cls(
-            names,
-            parametrization.units,
-            nominal,
-            vector_of(parametrization, solution.legs, legs) - nominal,
-            kinematic.value_covariance,
-            np.array([tolerances.get(name, np.inf) for name in names]),
-            np.array([solution.estimates.status.get(name) == "estimated" for name in names]),
-        )
+    @cached_property
+    def problem(self) -> FitProblem:
+        """The joint fit."""
+        return self.solution.posterior.problem
 
-    def nominal_size(self, problem_names: Sequence[str], *, stated: bool) -> NominalSize | None:
-        """Return what the model says of the size of the machine; None without free lengths.
+    @cached_property
+    def predicted(self) -> CrossValidation | None:
+        """Images left out, as the fit to the others predicts them."""
+        return cross_validate(self.problem, self.solution.posterior.state)
+
+    @cached_property
+    def nominal(self) -> dict[str, float]:
+        """Values of the kinematic parameters in the nominal model."""
+        parametrization, legs = self.solution.kinematic.parametrization, self.nominal_legs
+        values = vector_of(parametrization, legs, legs).tolist()
+        return dict(zip(parametrization.names, values, strict=True))
+
+    @cached_property
+    def nominal_legs(self) -> tuple[Leg, ...]:
+        """The legs of the nominal model."""
+        return geometries(self.dataset.machine)
+
+    @cached_property
+    def change(self) -> Array:
+        """By how much the fit moved the parameters, (p,)."""
+        fitted, legs = self.solution.kinematic.parametrization, self.nominal_legs
+        return vector_of(fitted, self.solution.legs, legs) - list(self.nominal.values())
+
+    @cached_property
+    def sigma(self) -> Array:
+        """Standard deviations of the parameters by the fit, (p,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.solution.kinematic.value_covariance)))
+
+    @cached_property
+    def tolerance(self) -> Array:
+        """Tolerances of the parameters, (p,); infinite without one, or if not estimated."""
+        machine, status = self.dataset.machine, self.solution.estimates.status
+        legs = dict(zip(machine.leg_names, self.nominal_legs, strict=True))
+        stated = machine.tolerance.of_parameters(tuple(self.nominal), legs, machine.size)
+        estimated = {name for name in stated if status.get(name) == "estimated"}
+        return np.array([stated[n] if n in estimated else np.inf for n in self.nominal])
+
+    @cached_property
+    def nominal_size(self) -> NominalSize | None:
+        """What the model says of the size of the machine; None without free lengths.
 
         The size is that of the nominal lengths by least squares, each with its tolerance. How much
         the other changes vary says how far that counts, with Student's distribution: a machine
-        whose parts vary little is as large as its model, too. *Stated* tolerances are the least.
+        whose parts vary little is as large as its model, too. Stated tolerances are the least.
         """
-        at = np.flatnonzero(self.estimated & np.equal(self.units, "m") & (self.tolerance < np.inf))
-        length, change, tolerance = self.nominal[at], self.change[at], self.tolerance[at]
-        information = float(np.sum((length / tolerance) ** 2))
+        units = self.solution.kinematic.parametrization.units
+        at = np.flatnonzero(np.equal(units, "m") & (self.tolerance < np.inf))
+        nominal, tolerance = np.array(list(self.nominal.values()))[at], self.tolerance[at]
+        information = float(np.sum((nominal / tolerance) ** 2))
         if information <= 0.0 or len(at) < 2:
             return None
-        by_change = length / tolerance**2 / information
-        excess, sigma = float(by_change @ change), 1.0 / np.sqrt(information)
-        fitted = np.sqrt(np.diagonal(self.covariance)[at])
-        beyond = (change - excess * length) / np.hypot(tolerance, fitted)
-        n = len(at) - 1
-        part = np.sqrt(np.sum(beyond**2) / n) * stdtrit(n, ndtr(_STUDENT_AT)) / _STUDENT_AT
-        sigma *= max(float(part), 1.0 if stated else 0.0)
-        places = [problem_names.index(self.names[i]) for i in at.tolist()]
-        by_parameter = np.zeros(len(problem_names))
-        by_parameter[places] = by_change
+        by_change = nominal / tolerance**2 / information
+        excess, sigma = float(by_change @ self.change[at]), 1.0 / np.sqrt(information)
+        beyond = (self.change[at] - excess * nominal) / np.hypot(tolerance, self.sigma[at])
+        n, level = len(at) - 1, -float(ndtri(0.5 * DOUBT_BY_CHANCE))
+        part = np.sqrt(np.sum(beyond**2) / n) * -float(stdtrit(n, 0.5 * DOUBT_BY_CHANCE)) / level
+        sigma *= max(float(part), 1.0 if self.dataset.machine.tolerance != NOT_STATED else 0.0)
+        names, of_problem = list(self.nominal), self.problem.legs.parametrization.names
+        by_parameter = np.zeros(len(of_problem))
+        by_parameter[[of_problem.index(names[i]) for i in at.tolist()]] = by_change
         return NominalSize(by_parameter, excess, sigma)
 
+    @cached_property
+    def by_parameters(self) -> Array:
+        """Derivative (n_poses, 6, p) of platform poses by the parameters."""
+        solution, frame_legs = self.solution, self.dataset.machine.frame_legs
+        parametrization = solution.kinematic.parametrization
+        return platform_by_parameters(solution.legs, parametrization, frame_legs, solution.T_Rb_Re)
 
-def _moved_parameters(
-    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None, changes: _Changes
-) -> list[Doubt]:
-    """Return parameters that moved far beyond the tolerance of the machine, as one doubt."""
-    names, priors = changes.names, solution.posterior.problem.choices.priors
-    expected = [
-        priors[n].mean if n in priors else x
-        for n, x in zip(names, changes.nominal.tolist(), strict=True)
-    ]
-    change, tolerance = changes.change + changes.nominal - expected, changes.tolerance
-    spread = np.hypot(np.sqrt(np.diagonal(changes.covariance)), tolerance)
-    times = np.where(changes.estimated, np.abs(change) / spread, 0.0)
-    far = np.flatnonzero(times > MOST_MOVED)
-    if not len(far):
-        return []
-    error = None
-    if platform is not None:
-        steps = np.zeros((len(names), 1))
-        steps[far, 0] = change[far]
-        error = _moved_platform(dataset, solution, steps)
-    moved = []
-    for i in far[np.argsort(-times[far], kind="stable")].tolist():
-        scale, unit = SHOWN_IN[changes.units[i]]
-        moved.append(
-            f"{names[i]} by {scale * change[i]:+.3g} {unit} (tolerance {scale * tolerance[i]:.2g})"
-        )
-    what = f"the fit moved {few(moved)}, far beyond the tolerance of the machine"
-    remedy = (
-        "look at the worst outlines of these legs and at the model there; if the machine may be "
-        "that far off its model, state so (tolerance in dataset.yaml)"
-    )
-    return [Doubt("tolerance", what, remedy, *_mean(error))]
+    def moved(self, steps: Array) -> PlatformError:
+        """Return the motion of the platform by steps (p, c) of the parameters."""
+        return moved_by(self.by_parameters, steps)
 
+    def moved_in_fit(self, steps: Array) -> PlatformError:
+        """Return the motion of the platform by steps (p, c), in the order of the fit."""
+        of_fit = self.problem.legs.parametrization.names
+        return self.moved(steps[[of_fit.index(name) for name in self.nominal]])
 
-def _noise(
-    solution: Solution, session: SessionTests, platform: PlatformAccuracy | None
-) -> list[Doubt]:
-    """Return whether outlines scatter more than they claim: all, or of a view, leg or period.
-
-    What is beyond the claim may be no noise, and move the platform as much as that.
-    """
-    problem = solution.posterior.problem
-    o, scatter = problem.outlines, Scatter.of(problem, solution.posterior.state)
-    times = {"all views": scatter.ratio()}
-    if times["all views"] <= MOST_SCATTER:
-        groups = {f"view {name}": o.view == v for v, name in enumerate(o.views)}
-        groups |= {name: o.leg == j for j, name in enumerate(problem.legs.names)}
-        groups |= session.periods
-        times = {
-            name: scatter.ratio(of) * scatter.is_beyond_chance(of, len(groups))
-            for name, of in groups.items()
-        }
-    worst = max(times, key=times.__getitem__)
-    if times[worst] <= MOST_SCATTER:
-        return []
-    what = (
-        f"the outlines of {worst} scatter about the fit {times[worst]:.1f} times as much as their "
-        "standard deviations"
-    )
-    remedy = (
-        "something moves that should not, or edges are not those of the legs: look at the worst "
-        "outlines, for play, bending, a camera or board that moved, and readings of another moment"
-    )
-    part = float(np.sqrt(times[worst] ** 2 - 1.0))
-    sigma = None if platform is None else platform.sigma
-    return [Doubt("noise", what, remedy, *_mean(sigma, part))]
-
-
-def _scale(
-    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None, changes: _Changes
-) -> list[Doubt]:
-    """Return whether witnesses of the scale contradict each other, or the only one the model.
-
-    Where several agree, a model or radii of another size are theirs, and no doubt.
-    """
-    problem = solution.posterior.problem
-    names = problem.legs.parametrization.names
-    tolerance = dataset.machine.tolerance
-    nominal = changes.nominal_size(names, stated=tolerance != NOT_STATED)
-    found = None if nominal is None else compare_scales(solution.posterior, nominal)
-    if found is None:
-        return []
-    witnesses, wrong = scale_witnesses(problem), found.likelier_wrong()
-    alone = len(witnesses) == 1
-    # One ruler may have measured all that is stated, and one file has all squares of boards
-    others = () if alone or not {TRAVEL, BOARD} & set(witnesses) else (MODEL,)
-    explained = wrong is not None and found.witnesses[wrong] in (RADII, *others)
-    pairs = [
-        pair
-        for pair in found.disagreements
-        if not (explained and wrong in (pair.larger, pair.smaller))
-    ]
-    if not pairs:
-        return []
-    suspects = [pairs[0].larger, pairs[0].smaller] if wrong is None else [wrong]
-    first = next((p for p in pairs if wrong in (p.larger, p.smaller)), pairs[0])
-    if wrong is not None and found.witnesses[wrong] == MODEL:  # it has no part in the fit
-        suspects = (
-            [first.larger + first.smaller - wrong] if wrong in (first.larger, first.smaller) else []
-        )
-    clauses = [
-        f"by {found.witnesses[pair.larger]} the machine is {100.0 * pair.ratio:.2g} % larger than "
-        f"by {found.witnesses[pair.smaller]} ({pair.sigmas:.0f} standard deviations)"
-        for pair in pairs
-    ]
-    likelier = (
-        "either may be wrong"
-        if wrong is None
-        else f"the likelier wrong is {found.witnesses[wrong]}, as the others agree without it"
-    )
-    rests = f"; the scale rests on {witnesses[0]} alone" if alone else ""
-    what = f"{few(clauses)}: {likelier}{rests}"
-    remedy = (
-        "check these, and measure another length and state it "
-        f"({dataset.machine.length_option}, --set)"
-    )
-    error = None
-    if platform is not None and suspects:
-        step_of = [dict(zip(names, step, strict=True)) for step in found.steps.T.tolist()]
-        errors = [
-            _moved_platform(
-                dataset,
-                solution,
-                np.array([[first.ratio * step_of[i][name]] for name in changes.names]),
-            )
-            for i in suspects
-        ]
-        error = max(errors, key=lambda one: one.mean_displacement)
-    return [Doubt("scale", what, remedy, *_mean(error))]
-
-
-def _nominal_lengths(
-    dataset: Dataset, solution: Solution, platform: PlatformAccuracy | None, changes: _Changes
-) -> list[Doubt]:
-    """Return whether the only witness of the scale is a stated length that is the model's.
-
-    A measured one differs, and nothing else would show that this one was not measured.
-    """
-    stated = nominal_lengths(dataset, solution)
-    nominal = changes.nominal_size(changes.names, stated=dataset.machine.tolerance != NOT_STATED)
-    if not stated or nominal is None or len(scale_witnesses(solution.posterior.problem)) != 1:
-        return []
-    error = None
-    if platform is not None:
-        steps = nominal.sigma * np.where(np.equal(changes.units, "m"), changes.nominal, 0.0)
-        error = _moved_platform(dataset, solution, steps[:, None])
-        if error.mean_displacement <= platform.sigma.mean_displacement:
+    def cameras(self) -> list[Doubt]:
+        """Return cameras that the measurements contradict, with what their files do."""
+        views = list(dict.fromkeys(wrong.view for wrong in self.solution.camera_doubts))
+        if not views:
             return []
-    what = (
-        f"the scale rests on {few(stated)} alone, stated as in the model to all digits: was it "
-        "measured?"
-    )
-    remedy = (
-        "measure it and state that, or state a second length beside it "
-        f"({dataset.machine.length_option})"
-    )
-    return [Doubt("nominal_length", what, remedy, *_mean(error))]
+        effects = () if self.platform is None else self.platform.effects
+        errors = [effect.error for effect in effects if effect.what == FITTED_CAMERA]
+        what = f"the measurements contradict the camera of {few_views(views)}"
+        remedy = (
+            "calibrate it again at the same focus and zoom, and look for photographs that were "
+            "zoomed, scaled or cropped"
+        )
+        return [Doubt(CAMERA, what, remedy, *_mean(errors[0] if errors else None))]
+
+    def left_out(self) -> list[Doubt]:
+        """Return whether images without a part in the fit are predicted as well as it claims."""
+        if (predicted := self.predicted) is None:
+            return []
+        dof = np.maximum(predicted.dof, 1)
+        most = np.maximum(MOST_SQUARES, 1.0 + _SURE * np.sqrt(2.0 / dof))
+        of_blocks = predicted.squares / dof
+        worst = float(of_blocks.max()) if np.any(of_blocks > most) else 0.0
+        if (ratio := max(predicted.ratio, worst)) <= MOST_SQUARES:
+            return []
+        what = (
+            f"images that are left out lie {np.sqrt(ratio):.1f} times as far from their prediction "
+            "by the others as is stated"
+        )
+        remedy = (
+            "the session does not agree with itself: look for what changed or moved between "
+            "images, for play and bending, and at the worst outlines"
+        )
+        sigma = None if self.platform is None else self.platform.sigma
+        return [Doubt("left_out", what, remedy, *_mean(sigma, float(np.sqrt(ratio - 1.0))))]
+
+    def no_better(self) -> list[Doubt]:
+        """Return whether left-out images are predicted as much better as the change claims."""
+        predicted = self.predicted
+        if predicted is None or predicted.gain is None:
+            return []
+        if predicted.gain >= min(MIN_GAIN, 1.0 - _SURE * predicted.gain_sigma):
+            return []
+        gain = max(predicted.gain, 0.0)
+        what = (
+            "images that are left out are predicted better than by the nominal model by "
+            f"{100.0 * gain:.0f} % of what the change of the model claims"
+        )
+        remedy = "look at the overlays for edges that are not those of the legs, and at the cameras"
+        change = None if self.platform is None else self.platform.change
+        return [Doubt("no_better", what, remedy, *_mean(change, 1.0 - gain))]
+
+    def changes(self, *, scatters: bool) -> list[Doubt]:
+        """Return what changed in the session, and readings that do not follow motors.
+
+        It counts where it displaces the platform by more than that is known to; scatter of readings
+        also where outlines scatter by it, but not beside another cause, which leaves scatter
+        behind.
+        """
+        doubts = []
+        for finding in self.session.findings:
+            effect = None if self.platform is None else self._effect_of(finding)
+            if self.platform is None or effect is None:
+                doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
+            elif effect[0] > self.platform.sigma.mean_displacement or (
+                scatters and finding.kind == READING_NOISE
+            ):
+                doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
+        return [doubt for doubt in doubts if doubt.code != READING_NOISE] or doubts
+
+    def _effect_of(self, finding: Finding) -> tuple[float, float]:
+        """Return the mean displacement [m] and rotation [rad] by a number that the fit lacks.
+
+        Of an encoder whose zero changed on the worse side of the change.
+        """
+        machine, solution = self.dataset.machine, self.solution
+        error = self.moved_in_fit(finding.steps)
+        before = error.mean_displacement, error.mean_rotation
+        if finding.kind != "encoder":
+            return before
+        q = self.dataset.measurements.q_of_poses
+        is_of_motor = np.array([leg.motor_label == finding.subject for leg in machine.legs])
+        there = poses_at_readings(machine, solution.legs, q, solution.T_Rb_Re)
+        q = q + finding.amount * is_of_motor
+        moved = poses_at_readings(machine, solution.legs, q, there)
+        after = (float(x.mean()) for x in pose_differences(moved, there))
+        displacement, rotation = (max(b, a - b) for b, a in zip(before, after, strict=True))
+        return displacement, rotation
+
+    def moved_parameters(self) -> list[Doubt]:
+        """Return parameters that moved far beyond the tolerance of the machine, as one doubt."""
+        priors, names = self.problem.choices.priors, list(self.nominal)
+        expected = [priors[n].mean if n in priors else x for n, x in self.nominal.items()]
+        change = self.change + list(self.nominal.values()) - expected
+        times = np.abs(change) / np.hypot(self.sigma, self.tolerance)
+        far = np.flatnonzero(times > MOST_MOVED)
+        if not len(far):
+            return []
+        error = None
+        if self.platform is not None:
+            error = self.moved(np.where(times > MOST_MOVED, change, 0.0)[:, None])
+        moved = []
+        for i in far[np.argsort(-times[far], kind="stable")].tolist():
+            scale, unit = SHOWN_IN[self.solution.kinematic.parametrization.units[i]]
+            tolerance = scale * self.tolerance[i]
+            moved.append(
+                f"{names[i]} by {scale * change[i]:+.3g} {unit} (tolerance {tolerance:.2g})"
+            )
+        what = f"the fit moved {few(moved)}, far beyond the tolerance of the machine"
+        remedy = (
+            "look at the worst outlines of these legs and at the model there; if the machine may "
+            "be that far off its model, state so (tolerance in dataset.yaml)"
+        )
+        return [Doubt("tolerance", what, remedy, *_mean(error))]
+
+    def noise(self) -> list[Doubt]:
+        """Return whether outlines scatter more than they claim: all, of a view, leg or period.
+
+        What is beyond the claim may be no noise, and move the platform as much as that.
+        """
+        problem = self.problem
+        o, scatter = problem.outlines, Scatter.of(problem, self.solution.posterior.state)
+        times = {"all views": scatter.ratio()}
+        if times["all views"] <= MOST_SCATTER:
+            groups = {f"view {name}": o.view == v for v, name in enumerate(o.views)}
+            groups |= {name: o.leg == j for j, name in enumerate(problem.legs.names)}
+            groups |= self.session.periods
+            times = {
+                name: scatter.ratio(of) * scatter.is_beyond_chance(of, len(groups))
+                for name, of in groups.items()
+            }
+        worst = max(times, key=times.__getitem__)
+        if times[worst] <= MOST_SCATTER:
+            return []
+        what = (
+            f"the outlines of {worst} scatter about the fit {times[worst]:.1f} times as much as "
+            "their standard deviations"
+        )
+        remedy = (
+            "something moves that should not, or edges are not those of the legs: look at the "
+            "worst outlines, for play, bending, a camera or board that moved, and readings of "
+            "another moment"
+        )
+        sigma = None if self.platform is None else self.platform.sigma
+        part = float(np.sqrt(times[worst] ** 2 - 1.0))
+        return [Doubt("noise", what, remedy, *_mean(sigma, part))]
+
+    def scale(self) -> list[Doubt]:
+        """Return whether witnesses of the scale contradict each other, or the only one the model.
+
+        Where several agree, a model or radii of another size are theirs, and no doubt.
+        """
+        if self.nominal_size is None:
+            return []
+        compared = compare_scales(self.solution.posterior, self.nominal_size)
+        if compared is None:
+            return []
+        witnesses, wrong = scale_witnesses(self.problem), compared.likelier_wrong()
+        alone, names = len(witnesses) == 1, compared.witnesses
+        # One ruler may have measured all that is stated, and one file has all squares of boards
+        others = () if alone or not {TRAVEL, BOARD} & set(witnesses) else (MODEL,)
+        explained = wrong is not None and names[wrong] in (RADII, *others)
+        pairs = [
+            pair
+            for pair in compared.disagreements
+            if not (explained and wrong in (pair.larger, pair.smaller))
+        ]
+        if not pairs:
+            return []
+        suspects = [pairs[0].larger, pairs[0].smaller] if wrong is None else [wrong]
+        first = next((p for p in pairs if wrong in (p.larger, p.smaller)), pairs[0])
+        if wrong is not None and names[wrong] == MODEL:  # it has no part in the fit
+            both = {first.larger, first.smaller}
+            suspects = list(both - {wrong}) if wrong in both else []
+        clauses = [
+            f"by {names[pair.larger]} the machine is {100.0 * pair.ratio:.2g} % larger than by "
+            f"{names[pair.smaller]} ({pair.sigmas:.0f} standard deviations)"
+            for pair in pairs
+        ]
+        likelier = (
+            "either may be wrong"
+            if wrong is None
+            else f"the likelier wrong is {names[wrong]}, as the others agree without it"
+        )
+        rests = f"; the scale rests on {witnesses[0]} alone" if alone else ""
+        what = f"{few(clauses)}: {likelier}{rests}"
+        remedy = (
+            "check these, and measure another length and state it "
+            f"({self.dataset.machine.length_option}, --set)"
+        )
+        error = None
+        if self.platform is not None and suspects:
+            errors = [self.moved_in_fit(first.ratio * compared.steps[:, [i]]) for i in suspects]
+            error = max(errors, key=lambda one: one.mean_displacement)
+        return [Doubt("scale", what, remedy, *_mean(error))]
+
+    def nominal_lengths(self) -> list[Doubt]:
+        """Return whether the only witness of the scale is a stated length that is the model's.
+
+        A measured one differs, and nothing else would show that this one was not measured.
+        """
+        stated = nominal_lengths(self.dataset, self.solution)
+        if not stated or self.nominal_size is None or len(scale_witnesses(self.problem)) != 1:
+            return []
+        error = None
+        if self.platform is not None:
+            units = self.solution.kinematic.parametrization.units
+            lengths = np.where(np.equal(units, "m"), list(self.nominal.values()), 0.0)
+            error = self.moved(self.nominal_size.sigma * lengths[:, None])
+            if error.mean_displacement <= self.platform.sigma.mean_displacement:
+                return []
+        what = (
+            f"the scale rests on {few(stated)} alone, stated as in the model to all digits: was it "
+            "measured?"
+        )
+        remedy = (
+            "measure it and state that, or state a second length beside it "
+            f"({self.dataset.machine.length_option})"
+        )
+        return [Doubt("nominal_length", what, remedy, *_mean(error))]
 
 
 def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:

@@ -27,13 +27,13 @@ from legcal.data.measurements import few, row_names
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.motions import components, motions_of, product
 from legcal.geometry.types import Array
+from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import WORKSPACE_POSES, WORKSPACE_SEED, random_poses
 from legcal.machine.kinematics import followed_poses, platforms_in_base, pose_differences
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of, vector_of
 from legcal.machine.redundancy import reading_residuals
-from legcal.machine.solved_poses import solve_poses
 from legcal.vision.board import Link
 
 WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")

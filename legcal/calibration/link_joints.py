@@ -33,10 +33,15 @@ from legcal.files.motions import Pose
 from legcal.geometry.axes import turned_axis
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.directions import SHOWN, describe_direction
 from legcal.machine.leg import LegColumns
 from legcal.machine.model import Machine
-from legcal.machine.parameters import free_coordinates, geometries, parametrization_of
+from legcal.machine.parameters import (
+    SHOWN,
+    describe_direction,
+    free_coordinates,
+    geometries,
+    parametrization_of,
+)
 from legcal.machine.rods import AT_ZERO
 from legcal.vision.board import LINKS, Link
 

@@ -32,12 +32,12 @@ from legcal.data.measurements import Measurements, few, images_in_words, row_nam
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.closing import solve_poses
 from legcal.machine.kinematics import followed_poses, platform_in_base, platforms_in_base
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import Contradiction, contradictions
-from legcal.machine.solved_poses import solve_poses
 from legcal.paper.criteria import Criteria
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs

@@ -28,19 +28,25 @@ import numpy as np
 from legcal.calibration.board import board_notes, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
-from legcal.calibration.estimate import TRIAL, Estimate, fit_outlines
+from legcal.calibration.estimate import (
+    TRIAL,
+    Estimate,
+    fit_outlines,
+    measure_again,
+    not_found_again,
+    shown_near,
+)
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known_parameters, resolve
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.near_fit import measure_again, not_found_again, shown_near
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
-from legcal.calibration.verdict import judge
+from legcal.calibration.verdict import camera_file_notes, judge
 from legcal.data.cache import (
     fingerprint,
     note_on_missing_photographs,
@@ -63,7 +69,7 @@ from legcal.errors import (
 from legcal.files.folder import check_destination, output_path
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes
 from legcal.perception.outline import measure_in_brief
@@ -197,7 +203,6 @@ def calibrate(
         *([f"Left out, as asked: {leave_out}."] if leave_out else ()),
         *board_notes(dataset, found.solution, found.corners),
         *found.solution.notes,
-        *_camera_notes(dataset, found.solution),
         *exact_cameras(dataset, choices),
     ]
     calibration = judge(
@@ -304,12 +309,9 @@ def _estimate(
         estimate = first if diagnosis else measure_again(data, first, seen, board, options)
     except (NotVisible, NotIdentifiable, DidNotConverge) as error:
         # A fit with a wrong camera may lead away from outlines that were found before it.
-        if not first.solution.camera_doubts.notes:
+        if not (wrong := first.solution.camera_doubts):
             raise
-        cameras = (
-            *first.solution.camera_doubts.notes,
-            *_camera_notes(data.dataset, first.solution),
-        )
+        cameras = (*map(str, wrong), *camera_file_notes(data.dataset, first.solution))
         raise type(error)([*cameras, *error.facts]) from error
     return replace(
         estimate,
@@ -436,24 +438,21 @@ def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntAr
 def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
     posterior, notes = solution.posterior, list[str]()
     sigma = np.sqrt(np.diagonal(posterior.covariance)[posterior.problem.where("own_zeros")])
-    zeros = dataset.measurements.own_zeros, posterior.state.own_zeros.tolist(), sigma.tolist()
+    values, errors = posterior.state.own_zeros.tolist(), sigma.tolist()
     unit_of = {leg.motor_label: leg.reading_unit for leg in dataset.machine.legs}
-    for of, value, error in zip(*zeros, strict=True):
+    for k, of in enumerate(dataset.measurements.own_zeros):
         scale, unit = SHOWN_IN[unit_of[of.motor]]
+        if not posterior.problem.readings.by_zero[:, k].any():
+            notes.append(
+                f"In {of.images} the zero of the encoder of {of.motor} is not known: all of them "
+                "are kept aside; keep others aside (--holdout)."
+            )
+            continue
         notes.append(
-            f"In {of.images} the zero of the encoder of {of.motor} is {scale * value:+.4f} ± "
-            f"{scale * error:.4f} {unit} from that of the other images, which the model has."
+            f"In {of.images} the zero of the encoder of {of.motor} is {scale * values[k]:+.4f} ± "
+            f"{scale * errors[k]:.4f} {unit} from that of the other images, which the model has."
         )
     return notes
-
-
-def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
-    """Return a note on the file of each camera that the measurements contradict."""
-    names = [view.name for view in dataset.measurements.views]
-    return [
-        f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
-        for view in solution.camera_doubts.views
-    ]
 
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:

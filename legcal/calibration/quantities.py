@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from legcal.files.quantity import SHOWN_IN
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 
 if TYPE_CHECKING:
     from legcal.calibration.documents import FrameMark, Result

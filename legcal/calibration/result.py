@@ -52,11 +52,16 @@ from legcal.data.measurements import row_names
 from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.directions import describe_direction
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.parameters import geometries, nominal_axes, parametrization_of, vector_of
+from legcal.machine.parameters import (
+    describe_direction,
+    geometries,
+    nominal_axes,
+    parametrization_of,
+    vector_of,
+)
 from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
 from legcal.vision.board import LINKS, Link

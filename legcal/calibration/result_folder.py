@@ -46,11 +46,10 @@ from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.home import home_of_legs
-from legcal.machine.leg import Leg, with_radii
+from legcal.machine.leg import ARMS, AXES, Leg, ParameterId, with_radii
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
-from legcal.machine.parameter_id import ARMS, AXES, ParameterId
 from legcal.machine.parameters import (
     calibrated_axis,
     geometries,

@@ -28,21 +28,26 @@ from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.image_choice import images_in_words
 from legcal.data.measurements import Measurements, few_views, row_names
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, normal_equations
-from legcal.estimation.uncertainty import residual_changes, response, score_test
+from legcal.estimation.uncertainty import (
+    LEAST_SEEN,
+    Estimated,
+    Scores,
+    residual_changes,
+    response,
+)
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
 
-SIGNIFICANCE = 1e-4  # largest probability of a finding by chance, times the number of tests
 MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
 MIN_IMAGES = 3  # on each side of a change
 _MAX_OTHER_VIEWS = 5  # views whose side of a change is tried
 _HUBER = 3.0  # standard deviations from which on outlines count less
-_UNSEEN = 1e-7  # part of the square of a column below which the fit absorbs it
 ALL_MOTORS = "all motors"
 
 _GOOD_PART = 0.2  # of a turn, beyond which errors once a turn are looked for
@@ -267,7 +272,7 @@ def session_tests(
     if not hypotheses:
         return SessionTests()
     scores = _Scores.of(problem, linear, normal, hypotheses)
-    least = math.sqrt(chdtri(1.0, SIGNIFICANCE / max(len(tests), 1)))
+    least = math.sqrt(chdtri(1.0, DOUBT_BY_CHANCE / max(len(tests), 1)))
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
     for test, number in zip(tests, solved, strict=True):
         hypothesis = hypotheses[test.hypothesis]
@@ -337,7 +342,7 @@ def _forward_selection(
     lacking = list[tuple[_Test, _Solved]]()
     while tests and len(lacking) < MAX_FINDINGS:
         best = min(range(len(tests)), key=lambda i: (solved[i].p_value, -solved[i].square))
-        if solved[best].p_value * n_tests > SIGNIFICANCE:
+        if solved[best].p_value * n_tests > DOUBT_BY_CHANCE:
             break
         lacking.append((tests[best], solved[best]))
         scores = scores.given(solved[best])
@@ -682,11 +687,9 @@ def _of_views(
 
 @dataclass(frozen=True, eq=False)
 class _Scores:
-    """Rao's scores of all hypotheses in each block, and their information."""
+    """Rao's scores of all hypotheses in each block of images."""
 
-    score: Array  # (c,)
-    information: Array  # (c, c)
-    size: Array  # (c,) squares of the columns before the fit absorbs its part
+    scores: Scores
     column: Sequence[IntArray]  # (d, n_blocks) columns of each hypothesis, -1 without any
 
     @classmethod
@@ -714,18 +717,11 @@ class _Scores:
                     of_factor[:, :, column[k][blocks]] = (
                         values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
                     )
-        score, information = score_test(problem, linear, normal, stacked)
-        size = sum(np.einsum("nqc,nqc->c", v, v) for v in stacked.values())
-        return cls(score, information, np.asarray(size), columns)
+        return cls(Scores.of(problem, linear, normal, stacked), columns)
 
     def given(self, number: _Solved) -> _Scores:
         """Return the scores given a number that the fit lacks."""
-        toward = self.information[:, number.columns] @ number.chosen
-        return replace(
-            self,
-            score=self.score - toward @ number.amount,
-            information=self.information - toward @ number.inverse @ toward.T,
-        )
+        return replace(self, scores=self.scores.given(number.estimated))
 
     def of_readings(self, group: Sequence[int], sigma: Sequence[Array]) -> tuple[IntArray, Array]:
         """Return the columns (c,) of the readings of some motors, and what is given of each."""
@@ -735,52 +731,41 @@ class _Scores:
     def with_noise(self, noise: _Scatter) -> _Scores:
         """Return the scores where readings scatter as much as they were found to."""
         columns, sigma = self.of_readings(noise.group, noise.sigma)
-        toward = self.information[:, columns]
+        scores = self.scores
+        toward = scores.information[:, columns]
         precision = np.diag((noise.further * sigma) ** -2.0) + toward[columns]
         by_noise = np.linalg.solve(precision, toward.T)
-        return replace(
-            self,
-            score=self.score - self.score[columns] @ by_noise,
-            information=self.information - toward @ by_noise,
-        )
+        score = scores.score - scores.score[columns] @ by_noise
+        information = scores.information - toward @ by_noise
+        return replace(self, scores=replace(scores, score=score, information=information))
 
     def solved(self, test: _Test) -> _Solved:
         """Estimate the number of a test."""
         column = self.column[test.hypothesis]
         used = column >= 0
-        columns = column[used]
         number, block = np.nonzero(used)
         chosen = (number[:, None] == np.arange(len(column))) & test.holds[block][:, None]
-        chosen = chosen.astype(np.float64)
-        of_blocks = self.information[np.ix_(columns, columns)]
-        toward = of_blocks @ chosen
-        score, information = chosen.T @ self.score[columns], chosen.T @ toward
-        scale = np.sqrt(np.maximum(chosen.T @ self.size[columns], np.finfo(np.float64).tiny))
-        value, vector = np.linalg.eigh(information / scale / scale[:, None])
-        seen = value > _UNSEEN
-        root = vector[:, seen] / np.sqrt(value[seen]) / scale[:, None]
-        inverse = root @ root.T
-        amount = inverse @ score
-        left = self.score[columns] - toward @ amount
-        variance = np.diagonal(of_blocks) - np.sum((toward @ inverse) * toward, axis=1)
-        tested = variance > _UNSEEN * self.size[columns]
-        ratio = left[tested] ** 2 / variance[tested]
+        of_blocks = self.scores.at(column[used])
+        found = of_blocks.estimate(np.arange(len(number)), chosen.astype(np.float64))
+        left = of_blocks.given(found)
+        variance = np.diagonal(left.information)
+        tested = variance > LEAST_SEEN * left.size
+        ratio = left.score[tested] ** 2 / variance[tested]
         scatter = max(float(ratio.mean()), 1.0) if len(ratio) else 1.0
-        rank, square = int(seen.sum()), float(score @ amount) / scatter
+        rank, square = found.rank, found.square / scatter
         if test.has_levels:
-            variance = max(float(inverse[0, 0]) * scatter, np.finfo(np.float64).tiny)
-            rank, square = min(rank, 1), float(amount[0]) ** 2 / variance
-        return _Solved(columns, chosen, amount, inverse, rank, square, scatter)
+            variance_of_first = max(
+                float(found.covariance[0, 0]) * scatter, np.finfo(np.float64).tiny
+            )
+            rank, square = min(rank, 1), float(found.amount[0]) ** 2 / variance_of_first
+        return _Solved(found._replace(columns=column[used]), rank, square, scatter)
 
 
 class _Solved(NamedTuple):
     """The number of a test by its score."""
 
-    columns: IntArray  # (c,) of the hypothesis
-    chosen: Array  # (c, d) those of the blocks in which it holds, zeros and ones
-    amount: Array  # (d,)
-    inverse: Array  # (d, d) covariance of the number, by the covariances of outlines
-    rank: int  # directions of the number that the fit does not absorb
+    estimated: Estimated
+    rank: int  # directions of the number that are tested
     square: float  # of the score, in units of its scatter
     scatter: float  # mean square of the scores of single blocks over their variance, at least 1
 
@@ -790,9 +775,14 @@ class _Solved(NamedTuple):
         return float(chdtrc(float(self.rank), self.square)) if self.rank else 1.0
 
     @property
+    def amount(self) -> Array:
+        """The number, (d,)."""
+        return self.estimated.amount
+
+    @property
     def covariance(self) -> Array:
         """Covariance of the number."""
-        return self.inverse * self.scatter
+        return self.estimated.covariance * self.scatter
 
 
 def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
@@ -808,7 +798,7 @@ def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatt
         for subject, group in groups.items()
     ]
     best = max(tests, key=lambda test: test.gain, default=None)
-    if best is None or best.p_value > SIGNIFICANCE or best.ratio < MOST_SCATTER:
+    if best is None or best.p_value > DOUBT_BY_CHANCE or best.ratio < MOST_SCATTER:
         return None
     return best
 
@@ -859,8 +849,8 @@ class _Scatter:
             n = hypotheses[i].share[name][read].sum(axis=0)
             sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
         columns, sigma = scores.of_readings(group, sigmas)
-        z = sigma * scores.score[columns]
-        K = sigma[:, None] * scores.information[np.ix_(columns, columns)] * sigma
+        z = sigma * scores.scores.score[columns]
+        K = sigma[:, None] * scores.scores.information[np.ix_(columns, columns)] * sigma
         own, vector = np.linalg.eigh(K)
         own, squares = np.maximum(own, 0.0), (vector.T @ z) ** 2
         # A weighted sum of squares is nearly chi-squared with these degrees of freedom.

@@ -31,7 +31,7 @@ from legcal.calibration.quantities import (
 )
 from legcal.data.reasons import reason_in_words
 from legcal.errors import OutOfResources
-from legcal.machine.directions import list_in_words
+from legcal.machine.parameters import list_in_words
 from legcal.pages.document import Number, Table
 from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
 from legcal.vision.board import Link

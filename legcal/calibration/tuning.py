@@ -54,3 +54,9 @@ MAX_SIGMA = 0.1
 HELD_SIGMA = 0.01
 # Motion of the platform over the change of parameters, below which it hardly moves.
 HARMLESS = 0.01
+
+# Doubts in a result
+
+# Probability with which each kind of test doubts a healthy session by chance, all that it asks
+# together: of about ten kinds one session in a thousand.
+DOUBT_BY_CHANCE = 1e-4

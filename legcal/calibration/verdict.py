@@ -20,6 +20,7 @@ from legcal.calibration.doubts import (
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import HeldOut
+from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import SCALE
@@ -28,7 +29,7 @@ from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
-from legcal.data.dataset import Dataset
+from legcal.data.dataset import PLAN_NAME, POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
 from legcal.data.measurements import few
 from legcal.data.reading_units import legs_with_readings
@@ -40,8 +41,6 @@ from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
-PLAN_NAME = "plan.json"  # plan in the folder of a planned session
-POSES_NAME = "poses.csv"  # its poses
 _ROUNDED = 0.51e-4  # [mm or deg] of the commands there
 AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
@@ -101,6 +100,13 @@ def judge(
     if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
         doubts = (*doubts, no_improvement(remedy or "take more images or better ones"))
     verdict = _verdict(worst_first(doubts), found, remedy)
+    causes = {finding.what for finding in session.findings}
+    if any(doubt.what in causes or doubt.code in ("scale", "mistake") for doubt in doubts):
+        # What a named cause does to cameras and readings accuses neither
+        accused = {*map(str, solution.camera_doubts), *reading_notes(readings)}
+        notes = [note for note in notes if note not in accused]
+    else:
+        notes = [*notes, *camera_file_notes(dataset, solution)]
     return Calibration(
         dataset,
         solution,
@@ -119,6 +125,15 @@ def judge(
         corners,
         tuple(diagnosis),
     )
+
+
+def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on the file of each camera that the measurements contradict."""
+    names = [view.name for view in dataset.measurements.views]
+    return [
+        f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
+        for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
+    ]
 
 
 def _asked_lengths(dataset: Dataset, solution: Solution, doubts: Sequence[Doubt]) -> list[str]:
@@ -147,7 +162,12 @@ def _untested(
             "Changes in the course of the session could not be tested: images have neither times "
             "nor numbers in their names; add a column time to measurements.csv."
         ]
-    leg_of = {leg.motor_label: leg for leg in dataset.machine.legs}
+    leg_of = {leg.motor_label: leg for leg in dataset.machine.legs if leg.is_motor}
+    if unseen := [motor for motor in leg_of if motor not in session.least_slips]:
+        return [
+            f"A slip of the encoder of {few(unseen)} would not show in these images, however large "
+            "it was; take more images, which show all legs."
+        ]
     at_joint = {  # [m]
         motor: size / leg_of[motor].reading_of(1.0) for motor, size in session.least_slips.items()
     }

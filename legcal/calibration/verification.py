@@ -42,8 +42,8 @@ from legcal.estimation.solver import Minimum, information, minimise
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.equations import pose_sensitivity
+from legcal.machine.leg import ARMS, ParameterId
 from legcal.machine.model import Machine, vectors_A_to_B
-from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import (
     Parametrization,
     geometries,

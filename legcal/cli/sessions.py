@@ -182,7 +182,7 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a session: poses and camera positions that determine a machine best."""
-    from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE
+    from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning import request
     from legcal.planning.places import parse_bounds

@@ -65,6 +65,8 @@ from legcal.vision.image_file import Grey, decode_image, inspect_image
 AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
+PLAN_NAME = "plan.json"  # plan in the folder of a planned session
+POSES_NAME = "poses.csv"  # its poses
 CACHE_NAME = ".legcal-cache.json"
 MAX_KEPT = 128 * 2**20  # size of the cache of decoded images [bytes]
 MIN_CORNERS = 4  # corners in an image that must place its camera

@@ -24,8 +24,8 @@ from legcal.errors import Code, DatasetError, Problem, UsageError
 from legcal.files.motions import MotionEntry
 from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
-from legcal.machine.directions import list_in_words
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.parameters import list_in_words
 from legcal.machine.tolerance import BuiltEntry
 from legcal.vision.board import Link
 

@@ -164,13 +164,7 @@ def in_order(name: str) -> tuple[object, ...]:
 def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
     """Match photographs to rows: by name, else by time, else in order.
 
-    Parameters
-    ----------
-    rows : sequence of Row
-    photographs : sequence of Photograph
-        In the order of their names.
-    table : str
-        The table, for messages.
+    *photographs* are in the order of their names; *table* is for messages.
 
     Raises
     ------

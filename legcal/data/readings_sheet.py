@@ -384,15 +384,8 @@ class _MotorsOfKind:
         if stated is None:
             origin = "the unit in which the readings lie in the travel of the legs"
         tried = [stated] if stated else GUESSED[self.turning]
-        named = [
-            meaning
-            for name in tried
-            for meaning in self.possible
-            if meaning.unit == name and meaning.are_lengths is self.lengths
-        ]
-        if not named:  # counts with a scale are no usual unit
-            named = [m for m in meanings(self.values, self.legs, tried)
-                     if m.are_lengths is self.lengths]  # fmt: skip
+        named = [m for m in meanings(self.values, self.legs, tried)
+                 if m.are_lengths is self.lengths]  # fmt: skip
         fitting = [m for m in named if self.fits(m)]
         if not fitting:
             self._refuse_other(named)
@@ -438,7 +431,7 @@ class _MotorsOfKind:
     def _refuse_other(self, tried: Sequence[Meaning]) -> None:
         """Refuse values that fit in a unit outside *tried*, or as lengths instead of readings."""
         units = [meaning.unit for meaning in tried]
-        others = [meaning for meaning in self.possible if meaning not in tried]
+        others = [m for m in self.possible if m.unit not in units or m.are_lengths != self.lengths]
         others.sort(key=lambda m: (m.unit not in units, m.are_lengths is not self.lengths))
         for other in filter(self.fits, others):
             remedies = []

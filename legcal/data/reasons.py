@@ -140,18 +140,10 @@ _EARLIER_WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """The reason why an observation is not used; false for a used one.
-
-    Attributes
-    ----------
-    reason : Reason
-        The code.
-    detail : str or Cause
-        A name or figures for the reader; of ``PARTNER``, the code of the other outline.
-    """
+    """The reason why an observation is not used; false for a used one."""
 
     reason: Reason = Reason.NONE
-    detail: str | Cause = ""
+    detail: str | Cause = ""  # a name or figures for the reader; of PARTNER the code of the other
 
     def __bool__(self) -> bool:
         return self.reason is not Reason.NONE

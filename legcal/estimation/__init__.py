@@ -32,7 +32,7 @@ A client writes a state, a function of residual rows for each kind of measuremen
 derivatives; one finite-difference test checks them all), and the blocks. At predicted observations
 the same :func:`information` gives the Cramer-Rao bound and the identifiable parameters; it is
 additive over eliminated elements, so that candidate images are low-rank updates of it
-(``NormalEquations.contributions``). Rank decisions use its square root (``square_root``).
+(``NormalEquations.contributions``). Rank decisions use its square root (``marginal_rows``).
 The same matrix gives the response to errors of fixed quantities (:func:`response`), the
 disagreement between eliminated elements with common errors (:class:`Clusters`), score tests of
 columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the covariance of

@@ -30,6 +30,7 @@ from legcal.geometry.types import Array, IntArray
 
 _STIFF = 1e6  # information on tied directions, over the information of measurements
 _ROUNDING = 1e-12  # relative error of differences of information
+LEAST_SEEN = 1e-7  # part of the square of a column below which the fit absorbs it
 _N_WORST = 3  # directions reported
 _MIN_COMPONENT = 0.3  # smallest reported component of a direction, over the largest
 
@@ -278,6 +279,67 @@ def score_test(
     return score, projected
 
 
+class Estimated(NamedTuple):
+    """Numbers that a fit lacks, estimated by their scores."""
+
+    columns: IntArray  # (c,)
+    chosen: Array  # (c, d) what one unit of each number adds to each of these columns
+    amount: Array  # (d,)
+    covariance: Array  # (d, d)
+    rank: int  # directions of the numbers that the fit does not absorb
+    square: float  # of the score over its variance: chi-squared of that rank if all are zero
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Rao's scores of numbers that a fit lacks, and their information (:func:`score_test`)."""
+
+    score: Array  # (c,)
+    information: Array  # (c, c)
+    size: Array  # (c,) squares of the columns before the fit absorbs its part
+
+    @classmethod
+    def of(
+        cls,
+        problem: EstimationProblem[S],
+        linear: Linearization,
+        normal: NormalEquations,
+        columns: Mapping[str, Array],
+    ) -> Scores:
+        """Compute the scores of *columns*, as in :func:`score_test`."""
+        size = sum(np.einsum("nqc,nqc->c", v, v) for v in columns.values())
+        return cls(*score_test(problem, linear, normal, columns), np.asarray(size))
+
+    def at(self, columns: IntArray) -> Scores:
+        """Return the scores of some columns alone."""
+        information = self.information[np.ix_(columns, columns)]
+        return Scores(self.score[columns], information, self.size[columns])
+
+    def estimate(self, columns: IntArray, chosen: Array | None = None) -> Estimated:
+        """Estimate numbers together: one for each column, or *chosen* (c, d) sums of columns."""
+        chosen = np.eye(len(columns)) if chosen is None else chosen
+        score = chosen.T @ self.score[columns]
+        information = chosen.T @ self.information[np.ix_(columns, columns)] @ chosen
+        scale = np.sqrt(np.maximum(chosen.T @ self.size[columns], np.finfo(np.float64).tiny))
+        value, vector = np.linalg.eigh(information / scale / scale[:, None])
+        seen = value > LEAST_SEEN
+        root = vector[:, seen] / np.sqrt(value[seen]) / scale[:, None]
+        covariance = root @ root.T
+        amount = covariance @ score
+        return Estimated(
+            columns, chosen, amount, covariance, int(seen.sum()), float(score @ amount)
+        )
+
+    def given(self, numbers: Estimated) -> Scores:
+        """Return the scores of a fit that has these numbers as well."""
+        toward = self.information[:, numbers.columns] @ numbers.chosen
+        return replace(
+            self,
+            score=self.score - toward @ numbers.amount,
+            information=self.information - toward @ numbers.covariance @ toward.T,
+        )
+
+
 class LeftOut(NamedTuple):
     """How well a block of eliminated elements is predicted by all else."""
 
@@ -382,3 +444,44 @@ def scores_of_block(problem: EstimationProblem[S], state: S, name: str) -> tuple
         K = (vector * np.maximum(eigenvalue, 0.0)) @ vector.T
     block_score = g[effects] - prior_information * value - R_mixed.T @ inverse @ g[others]
     return K @ value - block_score, K
+
+
+_UNKNOWN = 1e-3  # [1 / unit]: singular values up to here count as undetermined unknowns
+
+
+def marginal_rows(rows: Array, which: IntArray) -> Array:
+    """Marginalise out all unknowns of rows (m, n) but *which*; return rows (c, c)."""
+    others = np.setdiff1d(np.arange(rows.shape[1]), which)
+    return compress(eliminate(rows[None][:, :, np.append(others, which)], len(others)))
+
+
+def eliminate(
+    # (k, r, n_nuisance + n_shared): rows of each group, one over the unit of the unknowns
+    rows: Array,
+    n_nuisance: int,  # number of leading columns: nuisance unknowns of each group
+) -> Array:
+    """Marginalise out the nuisance unknowns of each group of rows; return rows (m, n_shared).
+
+    A QR decomposition and an SVD rotate the rows until as few as possible contain nuisance
+    unknowns, and these rows are dropped: exact also where the nuisance unknowns are not determined.
+    """
+    n_shared = rows.shape[2] - n_nuisance
+    if rows.shape[0] == 0 or rows.shape[1] == 0:
+        return np.zeros((0, n_shared))
+    if n_nuisance == 0:
+        return rows.reshape(-1, n_shared)
+    if rows.shape[1] < n_nuisance:
+        missing = n_nuisance - rows.shape[1]
+        rows = np.concatenate([rows, np.zeros((len(rows), missing, rows.shape[2]))], axis=1)
+    upper = np.asarray(np.linalg.qr(rows, mode="r"))
+    left, singular, _ = np.linalg.svd(upper[:, :n_nuisance, :n_nuisance])
+    rotated = np.swapaxes(left, 1, 2) @ upper[:, :n_nuisance, n_nuisance:]
+    lower = upper[:, n_nuisance:, n_nuisance:]
+    return np.concatenate([rotated[singular <= _UNKNOWN], lower.reshape(-1, n_shared)])
+
+
+def compress(rows: Array) -> Array:
+    """Return the square rows (p, p) of the same information as rows (m, p)."""
+    n = rows.shape[1]
+    upper = np.asarray(np.linalg.qr(rows, mode="r")) if len(rows) else np.zeros((0, n))
+    return np.concatenate([upper, np.zeros((n - len(upper), n))])

@@ -21,14 +21,14 @@ from legcal.errors import OutOfClass, UsageError
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.configurations import workspace
-from legcal.machine.coordinates import (
+from legcal.machine.kinematics import equations_of_readings
+from legcal.machine.mobility import (
     COORDINATES,
     coordinates_of,
     independent_coordinates,
     poses_at_coordinates,
     turned_back,
 )
-from legcal.machine.kinematics import equations_of_readings
 from legcal.machine.model import Machine, readings_at_poses
 from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__

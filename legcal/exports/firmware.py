@@ -49,47 +49,34 @@ TURNED = 5.0  # [deg] of all towers from the nominal angles, above which the fra
 _MM = 1e3
 
 
-def firmware_refusal(name: str) -> Callable[[Subject], str | None]:
-    """Return the refusal of machines that a firmware does not know."""
-
-    def refusal(subject: Subject) -> str | None:
-        machine = subject.machine
-        actuators = machine.actuators
-        kinds = {firmware.turns for firmware in FIRMWARES if firmware.name == name}
-        title = next(firmware.title for firmware in FIRMWARES if firmware.name == name)
-        needed = f"needed a Delta with three {'' if True in kinds else 'linear '}motors ({title})"
-        if len(actuators) != TOWERS or machine.mobility != TOWERS:
-            carry = f"{len(actuators)} motors that carry rods"
-            return f"found {carry} and {machine.mobility} freedoms, {needed}"
-        if machine.n_legs != 2 * TOWERS:
-            return f"found {machine.n_legs} rods on them, {needed} and two rods on each"
-        if not machine.is_determined:
-            return f"found that {machine.undetermined}, {needed}"
-        turns = {actuator.turns for actuator in actuators}
-        if len(turns) > 1 or not turns <= kinds:
-            return f"found motors that {'turn' if True in turns else 'slide'}, {needed}"
-        up = _upwards(machine)
-        for actuator in actuators:
-            if (float(abs(actuator.axis @ up)) > UPRIGHT) is actuator.turns:
-                return f"found that '{actuator.joint}' does not move as in a Delta, {needed}"
-        return None
-
-    return refusal
+def firmware_refusal(name: str, subject: Subject) -> str | None:
+    """Return the reason for refusing a machine that a firmware does not know, or None."""
+    machine, actuators = subject.machine, subject.machine.actuators
+    kinds = {firmware.turns for firmware in FIRMWARES if firmware.name == name}
+    title = next(firmware.title for firmware in FIRMWARES if firmware.name == name)
+    needed = f"needed a Delta with three {'' if True in kinds else 'linear '}motors ({title})"
+    if len(actuators) != TOWERS or machine.mobility != TOWERS:
+        carry = f"{len(actuators)} motors that carry rods"
+        return f"found {carry} and {machine.mobility} freedoms, {needed}"
+    if machine.n_legs != 2 * TOWERS:
+        return f"found {machine.n_legs} rods on them, {needed} and two rods on each"
+    if not machine.is_determined:
+        return f"found that {machine.undetermined}, {needed}"
+    turns = {actuator.turns for actuator in actuators}
+    if len(turns) > 1 or not turns <= kinds:
+        return f"found motors that {'turn' if True in turns else 'slide'}, {needed}"
+    up = _upwards(machine)
+    for actuator in actuators:
+        if (float(abs(actuator.axis @ up)) > UPRIGHT) is actuator.turns:
+            return f"found that '{actuator.joint}' does not move as in a Delta, {needed}"
+    return None
 
 
-def firmware_files(name: str) -> Callable[[Subject, ExportOptions, Path], Rendered]:
-    """Return the renderer of a firmware."""
-
-    def render(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-        turns = subject.machine.actuators[0].turns
-        firmware = next(f for f in FIRMWARES if f.name == name and f.turns is turns)
-        return _rendered(subject, firmware, path)
-
-    return render
-
-
-def _rendered(subject: Subject, firmware: Firmware, path: Path) -> Rendered:
+def firmware_files(name: str, subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+    """Return the lines for a firmware, and a picture of what remains."""
     machine = subject.machine
+    turns = machine.actuators[0].turns
+    firmware = next(f for f in FIRMWARES if f.name == name and f.turns is turns)
     mount = _mounted(machine, firmware)
     readings, poses = _poses_to_print(mount)
     seen = _Seen(mount.steps(readings), mount.nozzle(poses))
@@ -443,7 +430,7 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
 def linuxcnc_refusal(subject: Subject) -> str | None:
     """Return the reason for refusing a machine that no kinematics of LinuxCNC are like, or None."""
     refusal = hexapod_refusal(subject)
-    of_deltas = firmware_refusal("linuxcnc")(subject)
+    of_deltas = firmware_refusal("linuxcnc", subject)
     return None if of_deltas is None else refusal and f"{refusal}, or a Delta with three motors"
 
 
@@ -468,7 +455,7 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
     """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
     if machine.actuators:
-        return firmware_files("linuxcnc")(subject, options, path)
+        return firmware_files("linuxcnc", subject, options, path)
     home = readings_at(machine, machine.home)
     pose = [*(_MM * machine.home.translation), *machine.home.rotation.as_euler("xyz", degrees=True)]
     lines = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,17 +33,13 @@ if TYPE_CHECKING:
 Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
 
-def _accept_all(subject: Subject) -> str | None:
-    """Accept every machine."""
-    return None
-
-
 @dataclass(frozen=True)
 class Format:
     """A format: its renderer, its restrictions and its options."""
 
     render: Render  # files from a subject, options and the requested path
-    refusal: Callable[[Subject], str | None] = _accept_all  # reason for refusing a machine
+    # reason for refusing a machine, or None
+    refusal: Callable[[Subject], str | None] = lambda _: None
     is_folder: bool = False
     options: tuple[str, ...] = ()  # supported fields of ExportOptions
 
@@ -55,7 +52,7 @@ FORMATS: dict[str, Format] = {
     "mjcf": Format(mjcf_files, mjcf_refusal),
     "linuxcnc": Format(linuxcnc_files, linuxcnc_refusal),
     **{
-        name: Format(firmware_files(name), firmware_refusal(name))
+        name: Format(partial(firmware_files, name), partial(firmware_refusal, name))
         for name in ("klipper", "reprapfirmware", "marlin")
     },
     "flypt": Format(flypt_files, flypt_refusal),

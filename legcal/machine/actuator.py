@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,18 +41,6 @@ class ActuatorColumns:
     ARM_AXIS, ARM_POINT = slice(17, 19), slice(19, 21)
     LINE, ARM = slice(12, 16), slice(17, 21)  # the line of the axis, the line of the arm
     COUNT = 9
-
-
-class JointMotion(NamedTuple):
-    """A joint centre at k readings, and its derivatives."""
-
-    A: Array  # (k, 3) [m]
-    by_A: Array  # (k, 3, 3) derivative by A at reading 0, which is also the rotation of the arm
-    by_axis: Array  # (k, 3, 2) derivative by rotations of the axis about its normal_basis
-    by_point: Array  # (k, 3, 2) derivative by displacements of the axis along its normal_basis
-    by_gain: Array  # (k, 3)
-    by_q: Array  # (k, 3) derivative by the reading [1, or m/rad]
-    angle: Array  # (k,) rotation of a revolute [rad]; zero for a prismatic
 
 
 US_PER_DEG = (0.1, 1000.0)  # plausible range of |pulse width per degree| of hobby servos
@@ -222,60 +210,15 @@ class Actuator:
 
     def rotations(self, q: Array) -> Array:
         """Return the rotations (k, 3, 3) of the carriage or arm at readings (k,)."""
-        q = np.asarray(q, dtype=np.float64)
-        if not self.turns:
-            return np.broadcast_to(np.eye(3), (len(q), 3, 3))
-        w, angle = self.axis, self.gain * q[:, None, None]
-        K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-        return np.asarray(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K))
+        return self.motion(self.point, q).by_A
 
     def at(self, A: Array, q: Array) -> Array:
         """Return the joint centre (k, 3) at readings (k,); it is at A (3,) at reading 0."""
-        q = np.asarray(q, dtype=np.float64)
-        if not self.turns:
-            return np.asarray(A + self.gain * q[:, None] * self.axis)
-        return np.asarray(self.point + self.rotations(q) @ (A - self.point))
-
-    def path(self, A: Array) -> tuple[Array, Array, Array, Array]:
-        """Return middle, cos, sin and slide (3,) of the path of a joint at A (3,) at reading 0.
-
-        Its position is middle + cos cosine(g q) + sin sine(g q) + slide q.
-        """
-        zero = np.zeros(3)
-        if not self.turns:
-            return A, zero, zero, self.gain * self.axis
-        sin = cross(self.axis, A - self.point)
-        cos = cross(sin, self.axis)
-        return A - cos, cos, sin, zero
+        return self.motion(A, q).A
 
     def motion(self, A: Array, q: Array) -> JointMotion:
-        """Return :meth:`at` with its derivatives."""
-        q = np.asarray(q, dtype=np.float64)
-        k, basis = len(q), self.line.across
-        if not self.turns:
-            across = cross(basis, self.axis)  # (2, 3)
-            return JointMotion(
-                self.at(A, q),
-                np.broadcast_to(np.eye(3), (k, 3, 3)),
-                self.gain * q[:, None, None] * across.T,
-                np.zeros((k, 3, 2)),
-                q[:, None] * self.axis,
-                np.broadcast_to(self.gain * self.axis, (k, 3)),
-                np.zeros(k),
-            )
-        R, arm = self.rotations(q), A - self.point
-        turned = R @ arm
-        by_axis = np.stack([cross(e, turned) - R @ cross(e, arm) for e in basis], axis=2)
-        by_angle = cross(self.axis, turned)
-        return JointMotion(
-            self.point + turned,
-            R,
-            by_axis,
-            (np.eye(3) - R) @ basis.T,
-            q[:, None] * by_angle,
-            self.gain * by_angle,
-            self.gain * q,
-        )
+        """Return the motion of the joint centre that is at A (3,) at reading 0."""
+        return JointMotion(self, A, np.asarray(q, dtype=np.float64))
 
     def moved(self, step: Array) -> Actuator:
         """Return the actuator after a step (9,): its axis (rotations, point), gain and arm."""
@@ -351,3 +294,68 @@ class Actuator:
         line = self.arm.line
         arm = {"link": self.arm.link, "point": line.point.tolist(), "axis": line.axis.tolist()}
         return document | {"arm": arm}
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """A joint centre on an actuator at k readings, and its derivatives."""
+
+    actuator: Actuator
+    at_zero: Array  # (3,) the joint centre at reading 0 [m]
+    q: Array  # (k,) readings [m or rad]
+
+    @cached_property
+    def angle(self) -> Array:
+        """The rotation of a revolute, (k,) [rad]; zero for a prismatic."""
+        return np.asarray(self.actuator.gain * self.q * self.actuator.turns)
+
+    @cached_property
+    def _arm(self) -> Array:
+        """From the point of the axis to the joint, (k, 3) [m]: Rodrigues' formula."""
+        w, arm, angle = self.actuator.axis, self.at_zero - self.actuator.point, self.angle[:, None]
+        along = (arm @ w) * w
+        return np.asarray(along + np.cos(angle) * (arm - along) + np.sin(angle) * cross(w, arm))
+
+    @cached_property
+    def A(self) -> Array:
+        """The joint centre, (k, 3) [m]."""
+        if self.actuator.turns:
+            return np.asarray(self.actuator.point + self._arm)
+        return np.asarray(self.at_zero + self.actuator.gain * self.q[:, None] * self.actuator.axis)
+
+    @cached_property
+    def by_A(self) -> Array:
+        """The derivative (k, 3, 3) by A at reading 0, which is also the rotation of the arm."""
+        w, angle = self.actuator.axis, self.angle[:, None, None]
+        K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+        return np.asarray(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K))
+
+    @cached_property
+    def by_axis(self) -> Array:
+        """The derivative (k, 3, 2) by rotations of the axis about its normal_basis."""
+        basis, arm = self.actuator.line.across, self.at_zero - self.actuator.point
+        if not self.actuator.turns:
+            across = cross(basis, self.actuator.axis).T
+            return np.asarray(self.actuator.gain * self.q[:, None, None] * across)
+        return np.stack([cross(e, self._arm) - self.by_A @ cross(e, arm) for e in basis], axis=2)
+
+    @cached_property
+    def by_point(self) -> Array:
+        """The derivative (k, 3, 2) by displacements of the axis along its normal_basis."""
+        return np.asarray((np.eye(3) - self.by_A) @ self.actuator.line.across.T)
+
+    @cached_property
+    def _by_true_motion(self) -> Array:
+        """The derivative (k, 3) by the angle of a revolute, or the displacement of a prismatic."""
+        w = self.actuator.axis
+        return cross(w, self._arm) if self.actuator.turns else np.tile(w, (len(self.q), 1))
+
+    @property
+    def by_gain(self) -> Array:
+        """The derivative (k, 3) by the gain."""
+        return np.asarray(self.q[:, None] * self._by_true_motion)
+
+    @property
+    def by_q(self) -> Array:
+        """The derivative (k, 3) by the reading [1, or m/rad]."""
+        return np.asarray(self.actuator.gain * self._by_true_motion)

@@ -26,7 +26,7 @@ from legcal.machine.description import (
 from legcal.machine.equations import posture_constraints
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.rods import actuators_of, joints_at, reading_of_rod
-from legcal.machine.solver import poses_after, solve
+from legcal.machine.solver import postures_after, solve
 
 TRIALS = 40
 CLOSED = 1e-10  # largest residual of a closed pose, relative to the size of the machine
@@ -282,7 +282,9 @@ class _ClosingEquations:
 
     def nearest(self, T: RigidTransform) -> RigidTransform:
         """Return the nearest pose that closes, as far as steps get nearer to one."""
-        solution = solve(self, _after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30)
+        solution = solve(
+            self, postures_after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30
+        )
         pose = solution.points[0, :12].reshape(3, 4)
         return motion_of(pose[:, :3], pose[:, 3])
 
@@ -400,12 +402,6 @@ def _rods_in_words(rods: Sequence[Leg]) -> str:
     return legs_in_words([leg.name for leg in rods])
 
 
-def _after(points: Array, steps: Array) -> Array:
-    """Return poses with readings (k, 12 + n) after steps (k, 6 + n)."""
-    poses = poses_after(points[:, :12].reshape(-1, 3, 4), steps[:, :6])
-    return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + steps[:, 6:]], axis=1)
-
-
 def _project(described: Description, home: Home) -> Home:
     """Return the closed pose nearest to home."""
     closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
@@ -443,7 +439,9 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
         return values, slopes
 
     points = np.concatenate([starts.reshape(-1, 12), np.tile(still, (n_trials, 1))], axis=1)
-    solution = solve(equations, _after, points, tolerance=1e-15, unit=closure.unit, damped=True)
+    solution = solve(
+        equations, postures_after, points, tolerance=1e-15, unit=closure.unit, damped=True
+    )
     best: tuple[float, RigidTransform] | None = None
     for pose in solution.points[solution.worst <= CLOSED, :12].reshape(-1, 3, 4):
         T = motion_of(pose[:, :3], pose[:, 3])

@@ -4,11 +4,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
+from legcal.machine.closing import project_pose
 from legcal.machine.files import LegcalBlock
 from legcal.machine.home import home_reading_in_words, legs_outside
 from legcal.machine.mobility import dimensionless, singularity
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.solved_poses import project_pose
 from legcal.machine.ties import ties_in_words
 from legcal.machine.topology import level_rotation
 

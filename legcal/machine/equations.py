@@ -33,7 +33,6 @@ from legcal.machine.parameters import Parametrization, is_spatial
 from legcal.machine.rods import (
     actuator_index,
     actuators_of,
-    carried_at_A,
     first_rods,
     readings_of_rods,
 )
@@ -478,13 +477,14 @@ def _lengths(
     legs: Sequence[Leg], R: Array, t: Array, by_local: bool, q: Array | None
 ) -> PoseEquations:
     """Return the lengths of all legs at once."""
-    A = np.array([leg.A for leg in legs]).reshape(-1, 3)
-    on, moved = actuator_index(legs), dict[int, JointMotion]()
-    hung = {} if q is None else {j: leg.actuator for j, leg in enumerate(legs) if leg.actuator}
+    A, on = np.array([leg.A for leg in legs]).reshape(-1, 3), actuator_index(legs)
+    moved = dict[int, JointMotion]()
     if q is not None:
-        A = carried_at_A(tuple(legs)).at(q)
-        for j, actuator in hung.items() if by_local else ():
-            moved[j] = actuator.motion(legs[j].A, q[:, on[j]])
+        A = np.tile(A, (len(q), 1, 1))
+        for j, leg in enumerate(legs):
+            if leg.actuator is not None:
+                moved[j] = leg.actuator.motion(leg.A, q[:, on[j]])
+                A[:, j] = moved[j].A
     B = np.array([leg.B for leg in legs]).reshape(-1, 3)
     arms = B @ np.swapaxes(R, 1, 2)
     vectors = arms + t[:, None] - A
@@ -495,13 +495,11 @@ def _lengths(
         local[..., LegColumns.A], local[..., LegColumns.B] = -u, u @ R
         local[..., LegColumns.LENGTH] = -1.0
     by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
-    if q is not None and hung:
-        carried, columns = list(hung), [on[j] for j in hung]
-        by_reading = carried_at_A(tuple(legs)).by_reading(q)[:, carried]
-        by_q[:, carried, columns] = -np.sum(by_reading * u[:, carried], axis=2)
     for j, motion in moved.items():
-        local[:, j, LegColumns.A] = -_back(motion, u[:, j])
-        _write_actuator(motion, u[:, j], local[:, j])
+        by_q[:, j, on[j]] = -_dot(motion.by_q, u[:, j])
+        if by_local:
+            local[:, j, LegColumns.A] = -_back(motion, u[:, j])
+            _write_actuator(motion, u[:, j], local[:, j])
     return PoseEquations(
         lengths - np.array([leg.q0 for leg in legs]),
         np.concatenate([cross(arms, u), u], axis=2),

@@ -16,7 +16,7 @@ from legcal.errors import DidNotConverge, ModelError
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array
-from legcal.machine.closing import close_at
+from legcal.machine.closing import close_at, project_pose
 from legcal.machine.equations import (
     PoseEquations,
     is_constrained,
@@ -28,7 +28,6 @@ from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import B_at, Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
 from legcal.machine.rods import actuator_index
-from legcal.machine.solved_poses import project_pose
 from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
 

@@ -8,7 +8,6 @@ chain is closed at its end.
 """
 
 from collections.abc import Iterator, Sequence
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.closing import close_at, closure_equations
+from legcal.machine.closing import ROUNDING, TOLERANCE, close_at, closure_equations, project_pose
 from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
@@ -34,14 +33,14 @@ from legcal.machine.mobility import (
 )
 from legcal.machine.model import (
     Machine,
+    Pose,
     platform_pose,
+    pose_of,
     readings_at,
     readings_at_poses,
     slider_columns,
 )
-from legcal.machine.pose_input import Pose, pose_of
 from legcal.machine.redundancy import contradictions
-from legcal.machine.solved_poses import ROUNDING, TOLERANCE, project_pose
 from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
 from legcal.machine.ties import machine_ties
 
@@ -52,7 +51,6 @@ RANDOM_ANGLES = 6  # random starts for the angles of all legs
 FEW_RESTARTS = 2  # restarts of single legs that do not close
 MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit is wrong
 MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
-SAME_START = 2.5e-9  # tolerance of a start at the last pose [mean leg lengths, rotation matrix]
 FEW_STEPS = 12  # largest number of Newton steps
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
@@ -70,8 +68,8 @@ def forward_kinematics(
         Readings [m, rad] of legs or of motors. Those of legs without a motor are ignored and may
         be NaN; of rods on one actuator the first counts.
     start : RigidTransform, SE3 or (4, 4) array, optional
-        T_base_platform of a pose in the required assembly mode, by default ``mechanism.home``. The
-        pose returned by the last call for this machine is fastest.
+        T_base_platform of a pose in the required assembly mode, by default ``mechanism.home``. For
+        many poses a :class:`Follower` is faster.
 
     Returns
     -------
@@ -90,23 +88,7 @@ def forward_kinematics(
         If the readings are too few, not finite, or so large that their unit must be wrong.
     """
     _check_machine(mechanism)
-    start = None if start is None else pose_of(start)
-    # Continue from the last configuration if this call starts at the last pose.
-    T_last, configuration = _last.get(mechanism, (None, mechanism.home_configuration))
-    away = np.zeros((4, 4)) if start is None or T_last is None else start.as_matrix() - T_last
-    away[:3, 3] /= mechanism.size
-    if start is None or T_last is None or np.abs(away).max() > SAME_START:
-        follower = Follower(mechanism, start)
-    else:
-        follower = Follower(mechanism)
-        follower.configuration = configuration
-    pose = follower.move_to(q)
-    _last[mechanism] = pose.as_matrix(), follower.configuration
-    return pose
-
-
-# Pose and configuration at the end of the last call of forward_kinematics.
-_last: WeakKeyDictionary[Machine, tuple[Array, Array]] = WeakKeyDictionary()
+    return Follower(mechanism, start).move_to(q)
 
 
 class Follower:

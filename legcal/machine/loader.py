@@ -28,6 +28,7 @@ from legcal.machine.classification import (
     leg_of,
     parallel,
 )
+from legcal.machine.closing import MAX_POSE_ERROR
 from legcal.machine.cylinders import (
     at_visible_heights,
     with_arms,
@@ -65,7 +66,6 @@ from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
-from legcal.machine.solved_poses import MAX_POSE_ERROR
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
@@ -73,8 +73,7 @@ from legcal.machine.topology import (
     VIRTUAL,
     Normals,
     any_joint,
-    check_plane,
-    check_virtual,
+    check_virtual_joint,
     distinct_joint,
     find_chains,
     normals_in_links,
@@ -211,7 +210,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     """Return the mechanism, with its chain still open."""
     file, urdf, yaml_path = source.file, source.urdf, source.path
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
-    check_virtual(block, bodies, urdf, yaml_path)
     chains = _legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform, file.name_mot),
         bodies,
@@ -223,7 +221,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     _check_legs(chains, spatial=normals is None, path=yaml_path)
-    check_plane(block, bodies, urdf, normals, yaml_path)
+    check_virtual_joint(block, bodies, urdf, normals, yaml_path)
     in_plane = None if normals is None else normals_in_links(normals, ends)
     solids = visual_solids(urdf)
     shown = [solid.cylinder for solid in solids if solid.cylinder is not None]

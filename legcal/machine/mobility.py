@@ -3,7 +3,13 @@
 The closures leave a null space of joint rates; the mobility is the rank of the resulting twists of
 the platform. The rest of the null space does not move the platform: legs with an S joint at both
 ends spin about themselves. Dependent closures (a planar machine welded in space) do not change it.
+
+A platform has as many independent coordinates as freedoms, among x, y, z, roll, pitch, yaw of the
+platform link in the base link; roll, pitch and yaw turn about the fixed axes x, y, z in this order.
+The other coordinates follow from the constraints of the machine.
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 
@@ -11,22 +17,26 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import cross
-from legcal.geometry.types import Array
-from legcal.machine.equations import is_constrained, machine_equations
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.equations import machine_equations
 from legcal.machine.model import (
     B_at,
     Machine,
+    Pose,
+    pose_of,
     slider_columns,
     vectors_A_to_B,
     vectors_at,
 )
-from legcal.machine.pose_input import Pose, pose_of
-from legcal.machine.solver import solve
+from legcal.machine.solver import poses_after, solve
 
 CLOSED = 2.5e-12  # residual of a closed chain [mean leg lengths, rad]
 RANK_TOLERANCE = 1e-7  # relative to the largest singular value, with lengths in leg lengths
 STEP = 0.05  # step to a generic configuration [rad], and relative to the leg length
 CONFIGURATIONS = 3
+COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+_REACHED = 1e-9  # largest error of a pose reached, relative to the size of the machine
+_FREE = 0.1  # least independent motion of a chosen coordinate
 MAX_CHANGE = 0.5  # norm of J0^-1 J1 - 1 that excludes a singularity between J0 and J1
 
 
@@ -183,20 +193,12 @@ def dimensionless(
     Poses are matrices T_base_platform (k, 3 or 4, 4). *motors* limits the motors, all by default.
     """
     motors = list(machine.motors if motors is None else motors)
-    R, t = poses[:, :3, :3], poses[:, :3, 3]
-    turned = B_at(machine, poses) - t[:, None]
-    vectors = vectors_at(machine, poses)
-    lengths = np.linalg.norm(vectors, axis=2)
-    scale = lengths.mean(axis=1)[:, None, None]
-    centre = turned.mean(axis=1, keepdims=True)
-    if is_constrained(machine):
-        equations = machine_equations(machine, R, t)
-        counts = ~equations.measured | np.isin(equations.leg, motors)
-        jacobian = equations.by_pose[:, counts]
-        gradient, moment = jacobian[:, :, 3:], jacobian[:, :, :3]
-        return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
-    u = (vectors / lengths[..., None])[:, motors]  # plain lengths; one rod for each actuator
-    return np.concatenate([cross((turned - centre)[:, motors] / scale, u), u], axis=2)
+    equations = machine_equations(machine, poses[:, :3, :3], poses[:, :3, 3])
+    counts = ~equations.measured | np.isin(equations.leg, motors)
+    gradient, moment = equations.by_pose[:, counts, 3:], equations.by_pose[:, counts, :3]
+    scale = np.linalg.norm(vectors_at(machine, poses), axis=2).mean(axis=1)[:, None, None]
+    centre = (B_at(machine, poses) - poses[:, None, :3, 3]).mean(axis=1, keepdims=True)
+    return np.concatenate([(moment - cross(centre, gradient)) / scale, gradient], axis=2)
 
 
 def is_on_same_side(reference: Array, jacobian: Array) -> bool:
@@ -225,3 +227,84 @@ def excludes_singularity(reference: Array, jacobian: Array) -> bool:
     rank = int(np.sum(values > 1e-6 * values[0]))
     change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
     return float(np.linalg.norm(change, 2)) < MAX_CHANGE
+
+
+def independent_coordinates(machine: Machine) -> IntArray:
+    """Return the independent coordinates of a machine as indices, positions before angles.
+
+    Coordinates are chosen in order. One is chosen if a motion that the constraints allow at home,
+    and that keeps those chosen before, moves it by at least a tenth of the motion; rotations count
+    in leg lengths.
+    """
+    pose = machine.home.as_matrix()[None, :3]
+    equations = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
+    scale = machine.size
+    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+    constraints = equations.by_pose[0, ~equations.measured] * unit
+    _, _, rows = np.linalg.svd(np.vstack([constraints, np.zeros((6, 6))]))
+    free = rows[6 - machine.mobility :] * unit  # (m, 6) motions
+    slopes = coordinates_of(pose)[1][0]
+    moved = (slopes @ free.T) * np.array([1.0] * 3 + [scale] * 3)[:, None]
+    chosen: list[int] = []
+    for least in (_FREE, 0.0):  # the second pass takes any that is left
+        for k in range(len(COORDINATES)):
+            basis = np.linalg.qr(moved[chosen].T)[0] if chosen else np.zeros((machine.mobility, 0))
+            new = moved[k] - basis @ (basis.T @ moved[k])
+            if k not in chosen and len(chosen) < machine.mobility and np.linalg.norm(new) > least:
+                chosen.append(k)
+    return np.array(sorted(chosen), dtype=np.intp)
+
+
+def poses_at_coordinates(
+    machine: Machine, columns: IntArray, coordinates: Array, near: Array
+) -> tuple[Array, BoolArray]:
+    """Return the poses (k, 3, 4) at values (k, m) of some coordinates, and which were reached (k,).
+
+    The search for values [m, rad] of the coordinates *columns* starts at poses *near*, (3, 4) or
+    (k, 3, 4).
+    """
+    scale = machine.size
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        rows = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        keep = ~rows.measured
+        values, slopes = coordinates_of(poses)
+        unit = np.where(columns < 3, 1.0, scale)
+        off = turned_back(values[:, columns] - coordinates, columns) * unit
+        return (
+            np.concatenate([rows.values[:, keep], off], axis=1),
+            np.concatenate([rows.by_pose[:, keep], slopes[:, columns] * unit[:, None]], axis=1),
+        )
+
+    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+    start = np.broadcast_to(near, (len(coordinates), 3, 4)).copy()
+    solution = solve(equations, poses_after, start, tolerance=1e-14 * scale, unit=unit)
+    return solution.points, solution.worst <= _REACHED * scale
+
+
+def coordinates_of(poses: Array) -> tuple[Array, Array]:
+    """Return x, y, z, roll, pitch, yaw (k, 6) [m, rad] of poses, and their slopes (k, 6, 6).
+
+    Slopes are by rotations about the origin of the platform link and displacements in the base.
+    """
+    R = poses[:, :, :3]
+    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
+    pitch = np.arctan2(-R[:, 2, 0], np.hypot(R[:, 2, 1], R[:, 2, 2]))
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    values = np.concatenate([poses[:, :, 3], np.stack([roll, pitch, yaw], axis=1)], axis=1)
+    slopes = np.zeros((len(poses), 6, 6))
+    slopes[:, :3, 3:] = np.eye(3)
+    cos_y, sin_y = np.cos(yaw), np.sin(yaw)
+    cos_p, tan_p = np.cos(pitch), np.tan(pitch)
+    slopes[:, 3, 0], slopes[:, 3, 1] = cos_y / cos_p, sin_y / cos_p
+    slopes[:, 4, 0], slopes[:, 4, 1] = -sin_y, cos_y
+    slopes[:, 5, 0], slopes[:, 5, 1], slopes[:, 5, 2] = cos_y * tan_p, sin_y * tan_p, 1.0
+    return values, slopes
+
+
+def turned_back(differences: Array, columns: IntArray) -> Array:
+    """Return differences of coordinates, those of angles within half a turn."""
+    turns = np.where(columns < 3, 0.0, 2.0 * np.pi)
+    return np.asarray(
+        differences - turns * np.round(differences / np.where(columns < 3, 1.0, turns))
+    )

@@ -23,11 +23,11 @@ from scipy.spatial.transform import RigidTransform
 from legcal.causes import Cause
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.closing import solve_poses
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries, parametrization_of
 from legcal.machine.rods import actuator_index
-from legcal.machine.solved_poses import solve_poses
 
 # Standard deviation of rough readings, as motion of a joint relative to the mean leg length.
 ROUGH_READING = 1.5e-4

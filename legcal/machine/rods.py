@@ -6,14 +6,12 @@ See :mod:`legcal.machine.actuator` for how A moves with the reading of its actua
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import cross
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.leg import Leg
 
@@ -35,53 +33,13 @@ def actuator_index(legs: Sequence[Leg]) -> list[int]:
     return [-1 if leg.actuator is None else number[leg.actuator.joint] for leg in legs]
 
 
-@dataclass(frozen=True, eq=False)
-class Carried:
-    """The joints A of legs, each on the path of its actuator (:meth:`Actuator.path`)."""
-
-    on: IntArray  # (n,) index of its actuator (:func:`actuators_of`), -1 for none
-    gain: Array  # (n,) gain of actuators that turn
-    middle: Array  # (n, 3) [m], like the following
-    cos: Array
-    sin: Array
-    slide: Array
-
-    def at(self, q: Array) -> Array:
-        """Return the joints (k, n, 3) at readings of actuators (k, n_actuators)."""
-        reading, angle = self._readings_and_angles(q)
-        joints = self.middle + self.cos * np.cos(angle) + self.sin * np.sin(angle)
-        return np.asarray(joints + self.slide * reading)
-
-    def by_reading(self, q: Array) -> Array:
-        """Return the derivative of each joint by the reading of its actuator, (k, n, 3)."""
-        _, angle = self._readings_and_angles(q)
-        turning = self.sin * np.cos(angle) - self.cos * np.sin(angle)
-        return np.asarray(self.gain[:, None] * turning + self.slide)
-
-    def _readings_and_angles(self, q: Array) -> tuple[Array, Array]:
-        """Return the reading of the actuator of each joint, and its angle, (k, n, 1)."""
-        readings = np.zeros((len(q), len(self.on)))
-        carried = self.on >= 0
-        readings[:, carried] = q[:, self.on[carried]]
-        return readings[..., None], (self.gain * readings)[..., None]
-
-
-@lru_cache(maxsize=16)
-def carried_at_A(legs: tuple[Leg, ...]) -> Carried:
-    """Return the joints A of legs as carried by actuators."""
-    middle = np.array([leg.A for leg in legs]).reshape(-1, 3)
-    cos, sin, slide = (np.zeros_like(middle) for _ in range(3))
-    gain = np.zeros(len(legs))
-    for j, leg in enumerate(legs):
-        if leg.actuator is not None:
-            middle[j], cos[j], sin[j], slide[j] = leg.actuator.path(leg.A)
-            gain[j] = leg.actuator.gain if leg.actuator.turns else 0.0
-    return Carried(np.array(actuator_index(legs), dtype=np.intp), gain, middle, cos, sin, slide)
-
-
 def joints_at(legs: Sequence[Leg], q: Array) -> Array:
     """Return the joints A of legs (k, n_legs, 3) [m] at readings of actuators (k, n_actuators)."""
-    return carried_at_A(tuple(legs)).at(q)
+    A = np.tile(np.array([leg.A for leg in legs]).reshape(-1, 3), (len(q), 1, 1))
+    for j, (leg, a) in enumerate(zip(legs, actuator_index(legs), strict=True)):
+        if leg.actuator is not None:
+            A[:, j] = leg.actuator.at(leg.A, q[:, a])
+    return A
 
 
 def arms_at(legs: Sequence[Leg], q: Array) -> dict[int, Array]:
@@ -107,6 +65,13 @@ def ends_at_poses(
     """
     q = readings_of_rods(legs, R, t) if q is None else np.broadcast_to(q, (len(t), q.shape[1]))
     return joints_at(legs, q), _platform_joints(legs, R, t)
+
+
+def length_errors(legs: Sequence[Leg], R: Array, t: Array, q: Array) -> Array:
+    """Return |AB| minus the lengths at readings q (k, n_legs) of legs at poses, (k, n_legs) [m]."""
+    A, B = ends_at_poses(legs, R, t, q[:, first_rods(legs)])
+    sign = [0 if leg.actuator is not None else leg.sign for leg in legs]
+    return np.asarray(np.linalg.norm(B - A, axis=2) - [leg.q0 for leg in legs] - q * sign)
 
 
 def _platform_joints(legs: Sequence[Leg], R: Array, t: Array) -> Array:

@@ -155,6 +155,12 @@ def poses_after(poses: Array, step: Array) -> Array:
     return np.concatenate([R, t[..., None]], axis=2)
 
 
+def postures_after(points: Array, step: Array) -> Array:
+    """Return poses with readings (k, 12 + n) after steps (k, 6 + n); see :func:`poses_after`."""
+    poses = poses_after(points[:, :12].reshape(-1, 3, 4), step[:, :6])
+    return np.concatenate([poses.reshape(-1, 12), points[:, 12:] + step[:, 6:]], axis=1)
+
+
 def _rows(chosen: BoolArray) -> BoolArray | slice:
     """Return an index of the chosen rows, without a copy if all are chosen."""
     return slice(None) if chosen.all() else chosen

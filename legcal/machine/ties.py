@@ -23,7 +23,6 @@ import numpy as np
 
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.directions import SHOWN, parameters_in_words, sparse_basis
 from legcal.machine.equations import (
     PoseEquations,
     n_pose_constraints,
@@ -32,11 +31,14 @@ from legcal.machine.equations import (
 from legcal.machine.leg import Leg, LegColumns, frame_point, mean_length
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
+    SHOWN,
     Parametrization,
     geometries,
     is_spatial,
     moved_legs,
+    parameters_in_words,
     parametrization_of,
+    sparse_basis,
 )
 from legcal.machine.rods import actuators_of, readings_of_rods
 from legcal.machine.solver import poses_after

@@ -16,8 +16,7 @@ from pydantic import BeforeValidator, WithJsonSchema, model_validator
 from legcal.errors import BadValue
 from legcal.files.quantity import Quantity, read_value
 from legcal.files.schema import FileSchema, describe
-from legcal.machine.leg import Leg
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import Leg, ParameterId
 
 MachineKind = Literal["printed", "machined", "bought"]
 

@@ -82,7 +82,6 @@ def _paths(
     bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str], within: float
 ) -> list[list[Step]]:
     """Return the joints of every leg from base to platform."""
-    _refuse_carried_bodies(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
         _refuse_unsupported(connection, urdf, base, platform)
@@ -351,87 +350,61 @@ def normals_of_closures(
     return [None, *normals[1:]] if floats else normals
 
 
-def check_virtual(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> None:
-    """Check that the virtual joint, if any, is of a supported type and carries the platform."""
+def check_virtual_joint(
+    block: LegcalBlock, bodies: Bodies, urdf: Urdf, normals: Normals | None, path: Path
+) -> None:
+    """Check the virtual joint, if any: it carries the platform from the base as the legs let it.
+
+    Raises
+    ------
+    OutOfClass
+        If it is neither floating nor planar, connects other bodies, or moves in another plane than
+        the legs.
+    """
     if block.platform_joint is None:
         return
     joint = urdf.joints[block.platform_joint]
-    refused = f"legcal.platform_joint '{joint.name}' is not supported"
+    carrying = bodies.body_of[joint.parent], bodies.body_of[joint.child]
+    z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
     if joint.type not in VIRTUAL:
-        raise OutOfClass(
-            refused,
+        problem = (
             f"a {joint.type} joint",
             "a floating or planar one, which only says where the platform is",
             "correct it, or write null if a leg carries the platform",
-            path,
         )
-    if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
-        axis = ", ".join(f"{x:g}" for x in joint.axis)
-        raise OutOfClass(
-            refused,
-            f"a planar joint with the axis ({axis})",
-            '<axis xyz="0 0 1"/>, because its plane is the xy plane of its frame',
-            "turn its origin rpy instead",
-            path,
-        )
-    carrying = bodies.body_of[joint.parent], bodies.body_of[joint.child]
-    if carrying != (bodies.body_of[block.base], bodies.body_of[block.platform]):
-        raise OutOfClass(
-            refused,
+    elif carrying != (bodies.body_of[block.base], bodies.body_of[block.platform]):
+        problem = (
             f"it between the parent '{joint.parent}' and the child '{joint.child}'",
             f"'{block.base}' and '{block.platform}'",
             "name the joint that carries the platform, or write null",
-            path,
         )
-
-
-def check_plane(
-    block: LegcalBlock, bodies: Bodies, urdf: Urdf, normals: Normals | None, path: Path
-) -> None:
-    """Check that a planar virtual joint lets the platform move as its legs do."""
-    if block.platform_joint is None:
+    elif joint.type == "floating":
         return
-    joint = urdf.joints[block.platform_joint]
-    if joint.type != "planar":
-        return
-    if normals is None:
-        raise OutOfClass(
-            f"legcal.platform_joint '{joint.name}' is not supported",
+    elif not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
+        axis = ", ".join(f"{x:g}" for x in joint.axis)
+        problem = (
+            f"a planar joint with the axis ({axis})",
+            '<axis xyz="0 0 1"/>, because its plane is the xy plane of its frame',
+            "turn its origin rpy instead",
+        )
+    elif normals is None:
+        problem = (
             "a planar joint",
-            "a floating one, because the axes of the legs do not let the platform "
-            "move in one plane",
+            "a floating one, because the axes of the legs do not let the platform move in one "
+            "plane",
             "correct its type",
-            path,
         )
-    z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
-    normal = bodies.T_body_link[joint.parent][:3, :3].T @ normals[0]
-    if not parallel(z, normal):
+    elif not parallel(z, normal := bodies.T_body_link[joint.parent][:3, :3].T @ normals[0]):
         tilt = 90.0 - np.degrees(off_square(z, normal))
-        raise OutOfClass(
-            f"legcal.platform_joint '{joint.name}' is not supported",
+        problem = (
             f"its plane {tilt:.4g} deg from the plane in which the legs move",
             "the same plane within 0.057 deg",
             "correct its origin rpy",
-            path,
         )
-
-
-def _refuse_carried_bodies(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
-    """Refuse a platform with a further body, connected by a joint, on which legs end.
-
-    From such a body, without passing base or platform, several joints lead to the base and only
-    this one to the platform.
-    """
-    for connection in bodies.connections:
-        if platform not in connection.bodies or connection.joint is None:
-            continue
-        body = connection.bodies[1 - connection.bodies.index(platform)]
-        n_joints = sum(body in c.bodies for c in bodies.connections)
-        if body in (base, platform) or n_joints < 3:
-            continue
-        on_base, on_platform = _reached(bodies, body, (base, platform))
-        if len(on_base) > 1 and on_platform == [connection]:
-            raise OutOfClass(_platform_of_several_bodies(urdf, body, connection))
+    else:
+        return
+    start = f"legcal.platform_joint '{joint.name}' is not supported"
+    raise OutOfClass(start, *problem, path)
 
 
 def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
@@ -546,19 +519,6 @@ def _not_a_chain(
     """Return the problem of a leg, given by its first joints, that is not a chain."""
     needed, remedy = "one unbranched chain from base to platform for each leg", ""
     first = steps[0].connection
-    last = steps[-1].connection
-    if body != base and n_onward > 1 and len(steps) > 1 and last.joint in motors:
-        moves = first.joint in motors
-        return Problem(
-            f"the leg that starts with {_name(first)} is not supported",
-            f"the motor '{last.joint}' of {n_onward} rods beyond {_name(first)}",
-            "the motor of an arm or a carriage on the base itself",
-            "arms on arms cannot be calibrated with legcal"
-            if moves
-            else "make joints between it and the base fixed if they do not move, otherwise "
-            "this machine cannot be calibrated with legcal",
-            str(urdf.path),
-        )
     if body == base:
         course = "returns to the base"
     elif n_onward == 0:
@@ -572,13 +532,6 @@ def _not_a_chain(
             "link itself"
         )
         remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
-        if first.joint in motors:
-            between = _name(steps[1].connection) if len(steps) > 1 else "another joint"
-            course = (
-                f"carries {n_onward} rods on link '{body}' behind {between}, which stands between "
-                f"them and the motor '{first.joint}'"
-            )
-            remedy = f"make {between} fixed if it does not move, otherwise "
     else:
         course = f"shares link '{body}' with another leg or branches there"
     return Problem(

@@ -20,7 +20,6 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.directions import SHOWN, describe_direction
 from legcal.machine.leg import (
     EquationKind,
     KinematicParameters,
@@ -31,7 +30,9 @@ from legcal.machine.leg import (
 )
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
+    SHOWN,
     Parametrization,
+    describe_direction,
     geometries,
     is_spatial,
     numbers_of,

@@ -20,11 +20,10 @@ from legcal.machine.configurations import (
     poses_at,
 )
 from legcal.machine.kinematics import follow, platforms_in_base
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import ARMS, Leg, LegKind, ParameterId
 from legcal.machine.model import Machine, platform_pose, slider_columns
-from legcal.machine.parameter_id import ARMS, ParameterId
 from legcal.machine.parameters import is_held_by_default, moved_legs
-from legcal.machine.rods import ends_at_poses, first_rods
+from legcal.machine.rods import length_errors
 from legcal.planning.places import USUAL_LENGTH, Setting
 from legcal.progress import Report, no_progress
 
@@ -88,19 +87,15 @@ def surely_reached(
         for j, leg in enumerate(machine.legs)
         if leg.kind is not LegKind.PASSIVE and not (machine.is_redundant and leg.is_motor)
     ]
-    carried = [leg.actuator is not None for leg in machine.legs]
-    lengthening = np.where(carried, 0.0, machine.sign * poses.readings)
     t_nearby = Frames.of(nearby).t
     wider = replace(setting, length=_WIDER * setting.length, angle=_WIDER * setting.angle)
     for _ in range(N_REACHING):
         drawn = drawn_legs(legs, wider, rng)
         R, t = Frames.of(poses_at_readings(machine, drawn, poses.readings, nearby))
-        A, B = ends_at_poses(drawn, R, t, poses.readings[:, first_rods(drawn)])
-        length = np.linalg.norm(B - A, axis=2)
-        target_length = lengthening + [leg.q0 for leg in drawn]
-        residual = np.abs(length - target_length)[:, measured].max(axis=1, initial=0.0)
+        errors = length_errors(drawn, R, t, poses.readings)
+        residual = np.abs(errors[:, measured]).max(axis=1, initial=0.0)
         moved = np.linalg.norm(t - t_nearby, axis=1)
-        reached &= (residual < _CLOSED * machine.size) & (moved < _MOST_MOVED * length.mean())
+        reached &= (residual < _CLOSED * machine.size) & (moved < _MOST_MOVED * machine.size)
     return reached
 
 

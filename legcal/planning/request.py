@@ -9,8 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
-from legcal.calibration.joint_fit.predicted import Predictor
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise, read_noise
+from legcal.calibration.joint_fit.predicted import (
+    DEFAULT_NOISE,
+    PredictedNoise,
+    Predictor,
+    read_noise,
+)
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError

@@ -20,9 +20,9 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.platform import PlatformError
-from legcal.calibration.joint_fit.predicted_noise import PredictedNoise
+from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.quantities import mm_deg
-from legcal.calibration.verdict import PLAN_NAME, POSES_NAME
+from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError

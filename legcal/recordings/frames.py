@@ -15,7 +15,7 @@ from datetime import UTC
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,24 +65,26 @@ class Frame:
     image: NDArray[np.uint8]  # (height, width) or (height, width, 3) in the colour order of OpenCV
 
 
-class Recording(Protocol):
+class Recording:
     """A recording of a camera at one place."""
 
-    @property
-    def path(self) -> Path:
-        """The file or folder."""
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames in the order of their times, or *only* the frames with these indices.
 
         Each call starts at the first frame.
         """
+        raise NotImplementedError
 
     def notes(self) -> tuple[str, ...]:
         """Return notes, after all frames have been read."""
+        return ()
 
     def readings(self) -> Series | None:
         """Return the readings in the recording, if any."""
+        return None
 
 
 def _reader() -> int:
@@ -94,11 +96,11 @@ def _reader() -> int:
     return cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
 
 
-class Video:
+class Video(Recording):
     """A video file, read with OpenCV."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         self._notes: tuple[str, ...] = ()
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
@@ -143,16 +145,9 @@ class Video:
         """Return a note if the video was cut off."""
         return self._notes
 
-    def readings(self) -> Series | None:
-        """Return None: a video holds no readings."""
-        return None
 
-
-class ImageFolder:
+class ImageFolder(Recording):
     """A folder of images with times in their names or EXIF data."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of their times."""
@@ -186,14 +181,6 @@ class ImageFolder:
                 )
             yield Frame(times[photograph.name] or 0.0, np.asarray(image, dtype=np.uint8))
 
-    def notes(self) -> tuple[str, ...]:
-        """Return no notes."""
-        return ()
-
-    def readings(self) -> Series | None:
-        """Return None: images hold no readings."""
-        return None
-
 
 def _taken(photograph: Photograph) -> float | None:
     """Return the time of a photograph [s], from its EXIF data."""
@@ -221,7 +208,7 @@ def split_topic(path: Path) -> tuple[Path, str | None]:
     return (Path(file), f"/{topic}") if colon and is_bag(Path(file)) else (path, None)
 
 
-class Bag:
+class Bag(Recording):
     """A bag with the images of one camera and, unless given in a table, joint states."""
 
     def __init__(self, path: Path, machine: Machine, image_topic: str | None = None) -> None:
@@ -230,7 +217,7 @@ class Bag:
                 f"{path}: the bag could not be read: found no package rosbags, needed it; install "
                 "it with: pip install 'legcal[ros]'"
             )
-        self.path = path
+        super().__init__(path)
         self._machine = machine
         self._image_topic = image_topic
         self._bad = 0

@@ -73,18 +73,14 @@ def reading_speeds(times: Array, q: Array) -> Array:
     return np.asarray(np.abs(np.diff(q, axis=0)).max(axis=1) / np.diff(times))
 
 
-def clock_offset(frame_times: Array, frames_move: BoolArray, times: Array, moves: BoolArray,
-                 most: float | None = None) -> Offset:  # fmt: skip
+def clock_offset(
+    frame_times: Array,  # (n + 1,) by their own clock [s]
+    frames_move: BoolArray,  # (n,) whether there is motion between neighbouring times
+    times: Array,  # (m + 1,) of readings, by their own clock [s]
+    moves: BoolArray,  # (m,)
+    most: float | None = None,  # largest offset [s] if both were recorded by one clock
+) -> Offset:
     """Return the offset with the best agreement of motion in frames and in readings.
-
-    Parameters
-    ----------
-    frame_times, times : (n + 1,) arrays
-        Times of frames and of readings, each by their own clock [s].
-    frames_move, moves : (n,) arrays
-        Whether there is motion between neighbouring times.
-    most : float, optional
-        Largest offset [s] if both were recorded by one clock.
 
     Raises
     ------

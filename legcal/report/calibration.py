@@ -18,7 +18,7 @@ from legcal.calibration.summary import (
     tables,
 )
 from legcal.files.quantity import SHOWN_IN
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import ParameterId
 from legcal.pages.document import Table, Verdict
 from legcal.report.render import Report, report, table
 

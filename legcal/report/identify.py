@@ -17,7 +17,7 @@ from legcal.calibration.identify.report import (
     WeakDirection,
     views_in_words,
 )
-from legcal.machine.directions import leg_labels, legs_in_words, list_in_words
+from legcal.machine.parameters import leg_labels, legs_in_words, list_in_words
 from legcal.pages.document import Table, Verdict
 from legcal.report.render import Part, Report, table
 from legcal.report.render import report as blocks

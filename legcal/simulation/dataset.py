@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
-from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.axes import write_axis_table
 from legcal.data.corners import write_corners
-from legcal.data.dataset import AXES_NAME, CORNERS_NAME, OBSERVATIONS_NAME
+from legcal.data.dataset import AXES_NAME, CORNERS_NAME, OBSERVATIONS_NAME, PLAN_NAME
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import write_observations
 from legcal.data.reading_units import sigma_too_large

@@ -36,6 +36,7 @@ from legcal.errors import DidNotConverge, LegcalError
 from legcal.files.schema import Document, Number
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array, BoolArray
+from legcal.machine.closing import solve_poses
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, parameters_of_legs
@@ -43,7 +44,6 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
 from legcal.machine.rods import actuator_index, readings_of_rods
-from legcal.machine.solved_poses import solve_poses
 from legcal.pages.svg import Bars, Canvas, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
@@ -553,7 +553,7 @@ class PaperSummary:
                 continue
             shown = means[machine, estimator]
             errors = [
-                Bars(label, (1e3 * means[machine, name].errors).tolist())
+                Bars(label, (1e3 * means[machine, name].errors).tolist() or [None] * len(labels))
                 for label, name in (
                     ("initial model", INITIAL),
                     (words, estimator),

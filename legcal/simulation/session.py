@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.verdict import PLAN_NAME
 from legcal.data.corners import Corners
-from legcal.data.dataset import load_dataset
+from legcal.data.dataset import PLAN_NAME, load_dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotVisible, UsageError
@@ -230,7 +229,15 @@ class _Simulator:
             )
             posed = tuple(map(on_base.beside, posed))
         elif not views:
-            views = self._cameras_around(posed, with_board=bool(boards))
+            views, least = cameras_around(
+                self.truth, posed, self.cameras, self.rngs["cameras"], self.progress
+            )
+            if boards and least <= 0.0:
+                raise NotVisible(
+                    "The cameras could not be placed: found no place for one of them from which it "
+                    "sees the board on the platform in most poses, needed one for each; use fewer "
+                    "views, or a smaller board."
+                )
         if on_base is not None:
             boards = (FixedBoard(on_base.board, "base", on_base.T_base_board), *boards)
             if self.settings.hand_held:
@@ -238,21 +245,6 @@ class _Simulator:
         if self.settings.level == Level.PHOTOGRAPHS:
             views = _encoding(views, self.settings.appearance.gamma, self.settings.tell_gamma)
         return _Setup(poses, posed, boards, views, groups)
-
-    def _cameras_around(
-        self, posed: tuple[PosedMachine, ...], *, with_board: bool
-    ) -> tuple[Viewpoint, ...]:
-        """Return cameras around the machine; *with_board*, they must see the platform's board."""
-        views, least = cameras_around(
-            self.truth, posed, self.cameras, self.rngs["cameras"], self.progress
-        )
-        if with_board and least <= 0.0:
-            raise NotVisible(
-                "The cameras could not be placed: found no place for one of them from which it "
-                "sees the board on the platform in most poses, needed one for each; use fewer "
-                "views, or a smaller board."
-            )
-        return views
 
     def _in_hand(
         self, posed: tuple[PosedMachine, ...]

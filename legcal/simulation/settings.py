@@ -17,9 +17,8 @@ from legcal.data.axes import SIGMA_RANGE
 from legcal.errors import UsageError
 from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
 from legcal.files.schema import closest, describe, is_plain_name
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise

@@ -17,11 +17,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
 from legcal.files.reading import MAX_TEXT, read_bytes
 from legcal.machine.home import home_of_legs
-from legcal.machine.leg import Leg
+from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import check_closes, mechanism_text, model_name, write_urdf
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
     geometries,
     moved_legs,

@@ -306,7 +306,13 @@ def take_images(
         _refuse_inside(viewpoint, [posed_machines[p] for p in poses])
         views = [legs_in_image(legs, posed_machines[p], camera, T) for p in poses]
         if viewpoint.legs is not None:
-            views = [_only(viewpoint.legs, legs, view) for view in views]
+            views = [
+                tuple(
+                    leg_view if leg.name in viewpoint.legs else LegView(0.0, 0.0, ())
+                    for leg, leg_view in zip(legs, view, strict=True)
+                )
+                for view in views
+            ]
         if not any(leg.is_seen for view in views for leg in view):
             problems.append(_sees_nothing(viewpoint.name, legs, views))
         for p, view in zip(poses, views, strict=True):
@@ -317,16 +323,6 @@ def take_images(
         raise NotVisible(problems)
     view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T
     return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
-
-
-def _only(
-    names: Sequence[str], legs: Sequence[Leg], shown: Sequence[LegView]
-) -> tuple[LegView, ...]:
-    """Return the visible parts of the named legs; the others are not visible."""
-    nothing = LegView(0.0, 0.0, ())
-    return tuple(
-        view if leg.name in names else nothing for leg, view in zip(legs, shown, strict=True)
-    )
 
 
 def _refuse_inside(viewpoint: Viewpoint, posed_machines: Sequence[PosedMachine]) -> None:
@@ -355,11 +351,10 @@ def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegVi
         longest = max(leg.length_px for view in views for leg in view)
         return (
             f"{start} that legs are at most {longest:.1f} px long in them, needed "
-            f"{least_length(0.0):g} px of a tube or rod, and as much as its width; move the camera "
-            "nearer (its place is in metres), or give it a longer focal length."
+            f"{least_length(0.0):g} px, and as much as their width; move the camera nearer (its "
+            "place is in metres), or give it a longer focal length."
         )
     return (
-        f"{start} that no image shows a leg (at best {100.0 * most:.0f} % of one), needed an "
-        f"unhidden stretch of {100.0 * MIN_SHARE:.0f} % of at least one leg; turn or move the "
-        "camera."
+        f"{start} that no image shows a leg (at best {100.0 * most:.0f} % of one), needed "
+        f"{100.0 * MIN_SHARE:.0f} % of one unhidden; turn or move the camera."
     )

@@ -3,15 +3,13 @@
 Every mistake is undone in turn, and the images say how well they agree then (how many of the legs
 that they should show are there, with cameras placed anywhere). A few images of the views that
 disagree most say which mistakes are worth a closer look, all images judge these. One is named where
-far more images agree; those that images cannot tell from it are named with it. Where images show
-little without it, or nothing is explained, another one is undone beside it in the same way.
+far more images agree; those that images cannot tell from it are named with it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -24,7 +22,6 @@ from legcal.calibration.diagnosis.mistakes import (
     Assumed,
     Mistake,
     as_given,
-    both,
     joints_of,
     mistakes,
     moved_cameras,
@@ -46,7 +43,6 @@ from legcal.perception.agreement import (
 )
 from legcal.perception.diagnostics import far_off
 from legcal.perception.placement import Group, Placement, Search, group_views
-from legcal.progress import no_progress
 
 _Judged = tuple[Mistake, Agreement]  # with what all images say of it
 
@@ -64,7 +60,6 @@ _POOL = 3  # cameras of other mistakes that are tried
 _NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras first
 _FINALISTS = 6  # mistakes that all images judge
 _SAME_AMOUNT = 2  # of these that differ by how much
-_FIRSTS = 2  # mistakes beside which another one is looked for, where none explains the images
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 _ONE_ROW = (1, -1)  # by which readings stand late from a row on
 _FINER = (0.5, 0.25)  # steps of an amount between those that are tried
@@ -88,8 +83,7 @@ class Diagnosis:
     Attributes
     ----------
     kind : str
-        What it is in a few words: ``columns exchanged``, ``handedness``, ...; of two at once
-        ``columns exchanged and diameter for radius``.
+        What it is in a few words: ``columns exchanged``, ``handedness``, ...
     what : str
         The same as a clause that names columns, views and legs.
     same_as : tuple of str
@@ -180,7 +174,6 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     ]
     judged = judge.judged(judge.finalists(tried))
     likeliest = judge.likeliest(judged)
-    likeliest = judge.likeliest_two(judged, likeliest) or likeliest
     data.progress(STAGE, 1, 1)
     if not likeliest:
         return ()
@@ -318,27 +311,16 @@ class _Judge:
             return []
         return [moved_cameras(self.data, self.given, moved)]
 
-    def beside(self, what: Mistake, one: Agreement) -> _Judge:
-        """Return a judge of further mistakes with one mistake taken as given."""
-        other = copy(self)
-        other.data = replace(self.data, progress=no_progress)
-        other.given, other.own = what.true, one
-        other.of_groups = [replace(one.at(group.rows), cameras=(T,))
-                           for group, T in zip(self.groups, one.cameras, strict=True)]  # fmt: skip
-        other.pool = [[*self.known(g), *([] if T is None else [T])]
-                      for g, T in enumerate(one.cameras)]  # fmt: skip
-        return other
-
     def known(self, g: int) -> list[RigidTransform]:
         """Return the cameras of a group that are known in advance."""
         hint = self.groups[g].hint
         return [] if hint is None else [hint, _mirrored_camera(hint)]
 
-    def finalists(self, tried: Sequence[Mistake], rounds: int = len(_FEW_STARTS)) -> list[Mistake]:
+    def finalists(self, tried: Sequence[Mistake]) -> list[Mistake]:
         """Return the mistakes favoured by some images of the views that disagree most.
 
         These are all images of views that nearly agree, whose cameras are known about, and a few of
-        others; more of them in each of some rounds. Cameras are searched for only if no mistake
+        others; more of them in a second round. Cameras are searched for only if no mistake
         suits the images of a few groups near those that are known.
         """
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
@@ -348,8 +330,8 @@ class _Judge:
         gain = np.sum([look.near_known() for look in looks], axis=0)
         searches = not _suits(gain.max(initial=0.0) + _total(near), near)
         gain, seen = np.zeros(len(tried)), list[Agreement]()
-        done, total = 0, rounds * len(tried)
-        for starts in _FEW_STARTS[:rounds]:
+        done, total = 0, len(_FEW_STARTS) * len(tried)
+        for starts in _FEW_STARTS:
             n_images = 0
             while left and n_images < _FEW:
                 g = left.pop(0)
@@ -407,40 +389,6 @@ class _Judge:
         alike = [(what, one) for what, one in alike
                  if not what.amount_of or _total(one) == most[what.amount_of]]  # fmt: skip
         return sorted(alike, key=lambda one: -self.hints_suited(one[1]))  # then the commoner
-
-    def likeliest_two(
-        self, judged: Sequence[_Judged], likeliest: Sequence[_Judged]
-    ) -> list[_Judged]:
-        """Return pairs of mistakes, if images show less than half of the legs with one corrected.
-
-        The other one is looked for beside the likeliest, or where none is likely beside those that
-        suit best, if that is no chance. With both of them undone images show half of the legs.
-        """
-        now = likeliest[0][1] if likeliest else self.own
-        if now.mean >= _SUITS:
-            return []
-        better = [
-            (what, one)
-            for what, one in judged
-            if not what.of_few and _signed_ranks(one.share - self.own.share) >= _MIN_SIGMAS
-        ]
-        by_total = sorted(better, key=lambda one: -_total(one[1]))
-        for first, of_first in likeliest[:1] or by_total[:_FIRSTS]:
-            judge = self.beside(first, of_first)
-            tried = [
-                what
-                for what in mistakes(self.data, first.true)
-                if not (what.amount_of and what.amount_of == first.amount_of)
-            ]
-            alike = [what for what, _ in likeliest[1:]]
-            found = [
-                (both(first, what, alike), one)
-                for what, one in judge.likeliest(judge.judged(judge.finalists(tried, 1)))
-                if _suits(_total(one), self.own)
-            ]
-            if found:
-                return found
-        return []
 
     def _best_amount(self, what: Mistake, one: Agreement) -> tuple[Mistake, Agreement]:
         """Return the amount of a mistake that fits all images best, by halving steps."""

@@ -135,29 +135,9 @@ def as_given(data: OrderedDataset) -> Assumed:
     return Assumed(data.machine, data.measurements.q, np.ones((n, 2)), np.zeros(n, dtype=np.intp))
 
 
-def both(first: Mistake, second: Mistake, ambiguous_with: Sequence[Mistake] = ()) -> Mistake:
-    """Return two mistakes at once; the second was found with the first corrected.
-
-    ``ambiguous_with`` are mistakes that images cannot distinguish from the first, one of each kind.
-    """
-    alike = [same.what for same in ambiguous_with if same.kind != first.kind]
-    return Mistake(
-        f"{first.kind} and {second.kind}",
-        f"{first.what}, and {second.what}",
-        f"{first.mended} and {second.mended}",
-        f"{first.remedy}, and {second.remedy}",
-        second.true,
-        (*first.same_as, *alike, *second.same_as),
-        first.test or second.test,
-    )
-
-
-def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
-    """Return the possible mistakes of a session, the most common first.
-
-    They are changes of the hypothesis ``given``, by default the session as given by its files.
-    """
-    given = given or as_given(data)
+def mistakes(data: OrderedDataset) -> list[Mistake]:
+    """Return the possible mistakes of a session, the most common first."""
+    given = as_given(data)
     encoders = _Encoders(given)
     candidates = [
         *_column_mistakes(data, given),

@@ -42,7 +42,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     known_parameters,
     resolve,
 )
-from legcal.calibration.joint_fit.predicted_noise import (
+from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     WHITE,
     PredictedNoise,
@@ -52,12 +52,11 @@ from legcal.data.dataset import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files.schema import closest
 from legcal.machine.diagnostics import singularity_note
-from legcal.machine.directions import legs_in_words
 from legcal.machine.files import DATASET_YAML
 from legcal.machine.leg import JointType
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.parameters import geometries, is_held_by_default
+from legcal.machine.parameters import geometries, is_held_by_default, legs_in_words
 from legcal.machine.ties import ties_in_words
 from legcal.paper.conditions import (
     Condition,

@@ -22,17 +22,20 @@ from legcal.calibration.identify.report import (
 )
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
-from legcal.calibration.joint_fit.predicted import Contributions
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, WHITE, PredictedNoise
+from legcal.calibration.joint_fit.predicted import (
+    DEFAULT_NOISE,
+    WHITE,
+    Contributions,
+    PredictedNoise,
+)
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
 from legcal.errors import NotIdentifiable
-from legcal.estimation.square_root import compress, marginal_rows
+from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.geometry.types import Array
-from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.machine.equations import pose_sensitivity
-from legcal.machine.leg import SIGMA_LENGTH, LegColumns
-from legcal.machine.parameter_id import ARMS, ParameterId
+from legcal.machine.leg import ARMS, SIGMA_LENGTH, LegColumns, ParameterId
+from legcal.machine.parameters import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.vision.board import Link
 from legcal.vision.camera import shared_cameras
 

@@ -27,11 +27,11 @@ from legcal.calibration.identify.session import (
     neighbours,
     planned_session,
 )
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
+from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, PredictedNoise
 from legcal.geometry.types import Array
-from legcal.machine.directions import legs_in_words, list_in_words
 from legcal.machine.leg import JointType
 from legcal.machine.model import Machine
+from legcal.machine.parameters import legs_in_words, list_in_words
 from legcal.paper.conditions import Condition, count_conditions, three_legs_at_once
 from legcal.vision.board import Link
 

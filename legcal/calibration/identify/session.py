@@ -18,12 +18,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import (
+    DEFAULT_NOISE,
     Contributions,
+    PredictedNoise,
     information_of_images,
     predicted_outlines,
     readings_at,
 )
-from legcal.calibration.joint_fit.predicted_noise import DEFAULT_NOISE, PredictedNoise
 from legcal.calibration.joint_fit.variables import FittedLegs, Start
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.corners import found_corners
@@ -35,6 +36,7 @@ from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
+from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, radius_name
@@ -53,7 +55,6 @@ from legcal.machine.rods import (
     joints_at,
     readings_of_rods,
 )
-from legcal.machine.solved_poses import solve_poses
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
 from legcal.vision.board import Board, FixedBoard, Link, facing_board
 from legcal.vision.camera import sample_camera

@@ -10,7 +10,6 @@ nominal or refused, rounds of outlier rejection and noise estimation, checks, th
 ``variables``         state, manifold of the legs, exact constraints of platform poses
 ``factors``           outlines, readings, axes and corners as residuals with derivatives
 ``outline_errors``    noise of outlines, common-mode edge biases, gammas of cameras
-``gammas``            fits to outlines measured with several gammas, compared
 ``problem``           variables and factors of a fit
 ``fit``               the whole fit, step by step
 ``determinacy``       unobservable directions: refused, or held at nominal
@@ -19,11 +18,9 @@ nominal or refused, rounds of outlier rejection and noise estimation, checks, th
 ``diagnostics``       stated priors and fixed values against the measurements
 ``scale``             the source of the absolute scale: a measured length, or radii alone
 ``sensitivity``       effect of errors of fixed quantities; score tests of cameras
-``held_out``          prediction errors in held-out images
-``cross_validation``  images without a part in the fit predicted by it and the nominal model
+``held_out``          prediction errors in held-out images, and in images left out in turn
 ``platform``          accuracy at the platform
-``predicted``         the information of images before they are measured
-``predicted_noise``   the noise to expect of them, by default or of an earlier result
+``predicted``         the information and noise of images before they are measured
 ``solution``          the result
 ===================== ==================================================================
 

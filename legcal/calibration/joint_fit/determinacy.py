@@ -20,8 +20,8 @@ from legcal.errors import NotIdentifiable
 from legcal.estimation.solver import NormalEquations, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.directions import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.machine.equations import pose_sensitivity
+from legcal.machine.parameters import SHOWN, describe_direction, sparse_basis, split_by_motion
 
 _MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
 _REMEDY = "add images from other directions, of other legs or at poses that differ more"

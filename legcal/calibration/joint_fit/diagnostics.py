@@ -6,11 +6,11 @@ a second fit with the parameter free.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri, ndtr
+from scipy.special import chdtrc
 
 from legcal.calibration.joint_fit.determinacy import (
     HeldDirections,
@@ -22,17 +22,17 @@ from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
+from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.directions import list_in_words
-from legcal.machine.leg import Leg, radius_name
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import Leg, ParameterId, radius_name
+from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import actuators_of
-from legcal.vision.board import LINKS, Link
+from legcal.vision.board import LINKS
 from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
@@ -43,7 +43,6 @@ _WIDE_SIGMA = 0.05  # mean leg lengths or rad: the wide prior in place of a fixe
 _WIDE_RADIUS = 0.2  # relative, of a radius
 _MAX_VARIANCE_SHARE = 0.5  # posterior over prior variance, for a test
 _NOMINAL_SIGMA = 0.01  # mean leg lengths: error of a nominal model along held directions
-_MIN_SHARE = 0.01  # of the variance in a camera file, which measurements must remove for a test
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 # An arm that is no cylinder: its median outline error over that of rods (at most 1.8 for 204
@@ -51,7 +50,6 @@ _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 ARM_MISFIT, _ARM_MISFIT_PX = 2.0, 0.03
 _MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is noted
 MOST_SCATTER = 2.0  # of outlines, over the standard deviations that they came with
-_SCATTER_BY_CHANCE = 1e-3
 RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
@@ -68,21 +66,14 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     """
     if not problem.settings.judges_stated_values:
         return
-    priors, problems = problem.priors, []
-    for i, mean, sigma in zip(
-        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
-    ):
-        if problem.named[i] not in problem.choices.priors:
-            continue
-        estimate = estimate_without_prior(problem, state, normal, i, mean, sigma)
-        if estimate is not None and estimate.apart > _SIGNIFICANT:
-            unit = problem.units[i]
-            problems.append(
-                f"The prior of {problem.named[i]} contradicts the measurements: prior {mean:.6g} "
-                f"+- {sigma:.2g} {unit}, measurements about {estimate.value:.4g} {unit}, "
-                f"{estimate.apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct "
-                "or remove the prior."
-            )
+    names = problem.choices.priors.keys()
+    problems = [
+        f"The prior of {name} contradicts the measurements: prior {mean:.6g} +- {sigma:.2g} "
+        f"{problem.units[problem.named.index(name)]}, measurements about {estimate.value:.4g} "
+        f"{problem.units[problem.named.index(name)]}, {estimate.apart:.0f} standard deviations "
+        f"apart (limit {_SIGNIFICANT:g}); correct or remove the prior."
+        for name, mean, sigma, estimate in _contradicted(problem, state, normal, names)
+    ]
     if problems:
         raise DidNotConverge(problems)
 
@@ -93,40 +84,19 @@ def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalE
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
     *normal* is the information at *state*, a first minimum.
     """
-    for link in LINKS:
-        name = board_scale(link)
-        if name in problem.named and name not in problem.choices.priors:
-            _refuse_other_size(problem, state, normal, link)
-
-
-def _refuse_other_size(
-    problem: FitProblem,
-    state: State,
-    normal: NormalEquations,
-    link: Link,
-) -> None:
-    """Refuse the calibration board on a link if its dimensions in the dataset are wrong."""
-    name = board_scale(link)
-    number, priors = problem.named.index(name), problem.priors
-    for i in np.flatnonzero(priors.unknown == number).tolist():
-        mean, sigma = float(priors.mean[i]), float(priors.sigma[i])
-        estimate = estimate_without_prior(problem, state, normal, number, mean, sigma)
-        if estimate is None or estimate.sigma > _MAX_SCALE_SIGMA or estimate.apart <= _SIGNIFICANT:
-            continue
-        choices = replace(problem.choices, free=problem.choices.free | {name})
-        try:
-            refitted = first_minimum(problem.with_choices(choices), state)
-            size = f"{refitted.state.board_scale[LINKS.index(link)]:.4g} times the size"
-        except (DidNotConverge, NotIdentifiable):
-            size = "not of the size"
-        board = "" if link == "base" else f" on the {link}"
-        raise DidNotConverge(
-            f"The dimensions of the calibration board{board} contradict the readings and the legs: "
-            f"the board is {size} stated in the dataset ({estimate.apart:.0f} standard deviations; "
-            f"assumed accuracy {1e2 * sigma:.2g} %); measure the board and correct its dimensions "
-            "in dataset.yaml, or the scale of the readings if the board is right, or estimate the "
-            f"size of the board (--set {name}=free)."
-        )
+    board_of = {board_scale(link): "" if link == "base" else f" on the {link}" for link in LINKS}
+    names = board_of.keys() - problem.choices.priors.keys()
+    problems = [
+        f"The dimensions of the calibration board{board_of[name]} contradict the readings and the "
+        f"legs: the board is {estimate.value:.4g} times the size stated in the dataset "
+        f"({estimate.apart:.0f} standard deviations; assumed accuracy {1e2 * sigma:.2g} %); "
+        "measure the board and correct its dimensions in dataset.yaml, or the scale of the "
+        f"readings if the board is right, or estimate the size of the board (--set {name}=free)."
+        for name, _, sigma, estimate in _contradicted(problem, state, normal, names)
+        if estimate.sigma <= _MAX_SCALE_SIGMA
+    ]
+    if problems:
+        raise DidNotConverge(problems)
 
 
 @dataclass(frozen=True)
@@ -138,22 +108,34 @@ class EstimateWithoutPrior:
     apart: float  # distance from the prior, in standard deviations
 
 
-def estimate_without_prior(
-    problem: FitProblem, state: State, normal: NormalEquations, i: int, mean: float, sigma: float
-) -> EstimateWithoutPrior | None:
-    """Estimate named unknown *i* without its prior; None if the measurements do not depend on it.
+def _contradicted(
+    problem: FitProblem,
+    state: State,
+    normal: NormalEquations,
+    names: Collection[str],
+    most: float = _SIGNIFICANT,
+) -> Iterator[tuple[str, float, float, EstimateWithoutPrior]]:
+    """Yield priors of named unknowns that the measurements contradict: name, mean, sigma, estimate.
 
+    The unknown is estimated without its prior; measurements that hardly depend on it say nothing.
     For the information I of the measurements, an estimate at a distance d from the prior mean moves
     to d (1 + 1 / (I sigma^2)) without the prior. The difference has the variance sigma^2 + 1 / I.
     """
+    priors, coordinates = problem.priors, problem.coordinates(state)
     information_of_named = named_information(problem, state, normal)
-    measured = float(marginal(information_of_named, np.array([i]))[0, 0]) - 1.0 / sigma**2
-    if measured < _MIN_INFORMATION / sigma**2:
-        return None
-    offset = (float(problem.coordinates(state)[i]) - mean) * (1.0 + 1.0 / (measured * sigma**2))
-    variance = 1.0 / measured
-    apart = abs(offset) / float(np.sqrt(sigma**2 + variance))
-    return EstimateWithoutPrior(mean + offset, float(np.sqrt(variance)), apart)
+    for i, mean, sigma in zip(
+        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
+    ):
+        if problem.named[i] not in names:
+            continue
+        measured = float(marginal(information_of_named, np.array([i]))[0, 0]) - 1.0 / sigma**2
+        if measured < _MIN_INFORMATION / sigma**2:
+            continue
+        offset = (float(coordinates[i]) - mean) * (1.0 + 1.0 / (measured * sigma**2))
+        apart = abs(offset) / float(np.sqrt(sigma**2 + 1.0 / measured))
+        if apart > most:
+            estimate = EstimateWithoutPrior(mean + offset, float(measured**-0.5), apart)
+            yield problem.named[i], mean, sigma, estimate
 
 
 @dataclass(frozen=True)
@@ -377,64 +359,7 @@ class Scatter:
         """Return whether outlines scatter more than one of so many groups does by chance."""
         squares = self.squares[self.used & of]
         chance = float(chdtrc(2.0 * len(squares), 2.0 * squares.sum())) if len(squares) else 1.0
-        return n_groups * chance < _SCATTER_BY_CHANCE
-
-
-@dataclass(frozen=True)
-class DoubtedCamera:
-    """A camera whose fitted intrinsics contradict the covariance of its file."""
-
-    view: str  # the first one by name if several have the camera
-    key: str  # of the intrinsic with the largest change over its standard deviation
-    given: float  # in the camera file
-    sigma: float  # in the camera file
-    found: float  # by the fit
-    apart: float  # change in standard deviations
-
-    def __str__(self) -> str:
-        unit = f" {intrinsic_unit(self.key)}".rstrip()
-        return (
-            f"The camera of {self.view} does not agree with its covariance: the fit moves "
-            f"{self.key} from {self.given:.6g} +- {self.sigma:.2g}{unit} to "
-            f"{self.found:.6g}{unit}, {self.apart:.0f} times the expected change; the stated "
-            "uncertainty does not include this error; calibrate the camera again at the same focus "
-            "and zoom."
-        )
-
-
-def doubted_cameras(
-    problem: FitProblem, state: State, covariance: Array
-) -> tuple[DoubtedCamera, ...]:
-    """Return the cameras whose fitted intrinsics contradict the covariances of their files.
-
-    Whitened by the covariance of the file, a change of intrinsics has the covariance 1 - P for the
-    posterior covariance P. *covariance* is of the kept unknowns.
-    """
-    block, values = problem.block("cameras"), problem.coordinates(state)
-    prior, first = block.prior, int(problem.where("cameras")[0]) if block.n_unknowns else 0
-    from_file = np.isin(first + prior.unknown, problem.calibrated)
-    views = np.array([ParameterId.parse(block.labels[i]).owner for i in prior.unknown.tolist()])
-    doubted = []
-    for view in dict.fromkeys(views[from_file].tolist()):
-        rows = np.flatnonzero(from_file & (views == view))
-        unknowns, sigma = first + prior.unknown[rows], prior.sigma[rows]
-        whitening = np.eye(len(prior.mean)) if prior.whitening is None else prior.whitening
-        T = whitening[np.ix_(rows, rows)] / sigma
-        moved, posterior = (
-            values[unknowns] - prior.mean[rows],
-            covariance[np.ix_(unknowns, unknowns)],
-        )
-        reduction, vector = np.linalg.eigh(np.eye(len(rows)) - T @ posterior @ T.T)
-        tested = reduction > _MIN_SHARE
-        squared = float(np.sum((vector[:, tested].T @ T @ moved) ** 2 / reduction[tested]))
-        if squared <= chdtri(max(int(tested.sum()), 1), 2.0 * ndtr(-_SIGNIFICANT)):
-            continue
-        spread = np.sqrt(np.maximum(sigma**2 - np.diagonal(posterior), _MIN_SHARE * sigma**2))
-        k = int(np.argmax(np.abs(moved) / spread))
-        key = ParameterId.parse(problem.named[unknowns[k]]).kind
-        numbers = prior.mean[rows[k]], sigma[k], values[unknowns[k]], abs(moved[k]) / spread[k]
-        doubted.append(DoubtedCamera(view, key, *map(float, numbers)))
-    return tuple(doubted)
+        return n_groups * chance < DOUBT_BY_CHANCE
 
 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
@@ -573,19 +498,14 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
     *normal* is the information at *state*.
     """
     radii = {radius_name(problem.legs.names[leg], part) for leg, part in problem.outlines.parts}
-    priors, contradictions = problem.priors, []
-    for i, mean, sigma in zip(
-        priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
-    ):
-        name = problem.named[i]
-        if name not in radii or name in problem.choices.priors:
-            continue
-        estimate = estimate_without_prior(problem, state, normal, i, mean, sigma)
-        if estimate is not None and estimate.apart > RADIUS_SIGMAS:
-            contradictions.append(
-                f"{name} {1e3 * estimate.value:.2f} mm against {1e3 * mean:.2f} +- "
-                f"{1e3 * sigma:.2f} mm ({estimate.apart:.0f} standard deviations)"
-            )
+    names = radii - problem.choices.priors.keys()
+    contradictions = [
+        f"{name} {1e3 * estimate.value:.2f} mm against {1e3 * mean:.2f} +- {1e3 * sigma:.2f} mm "
+        f"({estimate.apart:.0f} standard deviations)"
+        for name, mean, sigma, estimate in _contradicted(
+            problem, state, normal, names, RADIUS_SIGMAS
+        )
+    ]
     if not contradictions:
         return []
     return [

@@ -20,8 +20,8 @@ from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import Frames, GaussianPrior, Linearization, linearize
 from legcal.estimation.solver import minimise, normal_equations
 from legcal.geometry.types import Array, BoolArray
+from legcal.machine.closing import solve_poses
 from legcal.machine.equations import freedoms, pose_equations
-from legcal.machine.solved_poses import solve_poses
 
 _SEED, _N_DRAWS = 1965, 16  # random starts of every pose, besides its present value
 _TURN, _SHIFT = 0.4, 0.3  # standard deviation of random starts [rad, mean leg lengths]

@@ -21,8 +21,9 @@ estimated as biases: their effect on the fit is added to its covariance.
 **Gammas.** Where the gamma of a camera is not given, its outlines shift with the logarithm of that
 gamma over the gamma used in measurement, each by a known derivative. A fit recovers only part of a
 wrong gamma: the derivatives are approximate, and common-mode biases absorb some. The gamma is
-therefore estimated by trials (:mod:`.gammas`); the bias ``gamma`` of the fit accounts for light at
-the limb that looks like another gamma, and the stated uncertainty includes both.
+therefore estimated by trials (:mod:`legcal.calibration.estimate`); the bias ``gamma`` of the fit
+accounts for light at the limb that looks like another gamma, and the stated uncertainty includes
+both.
 """
 
 from __future__ import annotations

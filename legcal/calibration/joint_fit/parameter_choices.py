@@ -15,17 +15,15 @@ from legcal.data.measurements import View
 from legcal.errors import DatasetError, UsageError
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
-from legcal.machine.leg import Leg, LegKind, radius_name
+from legcal.machine.leg import LegKind, ParameterId, radius_name
 from legcal.machine.model import Machine
-from legcal.machine.parameter_id import ParameterId
 from legcal.machine.parameters import (
-    free_coordinates,
     geometries,
     is_held_by_default,
     parametrization_of,
     vector_of,
 )
-from legcal.vision.board import FixedBoard, Link, board_name
+from legcal.vision.board import LINKS, FixedBoard, Link, board_name
 from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
 
 
@@ -239,38 +237,27 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
 
 def _rejected_names(machine: Machine) -> dict[str, str]:
     """Names that look like parameters of a machine but are not, with the reason."""
-    free = free_coordinates(len(machine.legs), machine.frame_legs)
+    kinds = (
+        *(f"{side}.{axis}" for side in LINKS for axis in "xyz"),
+        *("base_axis.1", "base_axis.2", "platform_axis.1", "platform_axis.2", "twist"),
+        *("offset", "length"),
+    )
     known = parametrization_of(machine, twists=True).names
     others: dict[str, str] = {}
-    for j, leg in enumerate(machine.legs):
-        for side, frame in (("base", "R_b"), ("platform", "R_e")):
-            for axis, letter in enumerate("xyz"):
-                name = f"{leg.name}.{side}.{letter}"
-                if name in known:
-                    continue
-                is_zero = not free[j, axis] and (axis < 2 or machine.spatial)
-                others[name] = (
-                    f"a coordinate that is zero by the definition of {frame}"
-                    if is_zero
-                    else "a coordinate that has no effect"
-                )
-        angles = ("base_axis.1", "base_axis.2", "platform_axis.1", "platform_axis.2", "twist")
-        names = [f"{leg.name}.{angle}" for angle in angles]
-        reason = f"an angle that is no parameter of a leg of type {leg.type} in this machine"
-        others |= {name: reason for name in names if name not in known}
-        others |= _other_lengths(leg)
+    for leg in machine.legs:
+        number = "length" if leg.kind is LegKind.CONSTANT else "offset"
+        for kind in kinds:
+            if kind in ("offset", "length"):
+                reason = f"a leg whose parameter is {leg.name}.{number}"
+                if leg.kind is LegKind.PASSIVE:
+                    reason = "a leg without an encoder, whose length is passive"
+            elif kind[-2:] in (".x", ".y", ".z"):
+                reason = "a coordinate that has no effect or is zero by the definition of its frame"
+            else:
+                reason = f"which is no parameter of a leg of type {leg.type} in this machine"
+            if f"{leg.name}.{kind}" not in known:
+                others[f"{leg.name}.{kind}"] = reason
     return others
-
-
-def _other_lengths(leg: Leg) -> dict[str, str]:
-    """Names of the length or offset that a leg does not have, with the reason."""
-    offset, length = f"{leg.name}.offset", f"{leg.name}.length"
-    if leg.kind is LegKind.CONSTANT:
-        return {offset: f"a leg of constant length, whose parameter is {length}"}
-    if leg.kind is LegKind.ACTUATED:
-        return {length: f"a leg with an encoder, whose parameter is {offset}"}
-    reason = "a leg without an encoder, whose length is passive"
-    return {offset: reason, length: reason}
 
 
 _PAST_TENSE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}

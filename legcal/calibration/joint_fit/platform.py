@@ -21,9 +21,10 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import workspace
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.kinematics import platforms_in_base, pose_differences
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries
+from legcal.machine.rods import length_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,18 +183,10 @@ def reach_readings(
     For readings without a pose, :func:`poses_at_readings` returns the nearest pose.
     """
     R, t = Frames.of(T_Rb_Re)
-    reached = np.ones(len(t), dtype=np.bool_)
-    for leg, reading in zip(legs, q.T, strict=True):
-        if leg.kind is LegKind.ACTUATED:
-            A, wanted = leg.A, leg.sign * reading + leg.q0
-        elif leg.actuator is not None:
-            A, wanted = leg.actuator.at(leg.A, reading), leg.q0
-        else:
-            continue
-        length = np.linalg.norm(R @ leg.B + t - A, axis=1)
-        most = _REACHED_BY_ALL if machine.is_redundant else _REACHED
-        reached &= np.abs(length - wanted) < most * length
-    return reached
+    motors = [leg.is_motor for leg in legs]
+    most = _REACHED_BY_ALL if machine.is_redundant else _REACHED
+    errors = length_errors(legs, R, t, q)[:, motors]
+    return np.asarray(np.all(np.abs(errors) < most * machine.size, axis=1))
 
 
 def poses_at_readings(

@@ -15,28 +15,26 @@ from itertools import combinations
 import numpy as np
 from scipy.special import ndtri
 
-from legcal.calibration.joint_fit.cross_validation import with_weights
 from legcal.calibration.joint_fit.diagnostics import stated_parameters
 from legcal.calibration.joint_fit.factors import measured_lengths
-from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.held_out import Posterior, with_weights
 from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_of_length
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegColumns
-from legcal.machine.parameter_id import ParameterId
+from legcal.machine.leg import LegColumns, ParameterId
 from legcal.vision.board import LINKS
 
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
 TRAVEL, BOARD = "the travel of the motors", "the calibration board"
 RADII, MODEL = "the radii", "the nominal model"
-CHANCE = 0.0027  # of any pair of a healthy session to disagree
 _CLEARLY = 4.0  # squared sigmas, by which the others agree better without one witness
 _LENGTHS = {"base", "platform", "offset", "length"}  # kinds of parameters with a length
 
@@ -221,7 +219,7 @@ class ScaleComparison:
     def disagreements(self) -> list[Disagreement]:
         """The pairs that differ by more than all of them do by chance, the surest first."""
         found, pairs = list[Disagreement](), list(combinations(range(len(self.size)), 2))
-        most = -float(ndtri(0.5 * CHANCE / len(pairs)))
+        most = -float(ndtri(0.5 * DOUBT_BY_CHANCE / len(pairs)))
         for i, j in pairs:
             apart, variance = self.size[i] - self.size[j], self._contrasts([i, j])[1][0, 0]
             sigmas = float(abs(apart) / np.sqrt(variance)) if variance > 0.0 else 0.0

@@ -14,11 +14,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import LegConstraints, State, intrinsic_of
 from legcal.estimation.problem import Linearization
 from legcal.estimation.solver import NormalEquations, normal_equations
-from legcal.estimation.uncertainty import residual_changes, response, score_test
+from legcal.estimation.uncertainty import Scores, residual_changes, response
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LegColumns
 from legcal.machine.parameters import is_held_by_default
@@ -38,7 +39,6 @@ _CAMERA_ERRORS: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = 
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
-_ROUNDING = 1e-9  # relative, in differences of nearly equal numbers
 
 
 @dataclass(frozen=True)
@@ -180,6 +180,9 @@ class WrongIntrinsic:
 
     units: ClassVar[tuple[tuple[Mapping[str, float], Mapping[str, float]], ...]]  # relative, added
     keys: ClassVar[tuple[str, ...]]  # of the intrinsics
+    name: ClassVar[str]  # in words
+    remedy: ClassVar[str]
+    against: ClassVar[str] = "the measurements"
 
     view: str  # the first one by name if several have the camera
     given: Array  # (u,) in the camera file
@@ -189,9 +192,16 @@ class WrongIntrinsic:
     error: Array  # (n_views, 5) the correction, in all views
 
     @property
-    def camera(self) -> str:
-        """The first view by name that has this camera."""
-        return self.view
+    def found(self) -> str:
+        """What the measurements say, as a clause."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return (
+            f"The {self.name} {self.view} does not agree with {self.against}: {self.found}, "
+            f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
+            f"this error; {self.remedy.format(self.view)}."
+        )
 
 
 class FocalLength(WrongIntrinsic):
@@ -199,38 +209,36 @@ class FocalLength(WrongIntrinsic):
 
     units = ((_FOCAL, {}),)
     keys = ("fx",)
+    name = "focal length of"
+    remedy = (
+        "calibrate the camera again at the same focus and zoom, look for photographs that were "
+        "scaled or refocused, or estimate it (--set {0}.fx=free --set {0}.fy=free)"
+    )
 
-    def __str__(self) -> str:
+    @property
+    def found(self) -> str:
+        """What the measurements say, as a clause."""
         (given,), (change,) = self.given, self.change
         return (
-            f"The focal length of {self.view} does not agree with the measurements: found fx = "
-            f"{given * (1.0 + change):.1f} +- {given * self.sigma[0]:.1f} px, given "
-            f"{given:.1f} px, {self.apart:.0f} standard deviations and {1e2 * change:+.2f} % "
-            "apart; the stated uncertainty does not include this error; calibrate the camera again "
-            "at the same focus and zoom, look for photographs that were scaled or refocused, or "
-            f"estimate it (--set {self.view}.fx=free --set {self.view}.fy=free)."
+            f"found fx = {given * (1.0 + change):.1f} +- {given * self.sigma[0]:.1f} px, given "
+            f"{given:.1f} px ({1e2 * change:+.2f} %)"
         )
 
 
-@dataclass(frozen=True, eq=False)
 class ZoomedView(FocalLength):
     """The focal length of a view against that of the other views with its camera file."""
 
-    of_others: str = ""  # the first view by name that has this camera
+    name = "focal length of view"
+    against = "the other views of its camera"
+    remedy = (
+        "look for photographs of that view that were zoomed, scaled, cropped or refocused, and "
+        "calibrate its camera with the settings used there"
+    )
 
     @property
-    def camera(self) -> str:
-        """The first view by name that has this camera."""
-        return self.of_others
-
-    def __str__(self) -> str:
-        return (
-            f"The focal length of view {self.view} does not agree with the other views of its "
-            f"camera: it differs by {1e2 * self.change[0]:+.2f} +- {1e2 * self.sigma[0]:.2f} %, "
-            f"{self.apart:.0f} standard deviations; the stated uncertainty does not include this "
-            "error; look for photographs of that view that were zoomed, scaled, cropped or "
-            "refocused, and calibrate its camera with the settings used there."
-        )
+    def found(self) -> str:
+        """What the measurements say, as a clause."""
+        return f"it differs by {1e2 * self.change[0]:+.2f} +- {1e2 * self.sigma[0]:.2f} %"
 
 
 class PrincipalPoint(WrongIntrinsic):
@@ -238,16 +246,19 @@ class PrincipalPoint(WrongIntrinsic):
 
     units = (({}, {"cx": 1.0}), ({}, {"cy": 1.0}))
     keys = ("cx", "cy")
+    name = "principal point of"
+    remedy = (
+        "look for photographs that were cropped or stabilised, calibrate the camera again at the "
+        "same focus and zoom, or estimate it (--set {0}.cx=free --set {0}.cy=free)"
+    )
 
-    def __str__(self) -> str:
+    @property
+    def found(self) -> str:
+        """What the measurements say, as a clause."""
         (cx, cy), (dx, dy) = self.given + self.change, self.sigma
         return (
-            f"The principal point of {self.view} does not agree with the measurements: found it at "
-            f"({cx:.1f} +- {dx:.1f}, {cy:.1f} +- {dy:.1f}) px, given ({self.given[0]:.1f}, "
-            f"{self.given[1]:.1f}) px, {self.apart:.0f} standard deviations apart; the stated "
-            "uncertainty does not include this error; look for photographs that were cropped or "
-            "stabilised, calibrate the camera again at the same focus and zoom, or estimate it "
-            f"(--set {self.view}.cx=free --set {self.view}.cy=free)."
+            f"found it at ({cx:.1f} +- {dx:.1f}, {cy:.1f} +- {dy:.1f}) px, given "
+            f"({self.given[0]:.1f}, {self.given[1]:.1f}) px"
         )
 
 
@@ -256,21 +267,22 @@ class LensDistortion(WrongIntrinsic):
 
     units = (({}, {"k1": 1.0}),)
     keys = ("k1",)
+    name = "distortion of"
+    remedy = (
+        "take and process the photographs of board and machine alike, with lens correction in all "
+        "or in none, and calibrate the camera again"
+    )
 
-    def __str__(self) -> str:
+    @property
+    def found(self) -> str:
+        """What the measurements say, as a clause."""
         (given,), (found,) = self.given, self.given + self.change
         looks = ""
         if abs(found) < 0.5 * abs(given):
-            looks = "; the lens distortion of the photographs appears to have been removed"
+            looks = " (the lens distortion of the photographs appears to have been removed)"
         elif given == 0.0:
-            looks = "; the lens distortion of the photographs appears not to have been removed"
-        return (
-            f"The distortion of {self.view} does not agree with the measurements: found k1 = "
-            f"{found:.3f} +- {self.sigma[0]:.3f}, given {given:.3f}, {self.apart:.0f} standard "
-            f"deviations apart{looks}; the stated uncertainty does not include this error; take "
-            "and process the photographs of board and machine alike, with lens correction in all "
-            "or in none, and calibrate the camera again."
-        )
+            looks = " (the lens distortion of the photographs appears not to have been removed)"
+        return f"found k1 = {found:.3f} +- {self.sigma[0]:.3f}, given {given:.3f}{looks}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,159 +332,95 @@ class CameraResiduals:
     def contradicted(self) -> list[WrongIntrinsic]:
         """Return the intrinsics in camera files that contradict the measurements.
 
-        One error of a camera resembles others: the most significant one is selected first, and
-        further ones only if they stay significant after its correction.
+        None where outlines scatter more than they claim even with these cameras corrected: then
+        something else is wrong, of which cameras take a part.
         """
-        owners = shared_cameras(self.problem.outlines.views, self.problem.first_cameras)
-        zoomed = {test.camera: test for test in self._zoomed_views()}
+        owners = np.array(shared_cameras(self.problem.outlines.views, self.problem.first_cameras))
         contradicted = list[WrongIntrinsic]()
-        for owner in dict.fromkeys(owners):
-            wrong = self._wrong_intrinsics(owner)
-            zoomed_view = zoomed.get(owner)
+        for owner in dict.fromkeys(owners.tolist()):
+            wrong = self._wrong_intrinsics(owner, owners == owner)
+            zoomed = self._zoomed_view(owners == owner)
             clearest = max((test.apart for test in wrong), default=_SIGNIFICANT)
-            contradicted += (
-                wrong if zoomed_view is None or zoomed_view.apart <= clearest else [zoomed_view]
-            )
-        return contradicted
+            contradicted += wrong if zoomed is None or zoomed.apart <= clearest else [zoomed]
+        squares = float(self.linear["outlines"].squared_norms.sum())
+        left = 1.0 - sum(test.apart**2 for test in contradicted) / max(squares, 1e-300)
+        scatter = Scatter.of(self.problem, self.state).ratio()
+        return contradicted if np.sqrt(max(left, 0.0)) * scatter <= MOST_SCATTER else []
 
-    def _wrong_intrinsics(self, owner: str) -> list[WrongIntrinsic]:
-        """Contradicted intrinsics of a camera, by its representative view.
+    def _wrong_intrinsics(self, owner: str, of_camera: BoolArray) -> list[WrongIntrinsic]:
+        """Contradicted intrinsics of a camera, by its representative view and all of its views.
 
-        Intrinsics with a choice are not tested. The problem includes common-mode biases and the
-        covariance of camera files, so that these are not mistaken for a wrong file.
+        One error of a camera resembles others: the most significant one is selected first, and
+        further ones only if they stay significant after its correction. Intrinsics with a choice
+        are not tested. The problem includes common-mode biases and the covariance of camera files,
+        so that these are not mistaken for a wrong file.
         """
-        kinds, errors, error_indices = list[type[WrongIntrinsic]](), list[Array](), list[IntArray]()
+        kinds, errors, columns = list[type[WrongIntrinsic]](), list[Array](), list[IntArray]()
         for kind in (FocalLength, PrincipalPoint, LensDistortion):
             units = [_camera_error(self.state, *unit) for unit in kind.units]
-            known_views, owners = self._known_views(np.sum(units, axis=0))
-            views_of_camera = np.array(
-                [v in known_views and owners[v] == owner for v in range(len(owners))]
-            )
-            if views_of_camera.any():
+            views = self._known_views(np.sum(units, axis=0)) & of_camera
+            if views.any():
                 kinds.append(kind)
-                error_indices.append(len(errors) + np.arange(len(units), dtype=np.intp))
-                errors += [views_of_camera[:, None] * unit for unit in units]
-        if not kinds:
+                columns.append(len(errors) + np.arange(len(units), dtype=np.intp))
+                errors += [views[:, None] * unit for unit in units]
+        selected = dict[int, float]()
+        scores = given = self._scores(errors) if errors else None
+        while given is not None and len(selected) < len(kinds):
+            left = {k: given.estimate(columns[k]) for k in range(len(kinds)) if k not in selected}
+            best = max(left, key=lambda k: left[k].square)
+            if left[best].square <= _SIGNIFICANT**2:
+                break
+            selected[best], given = float(np.sqrt(left[best].square)), given.given(left[best])
+        if scores is None or not selected:
             return []
-        score, information = self._score(errors)
-        selected = _forward_selection(score, information, error_indices)
-        if not selected:
-            return []
-        errors_of_wrong = np.concatenate([error_indices[k] for k in selected])
-        covariance = _inverse(information, errors_of_wrong)
-        change, sigma = -covariance @ score[errors_of_wrong], np.sqrt(np.diagonal(covariance))
+        together = scores.estimate(np.concatenate([columns[k] for k in selected]))
+        change, sigma = -together.amount, np.sqrt(np.diagonal(together.covariance))
         camera = self.problem.first_cameras[self.problem.outlines.views.index(owner)]
         wrong_intrinsics = []
-        for k, gain in selected.items():
-            views_of_camera = np.isin(errors_of_wrong, error_indices[k])
-            given = np.array([intrinsic_of(camera, key) for key in kinds[k].keys])
-            error = np.tensordot(
-                change[views_of_camera],
-                [errors[i] for i in errors_of_wrong[views_of_camera].tolist()],
-                axes=1,
-            )
+        for k, apart in selected.items():
+            own = np.isin(together.columns, columns[k])
+            given_values = np.array([intrinsic_of(camera, key) for key in kinds[k].keys])
+            error = np.tensordot(change[own], [errors[i] for i in columns[k].tolist()], axes=1)
             wrong_intrinsics.append(
-                kinds[k](owner, given, change[views_of_camera], sigma[views_of_camera], gain, error)
+                kinds[k](owner, given_values, change[own], sigma[own], apart, error)
             )
         return wrong_intrinsics
 
-    def _zoomed_views(self) -> list[ZoomedView]:
-        """Return the view of each camera whose focal length differs most from its other views.
+    def _zoomed_view(self, of_camera: BoolArray) -> ZoomedView | None:
+        """Return the view of a camera whose focal length differs most from its other views.
 
         Causes are digital zoom and refocusing. Cameras with choices for intrinsics, or with only
         one informative view, are not tested.
         """
-        problem, error = self.problem, _camera_error(self.state, _FOCAL, {})
-        known_views, owners = self._known_views(error)
-        views = [v for v in known_views if sum(owners[k] == owners[v] for k in known_views) > 1]
-        if not views:
-            return []
-        masks = [np.arange(len(owners)) == v for v in views]
-        visible, change, covariance = self._scores(error, masks)
-        zoomed = []
-        for owner in sorted({owners[v] for v in views}):
-            indices = [i for i, k in enumerate(visible.tolist()) if owners[views[k]] == owner]
-            weight = _inverse(covariance, np.array(indices, dtype=np.intp))
-            tests = []
-            for i, k in enumerate(indices if len(indices) > 1 else []):
-                X = np.column_stack([np.ones(len(indices)), np.arange(len(indices)) == i])
-                spread = np.linalg.inv(X.T @ weight @ X)
-                apart = float((spread @ X.T @ weight @ change[indices])[1])
-                view = views[int(visible[k])]
-                given = intrinsic_of(problem.first_cameras[view], "fx")
-                name, sigma = problem.outlines.views[view], float(np.sqrt(spread[1, 1]))
-                if not sigma > 0.0:  # of measurements without noise
-                    continue
-                zoom = apart * error * (np.arange(len(error)) == view)[:, None]
-                numbers = np.array([given]), np.array([apart]), np.array([sigma])
-                tests.append(ZoomedView(name, *numbers, abs(apart) / sigma, zoom, owner))
-            zoomed += sorted(tests, key=lambda test: test.apart)[-1:]
-        return zoomed
+        error = _camera_error(self.state, _FOCAL, {})
+        views = np.flatnonzero(self._known_views(error) & of_camera).tolist()
+        if len(views) < 2:
+            return None
+        in_view = [error * (np.arange(len(error)) == v)[:, None] for v in views]
+        scores, columns = self._scores(in_view), np.arange(len(views))
+        given, zoomed = scores.given(scores.estimate(columns, np.ones((len(views), 1)))), []
+        for i, v in enumerate(views):
+            number = given.estimate(columns[[i]])
+            change, sigma = -number.amount, np.sqrt(np.diagonal(number.covariance))
+            if number.rank:
+                name, camera = self.problem.outlines.views[v], self.problem.first_cameras[v]
+                focal, apart = np.array([intrinsic_of(camera, "fx")]), float(np.sqrt(number.square))
+                wrong = change[0] * in_view[i]
+                zoomed.append(ZoomedView(name, focal, change, sigma, apart, wrong))
+        return max(zoomed, key=lambda test: test.apart, default=None)
 
-    def _known_views(self, error: Array) -> tuple[list[int], tuple[str, ...]]:
-        """Return views with the intrinsics in *error* from files, and the camera of each view."""
+    def _known_views(self, error: Array) -> BoolArray:
+        """Return which views have the intrinsics in *error* from camera files, (n_views,)."""
         problem, wrong = self.problem, np.flatnonzero(np.any(error, axis=0))
         known_columns = np.append(problem.calibrated, problem.n_kept)
         is_known = np.all(np.isin(_camera_columns(problem)[:, wrong], known_columns), axis=1)
-        known_views = [v for v in np.unique(problem.outlines.view).tolist() if is_known[v]]
-        return known_views, shared_cameras(problem.outlines.views, problem.first_cameras)
+        return np.asarray(is_known & np.isin(np.arange(len(error)), problem.outlines.view))
 
-    def _scores(self, error: Array, masks: Sequence[BoolArray]) -> tuple[IntArray, Array, Array]:
-        """Estimate the size of an error in c sets of views jointly.
-
-        Return the sets with information (k,), their sizes (k,) relative to *error*, and the
-        covariance (k, k).
-        """
-        score, information = self._score([error * mask[:, None] for mask in masks])
-        visible = np.flatnonzero(np.diagonal(information) > 0.0)
-        covariance = _inverse(information, visible)
-        return visible, -covariance @ score[visible], covariance
-
-    def _score(self, errors: Sequence[Array]) -> tuple[Array, Array]:
-        """Score (c,) of errors (n_views, 5) of cameras, and its information (c, c).
-
-        The information of errors invisible in the residuals is zero.
-        """
+    def _scores(self, errors: Sequence[Array]) -> Scores:
+        """Return the scores of errors (n_views, 5) of cameras."""
         changes = [self.changes(error) for error in errors]
         columns = {
             name: np.stack([change[name] for change in changes], axis=-1)
             for name in self.derivatives
         }
-        score, information = score_test(self.problem, self.linear, self._plain, columns)
-        total = sum(np.sum(of_kind**2, axis=(0, 1)) for of_kind in columns.values())
-        invisible = np.diagonal(information) <= _ROUNDING * total
-        information[invisible] = information[:, invisible] = score[invisible] = 0.0
-        return score, information
-
-
-def _forward_selection(
-    score: Array, information: Array, groups: Sequence[IntArray]
-) -> dict[int, float]:
-    """Select significant groups of errors, the most significant first.
-
-    Return the significance of each in standard deviations, given the groups before it.
-    """
-    candidates = [
-        k for k, indices in enumerate(groups) if np.all(np.diagonal(information)[indices] > 0.0)
-    ]
-    chosen, so_far = dict[int, float](), 0.0
-
-    def explained(numbers: Sequence[int]) -> float:
-        indices = np.concatenate([groups[k] for k in numbers])
-        return float(score[indices] @ _inverse(information, indices) @ score[indices])
-
-    while candidates:
-        value = {k: explained([*chosen, k]) for k in candidates}
-        best = max(candidates, key=value.__getitem__)
-        gain = float(np.sqrt(max(value[best] - so_far, 0.0)))
-        if gain <= _SIGNIFICANT:
-            break
-        candidates.remove(best)
-        chosen[best], so_far = gain, value[best]
-    return chosen
-
-
-def _inverse(matrix: Array, at: IntArray) -> Array:
-    """Pseudoinverse of the rows and columns *at* (c,) of a symmetric matrix."""
-    block = matrix[np.ix_(at, at)]
-    return np.asarray(np.linalg.pinv(block, rcond=_ROUNDING, hermitian=True), dtype=np.float64)
+        return Scores.of(self.problem, self.linear, self._plain, columns)

@@ -12,11 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.joint_fit.determinacy import HeldDirections, covariance_of_held, named_units
 from legcal.calibration.joint_fit.diagnostics import (
-    MOST_SCATTER,
-    DoubtedCamera,
-    Scatter,
     contradicted_radii,
-    doubted_cameras,
     legs_left_out,
     rejected_notes,
     reversed_motors,
@@ -165,46 +161,6 @@ class GoodnessOfFit:
     redundant_readings: JudgedReadings | None  # None where readings cannot disagree
 
 
-@dataclass(frozen=True, eq=False)
-class CameraDoubts:
-    """Cameras that contradict the measurements."""
-
-    tested: Sequence[WrongIntrinsic]  # by score tests
-    others: Sequence[DoubtedCamera]  # by the covariances of their files
-
-    @classmethod
-    def of(cls, cameras: CameraResiduals, covariance: Array) -> CameraDoubts:
-        """Test the cameras at a minimum with the *covariance* of its kept unknowns."""
-        tested = cameras.contradicted()
-        if not cls._explain(cameras, tested):
-            return cls((), ())
-        views = {test.view for test in tested}
-        doubted = doubted_cameras(cameras.problem, cameras.state, covariance)
-        return cls(tested, [camera for camera in doubted if camera.view not in views])
-
-    @staticmethod
-    def _explain(cameras: CameraResiduals, tested: Sequence[WrongIntrinsic]) -> bool:
-        """Whether outlines scatter as little as they claim once these cameras are corrected.
-
-        Otherwise something else is wrong, of which cameras take a part.
-        """
-        squares = float(cameras.linear["outlines"].squared_norms.sum())
-        left = 1.0 - sum(test.apart**2 for test in tested) / max(squares, 1e-300)
-        scatter = Scatter.of(cameras.problem, cameras.state).ratio()
-        return scatter <= MOST_SCATTER or np.sqrt(max(left, 0.0)) * scatter <= MOST_SCATTER
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """Representative views of these cameras."""
-        views = [doubt.view for doubt in self.tested] + [doubt.view for doubt in self.others]
-        return tuple(dict.fromkeys(views))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """One sentence per camera."""
-        return tuple(str(doubt) for doubt in (*self.tested, *self.others))
-
-
 @brief
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -227,7 +183,7 @@ class Solution:
     outlines: Outlines  # the input table, with the rejections of the fit
     start: str  # label of the start
     iterations: int  # of the solver, all rounds
-    camera_doubts: CameraDoubts
+    camera_doubts: tuple[WrongIntrinsic, ...]  # cameras that the measurements contradict
     posterior: Posterior  # to predict other images; in the order of the fit
     notes: tuple[str, ...] = ()  # one sentence each
     details: tuple[str, ...] = ()  # on the starts, one sentence each
@@ -264,7 +220,7 @@ def assemble_solution(
     covariance = named_covariance(problem, state, kept)
     quality = _goodness_of_fit(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
-    doubts = CameraDoubts.of(cameras, kept)
+    contradicted = tuple(cameras.contradicted())
     gammas = _gammas(problem, state, kept, outlines)
     return Solution(
         legs=state.legs,
@@ -286,14 +242,14 @@ def assemble_solution(
         },
         gammas=gammas,
         sensitivities=(
-            *sensitivities(cameras, normal, doubts.tested),
+            *sensitivities(cameras, normal, contradicted),
             *sensitivity_to_scale(problem, state, kept),
         ),
         outlines=_with_rejections(outlines, fit),
         start=label,
         iterations=fit.minimum.iterations,
         posterior=Posterior(problem, state, fit.edge_biases, fit.noise, kept),
-        camera_doubts=doubts,
+        camera_doubts=contradicted,
         left_out=legs_left_out(problem, fit.accepted),
         notes=(
             *fit.notes,
@@ -305,7 +261,7 @@ def assemble_solution(
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *contradicted_radii(problem, state, normal),
             *(_misfit_of_axes(quality) if len(problem.axes) else ()),
-            *doubts.notes,
+            *map(str, contradicted),
         ),
     )
 

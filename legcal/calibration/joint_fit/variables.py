@@ -28,6 +28,7 @@ from legcal.estimation.problem import EstimationProblem, Frames, Tangent
 from legcal.geometry.axes import axis_angles_slope
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
+from legcal.machine.closing import solve_poses, solve_postures
 from legcal.machine.equations import PoseEquations, freedoms, posture_constraints
 from legcal.machine.leg import Leg, LegColumns, mean_length
 from legcal.machine.model import Machine
@@ -43,7 +44,6 @@ from legcal.machine.parameters import (
     with_numbers,
 )
 from legcal.machine.rods import actuator_index, actuators_of, first_rods
-from legcal.machine.solved_poses import solve_poses, solve_postures
 from legcal.machine.ties import Ties, independent, ties_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, Self
 
@@ -17,11 +17,10 @@ from legcal.simulation.rendering.rays import Single
 
 SAMPLES = (13, 21, 34, 55, 89, 144)  # Fibonacci numbers: the lattices of a pixel's rays
 
-_POSITIVE = ("exposure", "gamma", "jpeg")
-_MIN = {"electrons": 1.0}
-_MAX = {
-    "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
-    "electrons": math.inf, "jpeg": 100.0,
+_LIMITS = {  # least and most of numbers
+    "exposure": (1e-6, 1e6), "gamma": (0.01, 10.0), "jpeg": (1, 100), "electrons": (1.0, math.inf),
+    "blur": (0.0, 20.0), "clutter": (0, 500), "cables": (0, 100), "limb": (0.0, 1.0),
+    "texture": (0.0, 10.0),
 }  # fmt: skip
 
 _SIZE = 512  # points of the tile along a side
@@ -145,23 +144,21 @@ class Appearance:
     jpeg: int | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                _check_number(field.name, value)
+        for name, value in vars(self).items():
+            least, most = _LIMITS.get(name, (0.0, 1e6))
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if is_number and not least <= value <= most:
+                raise _refused(name, f"{value:g}", f"{least:g} to {most:g}; correct it.")
         if self.camera not in CAMERAS:
-            raise UsageError(
-                f"The appearance could not be used: found the camera {describe(self.camera)}, "
-                f"needed {', '.join(CAMERAS)}; {closest(self.camera, CAMERAS)}"
-            )
+            kinds = f"{', '.join(CAMERAS)}; {closest(self.camera, CAMERAS)}"
+            raise _refused("camera", describe(self.camera), kinds)
+        for name, choices in (("bits", (8, 16)), ("samples", SAMPLES)):
+            if getattr(self, name) not in choices:
+                needed = f"one of {', '.join(map(str, choices))}; choose one."
+                raise _refused(name, getattr(self, name), needed)
         if self.pipeline.jpeg and self.bits != 8:
-            raise UsageError(
-                f"The appearance could not be used: found {self.bits} bits of a pixel and a camera "
-                "that writes JPEG files, needed 8 bits; leave out the bits, or choose the camera "
-                "industrial."
-            )
-        _check_choice("bits", self.bits, (8, 16))
-        _check_choice("samples", self.samples, SAMPLES)
+            needed = "8 where the camera writes JPEG files; leave out the bits."
+            raise _refused("bits", self.bits, needed)
         for light in self.lights:
             if not (math.hypot(*light.direction) > 0.0 and 0.0 < light.distance < 1e6):
                 raise UsageError(
@@ -196,25 +193,9 @@ class Appearance:
         return replace(plain, **changes)  # type: ignore[arg-type]
 
 
-def _check_number(name: str, value: float) -> None:
-    """Refuse a number out of range."""
-    most = _MAX.get(name, 1e6)
-    least = _MIN.get(name, 0.0)
-    words = "above" if name in _POSITIVE else "of at least"
-    if not least <= value <= most or (name in _POSITIVE and value == 0.0):
-        raise UsageError(
-            f"The appearance could not be used: found {name} = {value:g}, needed a number {words} "
-            f"{least:g} and at most {most:g}; correct it."
-        )
-
-
-def _check_choice(name: str, value: int, choices: tuple[int, ...]) -> None:
-    """Refuse a value that is not among the choices."""
-    if value not in choices:
-        raise UsageError(
-            f"The appearance could not be used: found {name} = {value}, needed one of "
-            f"{', '.join(map(str, choices))}; choose one."
-        )
+def _refused(name: str, value: object, needed: str) -> UsageError:
+    """Return the refusal of a value of an appearance."""
+    return UsageError(f"The appearance could not be used: found {name} = {value}, needed {needed}")
 
 
 @lru_cache(maxsize=1)
