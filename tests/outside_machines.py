@@ -477,10 +477,7 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         for virtual in ("floating", "planar")
     },
     "another-plane": (_in_another_plane, ("from the plane in which the legs move",)),
-    "another-link": (
-        _carries_another_link(),
-        ("'p' is not supported", "the child 'plate'"),
-    ),
+    "another-link": (_carries_another_link(), ("floating joint 'platform_free' inside it",)),
     "carried-by-a-leg": (
         _carried_by_a_leg(),
         ("found it between the parent 'leg1_a1_link'",),
