@@ -42,7 +42,8 @@ def simulated(
         Viewpoint(name, lens, MotionEntry(**places[name]["T_base_camera"]).motion())
         for name in names
     )
-    return simulate(model, folder, settings(views=standing, **changes))
+    seen_from = views if changes.get("board") else standing  # cameras are placed to see a board
+    return simulate(model, folder, settings(views=seen_from, **changes))
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

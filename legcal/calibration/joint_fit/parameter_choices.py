@@ -252,7 +252,8 @@ def _rejected_names(machine: Machine) -> dict[str, str]:
                 if leg.kind is LegKind.PASSIVE:
                     reason = "a leg without an encoder, whose length is passive"
             elif kind[-2:] in (".x", ".y", ".z"):
-                reason = "a coordinate that has no effect or is zero by the definition of its frame"
+                frame = "R_b" if kind.startswith("base") else "R_e"
+                reason = f"a coordinate that has no effect or is zero by the definition of {frame}"
             else:
                 reason = f"which is no parameter of a leg of type {leg.type} in this machine"
             if f"{leg.name}.{kind}" not in known:
