@@ -120,7 +120,7 @@ def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> N
 def test_poses_for_plans_of_redundant_machines_are_those_of_least_squares(name: str) -> None:
     machine = machine_of(name)
     legs = fitted_legs(machine)
-    drawn = feasible_poses(machine, 8, np.random.default_rng(0), extreme=False)
+    drawn = feasible_poses(machine, 40, np.random.default_rng(0), extreme=False)
     assert surely_reached(machine, legs, default_setting(machine.size), drawn).mean() > 0.5
 
 

@@ -48,7 +48,8 @@ def test_recorded_sessions_give_one_result_from_every_start(name: str) -> None:
     steps = needs_steps(folder)
     first = calibrated(folder, "nominal", steps=steps)
     staged = calibrated(folder, "staged")
-    assert steps or staged.solution.start == "staged"
+    has_steps = not staged.dataset.machine.actuators  # where motors move joints at A there are none
+    assert steps or (staged.solution.start == "staged") == has_steps
     B = {leg.name: leg.B for leg in staged.solution.legs}
     values = staged.solution.estimates.values
     assert all(

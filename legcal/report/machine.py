@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import degrees
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from legcal.calibration.camera_calibration.document import CameraCalibration
-from legcal.calibration.camera_calibration.projection import CameraComparison
-from legcal.calibration.location.document import Location
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
 from legcal.report.render import Report, heading, report, table
-from legcal.vision.camera import intrinsic_unit
+
+if TYPE_CHECKING:
+    from legcal.calibration.camera_calibration.document import CameraCalibration
+    from legcal.calibration.camera_calibration.projection import CameraComparison
+    from legcal.calibration.location.document import Location
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
@@ -263,6 +264,8 @@ def _noise_line(location: Location) -> str:
 
 def camera_table(calibration: CameraCalibration, output: Path) -> Report:
     """Return a calibrated camera and its file."""
+    from legcal.vision.camera import intrinsic_unit
+
     used = [image for image in calibration.images if image.rms_px is not None]
     camera = calibration.camera
     title = heading(
