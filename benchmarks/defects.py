@@ -228,9 +228,8 @@ class Tree:
             os.chdir(self.folder)
             os.environ["PYTHONPATH"] = str(self.folder)
             sys.path[0] = str(self.folder)
-            options = ("-x", "-q", "-n", "0", "-m", "not slow")
-            options += ("-p", "no:cacheprovider", "--tb=no", "-rfE")
-            code = int(pytest.main([*options, *command]))
+            options = ["-x", "-q", "-n", "0", "-m", "not slow", "-p", "no:cacheprovider"]
+            code = int(pytest.main([*options, "--tb=no", "-rfE", *command]))
         except BaseException:
             traceback.print_exc()
         finally:
