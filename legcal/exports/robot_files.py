@@ -1,8 +1,8 @@
-"""A single URDF file with loops, and the folder for ROS.
+"""A single URDF file with loops, the folder for ROS, and the MJCF file for MuJoCo.
 
-The tree has exactly the numbers of the machine. Meshes, which a single file cannot hold, are left
-out; loops are ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
-reads the file without a YAML; other programs skip unknown elements.
+The tree of the URDF has exactly the numbers of the machine. Meshes, which a single file cannot
+hold, are left out; loops are ``<loop_joint>`` elements and motors ``<transmission>`` elements, so
+that legcal reads the file without a YAML; other programs skip unknown elements.
 """
 
 from __future__ import annotations
