@@ -324,7 +324,7 @@ def _options() -> Iterable[Refusal]:
         ("error-kind", "--error joint=2mm", ("joint", "'joints'")),
         ("error-no-kind", "--error 2mm", ("2mm", "KIND=SIZE")),
         ("error-no-size", "--error joints", ("'joints'", "KIND=SIZE")),
-        ("error-size", "--error joints=2m", ("size 2.0", "0 to 1")),
+        ("error-size", "--error joints=2m", ("--error joints", "'2m'", "0 to 1 m")),
         ("error-none-there", "--error twists=1deg", ("twists",)),
         ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
         ("error-number", "--error joints=2", ("joints", "a number and its unit")),
