@@ -159,7 +159,10 @@ def _calibration(subject: Subject) -> dict[str, object]:
     return calibration
 
 
-# MJCF
+# MJCF: bodies are at the home of the machine, where every loop is closed, and "ref" is the joint
+# value at home, so that joint positions equal those of the URDF, readings included. A 3d closure is
+# a <connect> and a 6d closure a <weld> of two sites. Links without inertia, or with an impossible
+# one, get a stub, which MuJoCo requires.
 
 
 WORLD = "world"
