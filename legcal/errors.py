@@ -270,9 +270,10 @@ class Problems(list[Problem]):
         needed: str = "",
         remedy: str = "",
         line: int | None = None,
+        name: str = "",
     ) -> None:
         """Add a problem of the file."""
-        self.append(Problem(what, found, needed, remedy, self.file, line=line))
+        self.append(Problem(what, found, needed, remedy, self.file, line=line, name=name))
 
     def raise_if_any(self, kind: type[LegcalError] = ModelError) -> None:
         """Raise all problems as one error."""

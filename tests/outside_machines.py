@@ -419,7 +419,7 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
     ),
     "parallelograms-on-arms": (
         _drawn(partial(_delta, parallelograms=True, elbows=2)),
-        ("'j_lower0_0' carries 2 rods", "so that the joints at A move"),
+        ("'j_lower0_0'", "2 rods on link 'arm0'", "'j_arm0'", "arms on arms"),
     ),
     "3-rrr": (_drawn(partial(_planar_arms, 3)), PLANE),
     "one-loop": (_one_loop, PLANE),

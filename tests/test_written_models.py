@@ -153,8 +153,9 @@ def test_the_yaml_keeps_the_gains_of_motors(name: str, motor: str, tmp_path: Pat
         ('"gain": 1.001', '"centre_us": 1500', "us_per_deg"),
     ):
         (tmp_path / "calibrated.yaml").write_text(text.replace(old, new))
-        with pytest.raises(ModelError, match=named):
+        with pytest.raises(ModelError, match=named) as refusal:
             load_mechanism(tmp_path / "calibrated.yaml")
+        assert "legcal.motors." in refusal.value.facts[0].name
 
 
 def _canonical(content: bytes) -> bytes:

@@ -1,8 +1,8 @@
-"""A single URDF file with loops, and the folder for ROS.
+"""A single URDF file with loops, the folder for ROS, and the MJCF file for MuJoCo.
 
-The tree has exactly the numbers of the machine. Meshes, which a single file cannot hold, are left
-out; loops are ``<loop_joint>`` elements and motors ``<transmission>`` elements, so that legcal
-reads the file without a YAML; other programs skip unknown elements.
+The tree of the URDF has exactly the numbers of the machine. Meshes, which a single file cannot
+hold, are left out; loops are ``<loop_joint>`` elements and motors ``<transmission>`` elements, so
+that legcal reads the file without a YAML; other programs skip unknown elements.
 """
 
 from __future__ import annotations
@@ -159,7 +159,10 @@ def _calibration(subject: Subject) -> dict[str, object]:
     return calibration
 
 
-# MJCF
+# MJCF: bodies are at the home of the machine, where every loop is closed, and "ref" is the joint
+# value at home, so that joint positions equal those of the URDF, readings included. A 3d closure is
+# a <connect> and a 6d closure a <weld> of two sites. Links without inertia, or with an impossible
+# one, get a stub, which MuJoCo requires.
 
 
 WORLD = "world"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +19,6 @@ from legcal.machine.parameters import geometries, legs_in_links, parametrization
 
 if TYPE_CHECKING:
     from legcal.calibration.result_folder import EarlierResult
-import re
-from collections.abc import Iterable
 
 RESULT_NAME = "result.json"
 

@@ -23,7 +23,7 @@ from legcal.geometry.lines import segment_distance
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.kinematics import follow, follow_poses
-from legcal.machine.mobility import free_motions, project, singularities, singularity
+from legcal.machine.mobility import LOOSE, free_motions, project, singularities, singularity
 from legcal.machine.model import (
     B_at,
     Machine,
@@ -38,7 +38,6 @@ from legcal.progress import Report, no_progress
 
 MAX_DRAWS = 40  # draws per configuration
 SHARES = np.minimum(1.3 * 0.8 ** np.arange(MAX_DRAWS), 1.0)  # share of the travel for each draw
-LOOSE = 0.01  # singularity measure of home below which motors hardly hold the platform
 MIN_SINGULARITY = 0.1  # least singularity measure, relative to home: nobody works nearer to one
 MIN_STEP = 1.0 / 16.0  # least step, relative to the way from home; harder draws are repeated
 WALK = 6  # steps of the random walk between two configurations

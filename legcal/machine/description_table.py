@@ -11,16 +11,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
     AfterValidator,
     BeforeValidator,
+    ConfigDict,
     Field,
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
+    model_validator,
 )
 from scipy.spatial.transform import Rotation
 
@@ -137,10 +139,18 @@ Kinds = Annotated[
 
 
 class Radii(FileSchema):
-    """The radii of the two parts of a leg."""
+    """The radii of the two parts of a leg, one of them at least."""
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1})
 
     tube: Positive | None = None
     rod: Positive | None = None
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if self.tube is None and self.rod is None:
+            raise ValueError
+        return self
 
 
 Radius = Annotated[

@@ -7,7 +7,7 @@ from legcal.geometry.types import Array
 from legcal.machine.closing import project_pose
 from legcal.machine.files import LegcalBlock
 from legcal.machine.home import home_reading_in_words, legs_outside
-from legcal.machine.mobility import dimensionless, singularity
+from legcal.machine.mobility import LOOSE, dimensionless, singularity
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.ties import ties_in_words
 from legcal.machine.topology import level_rotation
@@ -68,17 +68,18 @@ def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, 
 
 
 def singularity_note(machine: Machine) -> str | None:
-    """Return a note if the motors do not hold the platform at home, else None."""
+    """Return a note if the motors do not hold the platform at home, or hardly; else None."""
     if not 0 < machine.mobility <= len(machine.motors):
         return None
     measure = singularity(machine, machine.home)
-    if measure > _MIN_SINGULARITY:
+    if measure > LOOSE:
         return None
     motion = _free_motion(machine)
-    free = _in_words(motion, machine.size)
+    nearly = "nearly " if measure > _MIN_SINGULARITY else ""
     return (
-        f"the mechanism is singular at home: the platform can {free} there with all "
-        f"motors locked (singularity measure {measure:.1g}, needed above {_MIN_SINGULARITY:g}); "
+        f"the mechanism is {nearly}singular at home: the platform can {nearly}"
+        f"{_in_words(motion, machine.size)} there with all motors locked (singularity measure "
+        f"{measure:.1g}, needed above {LOOSE:g}); "
         f"{machine.urdf.wording.correct_home}{_good_home(machine, motion)}, or the joints if they "
         "make similar figures on base and platform."
     )

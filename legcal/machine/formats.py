@@ -139,7 +139,7 @@ def _with_arms_as_motors(source: Source) -> Source:
     with suppress(OutOfClass):
         block = propose_block(source, None)
         bodies = rigid_bodies(urdf, closures, block.platform_joint)
-        turning = motors_on(bodies, urdf, bodies.body_of[block.base])
+        turning = motors_on(bodies, bodies.body_of[block.base])
         chains = find_chains(bodies, urdf, block.base, block.platform, turning)
         moving = {chain.motor for chain in chains}
         motors = [name for name in turning if name in moving]

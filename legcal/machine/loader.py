@@ -306,19 +306,21 @@ def _actuators(
     problems = Problems(path)
     motors = sorted(str(motor) for motor in stated)
     for name, entry in (block.motors or {}).items():
-        actuator, refused = stated.get(name), f"legcal.motors.{name} could not be used"
+        actuator, entry_name = stated.get(name), f"legcal.motors.{name}"
+        refused = f"{entry_name} could not be used"
         if actuator is None:
             problems.add(
                 refused,
                 "no motor of that name that carries rods",
                 f"one of {', '.join(motors)}" if motors else "no entry",
                 closest(name, motors) if motors else "remove it: sliders along legs carry none",
+                name=entry_name,
             )
             continue
         try:
             pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=actuator.turns)
         except BadValue as bad:
-            problems.add(refused, bad.found, bad.needed, bad.remedy)
+            problems.add(refused, bad.found, bad.needed, bad.remedy, name=entry_name)
         else:
             stated[name] = replace(actuator, gain=entry.gain, pulses=pulses)
     problems.raise_if_any()

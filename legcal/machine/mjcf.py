@@ -102,7 +102,7 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
 class MjcfReader:
     """One MJCF file: its elements with defaults applied, and the tree of its bodies.
 
-    XmlProblems are collected and raised together. The loops are closed in the configuration of the
+    Problems are collected and raised together. The loops are closed in the configuration of the
     file, with all joints at their ``ref``.
     """
 
@@ -181,6 +181,8 @@ class MjcfReader:
         """Write a body with its joints, and return its child bodies."""
         element = part.element
         name = element.get("name", "")
+        if name == WORLD:
+            self.problems.at(element, f"has the name '{WORLD}', which <worldbody> has", "rename it")
         if not name or name in self.poses:
             name = self._unused(f"body{len(self.poses)}")
         T_parent_body = part.T_body_frame * self._pose(element, _attributes_of(element))

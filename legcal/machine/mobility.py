@@ -37,6 +37,7 @@ CONFIGURATIONS = 3
 COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 _REACHED = 1e-9  # largest error of a pose reached, relative to the size of the machine
 _FREE = 0.1  # least independent motion of a chosen coordinate
+LOOSE = 0.01  # singularity measure of home below which motors hardly hold the platform
 MAX_CHANGE = 0.5  # norm of J0^-1 J1 - 1 that excludes a singularity between J0 and J1
 
 

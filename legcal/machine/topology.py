@@ -151,7 +151,7 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
     if ends[0] is not None:
         bases = [bodies.body_of[ends[0]]]
     for base in bases:
-        on_base = motors_on(bodies, urdf, base) if motors is None else motors
+        on_base = motors_on(bodies, base) if motors is None else motors
         try:
             blocks[base] = _block_on(base, urdf, closures, on_base, path, ends)
         except OutOfClass as error:
@@ -179,7 +179,7 @@ def _joined_bodies(bodies: Bodies, urdf: Urdf, root: str) -> list[str]:
     return [body for body in order if body != root and ends.count(body) > 2]
 
 
-def motors_on(bodies: Bodies, urdf: Urdf, base: str) -> list[str]:
+def motors_on(bodies: Bodies, base: str) -> list[str]:
     """Return the joints on a body that could be motors of arms, for a file that names none."""
     return [
         c.joint
@@ -518,7 +518,18 @@ def _not_a_chain(
 ) -> Problem:
     """Return the problem of a leg, given by its first joints, that is not a chain."""
     needed, remedy = "one unbranched chain from base to platform for each leg", ""
-    first = steps[0].connection
+    first, last = steps[0].connection, steps[-1].connection
+    driven = last.joint in motors or (first.joint in motors and _is_an_arm(steps, within))
+    if body != base and n_onward > 1 and len(steps) > 1 and driven:
+        return Problem(
+            f"the leg that starts with {_name(first)} is not supported",
+            f"{n_onward} rods on link '{body}', which {_name(last)} connects to the moving link "
+            "before it",
+            "rods on the link that one motor on the base moves",
+            "make joints of this leg fixed that do not move; arms on arms cannot be calibrated "
+            "with legcal",
+            str(urdf.path),
+        )
     if body == base:
         course = "returns to the base"
     elif n_onward == 0:

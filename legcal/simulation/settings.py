@@ -518,4 +518,11 @@ def _spread(text: str, units: Mapping[str, float], option: str) -> Spread:
             "(the size is half the width) or normal (the size is one standard deviation); "
             "correct it."
         )
-    return Spread(parse_quantity(size, units, option), name if colon else Distribution.UNIFORM)
+    number = parse_quantity(size, units, option)
+    if not 0.0 <= number <= MAX_SIZE:
+        unit = "m" if units is LENGTH else "rad"
+        raise UsageError(
+            f"{option} could not be used: found {describe(size)}, needed 0 to {MAX_SIZE:g} {unit}; "
+            "correct it and its unit."
+        )
+    return Spread(number, name if colon else Distribution.UNIFORM)
