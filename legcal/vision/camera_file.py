@@ -497,9 +497,6 @@ def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
         raise DatasetError(
             f"{path}: K could not be read: found no such key, needed it; add 'K: ...' to the file."
         )
-    by_rows = np.array(
-        entry.K if entry.K is not None else np.transpose(entry.IntrinsicMatrix or [])
-    )
     K = by_rows - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     height, width = entry.ImageSize
     k1, k2, *k3 = entry.RadialDistortion
