@@ -506,6 +506,7 @@ def test_a_covariance_written_into_a_camera_file_is_taken(
     intrinsics, expected = intrinsic_names(camera), np.zeros((9, 9))
     indices = [intrinsics.index(name) for name in names]
     expected[np.ix_(indices, indices)] = np.array(rows).reshape(len(names), len(names))
+    assert camera.covariance is not None
     np.testing.assert_allclose(camera.covariance, expected)
 
 
