@@ -467,23 +467,18 @@ def _block(**changes: Any) -> dict[str, Any]:
         ({"sigma": {"fx": -1.0}}, ("legcal_camera.sigma.fx",)),
         ({"names": ["fx", "f"]}, ("legcal_camera", "found f,")),
         ({"covariance": [[4.0, "x"], [0.0, 1.0]]}, ("covariance", "a number")),
-        *(
-            (changed, ("legcal_camera.covariance", "no covariance"))
-            for changed in (
-                {"names": ["fx", "fx"]},
-                {"names": None},
-                {"covariance": None},
-                {"covariance": [[4.0, 0.0]]},
-                {"covariance": [[4.0], [0.0, 1.0]]},
-                {"covariance": [[4.0, 0.1], [0.2, 1.0]]},
-                {"covariance": [[4.0, 3.0], [3.0, 1.0]]},
-                {"covariance": [[1e-20, 1e300], [1e300, 1e-20]]},
-                {"covariance": [[4.0, 0.1], [0.1, 0.0]]},
-                {"covariance": [[4.0, 0.0], [0.0, -1.0]]},
-                {"covariance": [[4.0, 0.0], [0.0, 1e-30]]},
-                {"sigma": {"fx": 2.1}},
-            )
-        ),
+        ({"names": ["fx", "fx"]}, ("distinct names",)),
+        ({"names": None}, ("no names",)),
+        ({"covariance": None}, ("no covariance",)),
+        ({"covariance": [[4.0, 0.0]]}, ("1 rows that are not 2 of 2",)),
+        ({"covariance": [[4.0], [0.0, 1.0]]}, ("not 2 of 2 numbers",)),
+        ({"covariance": [[4.0, 0.1], [0.2, 1.0]]}, ("not symmetric",)),
+        ({"covariance": [[4.0, 3.0], [3.0, 1.0]]}, ("not positive semidefinite",)),
+        ({"covariance": [[1e-20, 1e300], [1e300, 1e-20]]}, ("not positive semidefinite",)),
+        ({"covariance": [[4.0, 0.1], [0.1, 0.0]]}, ("not positive semidefinite",)),
+        ({"covariance": [[4.0, 0.0], [0.0, -1.0]]}, ("the variance -1 of cx",)),
+        ({"covariance": [[4.0, 0.0], [0.0, 1e-30]]}, ("the variance 1e-30 of cx",)),
+        ({"sigma": {"fx": 2.1}}, ("deviation 2 of fx", "2.1 in sigma")),
     ],
 )  # fmt: skip
 def test_what_is_no_covariance_is_refused_by_name(
@@ -496,6 +491,23 @@ def test_what_is_no_covariance_is_refused_by_name(
         read_camera(path)
     assert [word for word in (path.name, *named) if word not in str(refused.value)] == []
     assert len(refused.value.problems) == 1
+
+
+@pytest.mark.usefixtures("found")
+@pytest.mark.parametrize(("names", "rows"), [(["cx", "fx"], [[4.0, -0.9], [-0.9, 1.0]]), ([], [])])
+def test_a_covariance_written_into_a_camera_file_is_taken(
+    folder: Path, tmp_path: Path, names: list[str], rows: list[list[float]]
+) -> None:
+    """What docs/formats.md says: names and covariance alone; all others are exact."""
+    document, path = yaml.safe_load((folder / "camera.yaml").read_text()), tmp_path / "camera.yaml"
+    document["legcal_camera"] = {"version": 1, "names": names, "covariance": rows}
+    path.write_text(yaml.safe_dump(document))
+    camera = read_camera(path)
+    intrinsics, expected = intrinsic_names(camera), np.zeros((9, 9))
+    indices = [intrinsics.index(name) for name in names]
+    expected[np.ix_(indices, indices)] = np.array(rows).reshape(len(names), len(names))
+    assert camera.covariance is not None
+    np.testing.assert_allclose(camera.covariance, expected)
 
 
 def test_the_picture_shows_where_corners_were_seen_and_replaces_only_itself(

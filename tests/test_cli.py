@@ -66,7 +66,7 @@ def test_calibrate_prints_one_screen_and_all_parameters_with_verbose(
     monkeypatch.setattr(computed, lambda *_, **__: example_run.calibration)
     assert run(monkeypatch, *words) == 0
     screen = capsys.readouterr().out.splitlines()
-    assert len(screen) <= 32
+    assert len(screen) <= 30
     assert screen[0].startswith("Calibrated:")
     assert run(monkeypatch, *words, "--verbose") == 0
     captured = capsys.readouterr()

@@ -204,6 +204,23 @@ def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
     assert svg.read_text() == "mine"
 
 
+@pytest.mark.parametrize("in_page", [True, False])
+@pytest.mark.parametrize("model", ["hexapod", "delta"])
+def test_the_legend_of_a_drawing_is_not_cut(model: str, in_page: bool) -> None:
+    machine = load_mechanism(model)
+    root = etree.fromstring(draw_machine(machine, in_page=in_page).markup())
+    width, height = (float(root.get(side, "nan")) for side in ("width", "height"))
+    texts = list(root.iter("{http://www.w3.org/2000/svg}text"))
+    first = next(k for k, text in enumerate(texts) if str(text.text).startswith("Rings: "))
+    legend = [str(text.text) for text in texts[first:]]
+    letter = 6.2  # width, at least [px]
+    assert max(len(line) for line in legend) * letter < width - 12.0
+    assert max(float(text.get("y", "nan")) for text in texts[first:]) < height - 3.0
+    said = " ".join(legend).replace("\N{NO-BREAK SPACE}", " ")
+    assert f"(base{machine.at_zero}) and R_e (platform)." in said
+    assert all(f"{j} {name}" in said for j, name in enumerate(machine.leg_names, 1))
+
+
 def test_hostile_names_do_nothing_in_a_terminal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

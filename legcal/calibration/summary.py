@@ -483,7 +483,7 @@ def _holdout_lines(found: Holdout) -> list[str]:
     views = ", ".join(f"{name} {rms:.3f}" for name, rms in found.views.items())
     lines = [
         f"Held out: {of}: {found.outlines - found.wrong} of {found.outlines} outlines are "
-        f"{found.rms_px:.3f} px (rms) from where the fit of the others predicts them, "
+        f"{found.rms_px:.3f} px (rms) from their prediction by the others, "
         f"{found.expected_px:.3f} px were expected ({views})."
     ]
     pair = found.platform

@@ -41,7 +41,7 @@ USUAL_UNITS = {False: ("m", "mm", "cm", "in"), True: ("rad", "deg", PULSES)}
 USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 # Fractions of the travel in use: in the stated unit, and in another that is certainly meant
 HARDLY_MOVES, SURELY_MOVES = 0.02, 0.5
-MIN_POSES = 5  # different poses, as the circle of an arm needs: fewer are a check, perhaps close by
+MIN_POSES = 5  # different poses: fewer are a check, perhaps close together
 
 
 def _unit_name(name: object) -> object:

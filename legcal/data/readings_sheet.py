@@ -107,7 +107,7 @@ class ReadingsSheet:
             "table of readings",
             "row",
             headings.columns(),
-            needed=f"one row for each {row_noun}",
+            needed=f"one row for each {row_noun}; write them",
             reshape=headings.reshape,
         )
         self._table.check()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ _STRAIGHT = 1e-9  # bend that counts as straight, relative to the squared size
 _EDGE, _HEAD, _LINE = 46.0, 44.0, 15.0  # margin, title, text line [px]
 _ARM = 34.0  # length of the axis of a frame [px]
 _APART = 15.0  # smallest distance of the names of marks [px]
+_LETTER = 6.6  # width of a letter of the legend [px], at most on average
 _MARK = b"<!-- legcal inspect -->"
 
 
@@ -151,7 +153,8 @@ def draw_machine(
     heights = [2.0 * _EDGE + scale * float((high - low)[axes[1]]) for _, axes in views]
     width = side if in_page else side * len(views)
     foot = _HEAD + (sum(heights) if in_page else max(heights))
-    height = foot + _LINE * (2 + (machine.n_legs + 3) // 4)
+    legend = _legend(machine, width)
+    height = foot + _LINE * (1 + len(legend))
     canvas = Canvas(width, height, f"{machine.name} {title}")
     canvas.box(0.0, 0.0, width, height, "white")
     canvas.text(12.0, 20.0, canvas.title, size=15)
@@ -185,7 +188,11 @@ def draw_machine(
             tips = np.vstack([np.zeros(3), _ARM / scale * np.eye(3)])
             _frame(canvas, name, on_paper(T.apply(tips)))
         _draw_marks(canvas, [(m, on_paper(m.points)) for m in marks if is_plan or not m.only_plan])
-    _legend(canvas, machine, scale, foot)
+    step = _round_length(100.0 / scale)
+    canvas.line(12.0, foot, 12.0 + step * scale, foot, BASE_COLOUR, 2.0)
+    canvas.text(18.0 + step * scale, foot + 4.0, f"{1e3 * step:g} mm")
+    for k, text in enumerate(legend, 1):
+        canvas.text(12.0, foot + _LINE * k + 7.0, text)
     if not in_page:
         canvas.parts.insert(0, _MARK.decode())
     return canvas
@@ -250,19 +257,14 @@ def _frame(canvas: Canvas, name: str, points: Array) -> None:
         canvas.text(x, y - 2.0, letter, colour=colour, anchor="middle", size=11)
 
 
-def _legend(canvas: Canvas, machine: Machine, scale: float, y: float) -> None:
-    """Draw a scale bar, and write the numbers of the legs."""
-    step = _round_length(100.0 / scale)
-    canvas.line(12.0, y, 12.0 + step * scale, y, BASE_COLOUR, 2.0)
-    canvas.text(18.0 + step * scale, y + 4.0, f"{1e3 * step:g} mm")
+def _legend(machine: Machine, width: float) -> list[str]:
+    """Return the lines of the legend, which a drawing of this width holds: rings, and legs."""
     frame = ", ".join(str(j + 1) for j in machine.frame_legs)
-    y += _LINE
     rings = f"legs {frame} define R_b (base{machine.at_zero}) and R_e (platform)."
-    canvas.text(12.0, y + 6.0, f"Rings: the joints of {rings}")
-    for k in range(0, machine.n_legs, 4):
-        y += _LINE
-        names = [f"{j + 1} {machine.leg_names[j]}" for j in range(k, min(k + 4, machine.n_legs))]
-        canvas.text(12.0, y + 8.0, ",  ".join(names))
+    legs = [f"{j}\N{NO-BREAK SPACE}{name}" for j, name in enumerate(machine.leg_names, 1)]
+    most = int((width - 24.0) / _LETTER)
+    return [line for text in (f"Rings: the joints of {rings}", ",  ".join(legs))
+            for line in wrap(text, most)]  # fmt: skip
 
 
 def _round_length(length: float) -> float:

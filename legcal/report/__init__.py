@@ -1,5 +1,5 @@
 """Results of the jobs as text and as pages.
 
 Results of :mod:`legcal.calibration` or their documents become reports of tables and lines
-(``render``), which a terminal and a page (``page.text_page``) show, or a page of their own.
+(``render``), which a terminal and a page (``render.text_page``) show, or a page of their own.
 """

@@ -219,7 +219,7 @@ def _hidden(views: Iterable[dict[str, Any]], n_images: int) -> str:
     legs = ", ".join(f"{name} in {n}" for name, n in rarely_shown.items())
     return (
         f"Few of the {n_images} images show these legs: {legs}. Other parts or a board hide them, "
-        "or they are outside; use other or more --views, or a smaller board."
+        "or they are outside; use other or more cameras, or a smaller board."
     )
 
 

@@ -34,7 +34,7 @@ def _in_metres(side: float) -> float:
     least, most = SIDES
     if not least <= side <= most:
         raise ValueError(
-            f"found {side:g} m, needed {least:g} to {most:g} m; write metres, 0.03 for 30 mm."
+            f"found {side:g} m, needed {least:g} to {most:g} m; correct the unit, 30 mm are 0.03 m."
         )
     return side
 

@@ -104,7 +104,7 @@ class CalibratedEntry(_OpenSchema):
     """The uncertainty of the intrinsics, added by legcal to a camera that it calibrated."""
 
     version: Literal[1]
-    sigma: dict[str, Sigma]
+    sigma: dict[str, Sigma] = Field(default_factory=dict)
     names: list[str] | None = None  # of the rows of the covariance
     covariance: list[list[float]] | None = None
     photographs: PhotographsEntry = Field(default_factory=PhotographsEntry)
@@ -353,39 +353,48 @@ def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | N
     if entry.names is None and entry.covariance is None:
         return None
     rows = entry.covariance or []
-    is_square = [len(row) for row in rows] == len(names) * [len(names)]
-    are_distinct = bool(names) and len(set(names)) == len(names)
-    C = np.array(rows if is_square and are_distinct else np.zeros((0, 0)))
-    if not len(C) or not _is_covariance(C, names, entry.sigma):
+    problem = _covariance_problem(rows, names, entry.sigma)
+    if entry.names is None or entry.covariance is None:
+        problem = f"no {'names' if entry.names is None else 'covariance'}"
+    if problem:
         raise DatasetError(
-            f"{path}: {CALIBRATED}.covariance could not be used: found numbers that are no "
-            f"covariance of {', '.join(names) or 'any names'} with the stated standard deviations, "
-            "needed the block as legcal camera writes it; calibrate the camera again."
+            f"{path}: {CALIBRATED}.covariance could not be used: found {problem}, needed names and "
+            "their covariance; calibrate the camera again, or correct the block."
         )
+    C = np.array(rows).reshape(len(names), len(names))
     indices = [intrinsics.index(name) for name in names]
     covariance = np.zeros((len(intrinsics), len(intrinsics)))
     covariance[np.ix_(indices, indices)] = 0.5 * (C + C.T)
     return covariance
 
 
-def _is_covariance(C: Array, names: Sequence[str], sigma: Mapping[str, float]) -> bool:
-    """Return whether a matrix is a covariance with plausible standard deviations, stated or not."""
-    variance, (least, most) = np.diagonal(C), _SIGMAS
+def _covariance_problem(
+    rows: Sequence[Sequence[float]], names: Sequence[str], sigma: Mapping[str, float]
+) -> str:
+    """Return why rows are no covariance with plausible, or stated, deviations; "" if they are."""
+    n, (least, most) = len(names), _SIGMAS
+    if len(set(names)) < n or [len(row) for row in rows] != n * [n]:
+        return f"{len(rows)} rows that are not {n} of {n} numbers for distinct names"
+    C = np.array(rows).reshape(n, n)
+    variance = np.diagonal(C)
     is_exact = variance == 0.0
-    if not np.all(np.isfinite(C)) or not np.all(is_exact | (variance >= least**2)):
-        return False
+    implausible = ~is_exact & ~((variance >= least**2) & (variance <= most**2))
+    if implausible.any():
+        i = int(np.argmax(implausible))
+        return f"the variance {variance[i]:g} of {names[i]}, no square of {least:g} to {most:g}"
     deviation = np.sqrt(variance)
-    if np.any(np.abs(C) > (1.0 + _ROUNDING) * np.outer(deviation, deviation)):
-        return False
+    bound = (1.0 + _ROUNDING) * np.outer(deviation, deviation)
     scale = np.where(is_exact, 1.0, deviation)
-    correlation = C / np.outer(scale, scale)
-    stated = np.array([sigma.get(name, s) for name, s in zip(names, deviation, strict=True)])
-    return bool(
-        np.all(deviation <= most)
-        and np.abs(correlation - correlation.T).max(initial=0.0) <= _ROUNDING
-        and np.linalg.eigvalsh(correlation).min(initial=0.0) >= -_ROUNDING
-        and np.all(np.abs(stated - deviation) <= _SIGMA_DIGITS * deviation)
-    )
+    correlation = np.clip(C, -2.0 * bound, 2.0 * bound) / np.outer(scale, scale)
+    if np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
+        return "a matrix that is not symmetric"
+    least_eigenvalue = float(np.linalg.eigvalsh(correlation).min(initial=0.0))
+    if np.any(np.abs(C) > bound) or least_eigenvalue < -_ROUNDING:
+        return "a matrix that is not positive semidefinite"
+    for name, s in zip(names, deviation.tolist(), strict=True):
+        if abs(sigma.get(name, s) - s) > _SIGMA_DIGITS * s:
+            return f"the standard deviation {s:g} of {name}, unlike {sigma[name]:g} in sigma"
+    return ""
 
 
 def _from_message(document: Mapping[str, Any], path: Path) -> Camera:
@@ -497,9 +506,6 @@ def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
         raise DatasetError(
             f"{path}: K could not be read: found no such key, needed it; add 'K: ...' to the file."
         )
-    by_rows = np.array(
-        entry.K if entry.K is not None else np.transpose(entry.IntrinsicMatrix or [])
-    )
     K = by_rows - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     height, width = entry.ImageSize
     k1, k2, *k3 = entry.RadialDistortion
