@@ -1,5 +1,6 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
+from legcal.calibration.identify.session import REACHED, recorded_session
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
+from legcal.data.image_choice import dataset_at
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
@@ -167,6 +170,15 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
     path.write_text(SHIPPED_YAML.read_text().replace("../urdf/hexapod.urdf", str(SHIPPED_URDF)))
     motors = [f"leg{j}_prismatic" for j in range(1, n_motors + 1)]
     return load_mechanism(without_motors(path, *motors))
+
+
+def test_poses_in_place_of_those_that_readings_do_not_give_differ(tmp_path: Path) -> None:
+    few = dataset_at(legcal.load_dataset(ROOT / "examples/hexapod"), np.arange(4))
+    session = recorded_session(replace(few, machine=by_hand(3, tmp_path)))
+    t = session.t_reached
+    assert len(t) == REACHED
+    apart = np.linalg.norm(t[:, None] - t, axis=2)[np.triu_indices(REACHED, 1)]
+    assert apart.min() > 1e-4
 
 
 @pytest.mark.parametrize(

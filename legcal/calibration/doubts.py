@@ -40,7 +40,7 @@ from legcal.calibration.joint_fit.scale import (
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.session_changes import OF_MOTORS, Finding, SessionTests
-from legcal.calibration.tuning import DOUBT_BY_CHANCE
+from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import few, few_views
@@ -379,8 +379,8 @@ class _Evidence:
         by_change = nominal / tolerance**2 / information
         excess, sigma = float(by_change @ self.change[at]), 1.0 / np.sqrt(information)
         beyond = (self.change[at] - excess * nominal) / np.hypot(tolerance, self.sigma[at])
-        n, level = len(at) - 1, -float(ndtri(0.5 * DOUBT_BY_CHANCE))
-        part = np.sqrt(np.sum(beyond**2) / n) * -float(stdtrit(n, 0.5 * DOUBT_BY_CHANCE)) / level
+        n, level = len(at) - 1, -float(ndtri(0.5 * SCALE_BY_CHANCE))
+        part = np.sqrt(np.sum(beyond**2) / n) * -float(stdtrit(n, 0.5 * SCALE_BY_CHANCE)) / level
         sigma *= max(float(part), 1.0 if self.dataset.machine.tolerance != NOT_STATED else 0.0)
         names, of_problem = list(self.nominal), self.problem.legs.parametrization.names
         by_parameter = np.zeros(len(of_problem))

@@ -57,6 +57,6 @@ HARMLESS = 0.01
 
 # Doubts in a result
 
-# Probability with which each kind of test doubts a healthy session by chance, all that it asks
-# together: of about ten kinds one session in a thousand.
-DOUBT_BY_CHANCE = 1e-4
+# Probability with which a kind of test doubts a healthy session by chance, all that it asks
+# together: scans over moments and motors, witnesses of the scale, scatter of views and legs.
+DOUBT_BY_CHANCE, SCALE_BY_CHANCE, SCATTER_BY_CHANCE = 1e-4, 0.0027, 1e-3

@@ -401,8 +401,10 @@ def recorded_session(
     parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
-        more = random_postures(machine, legs, REACHED - len(t))
-        R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
+        n_drawn = 0 if machine.is_determined else len(t)  # the same poses are drawn first
+        R_more, t_more = random_postures(machine, legs, REACHED - len(t) + n_drawn)
+        R_reached = np.concatenate([R, R_more[n_drawn:]])
+        t_reached = np.concatenate([t, t_more[n_drawn:]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(

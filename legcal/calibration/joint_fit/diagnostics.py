@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
-from legcal.calibration.tuning import DOUBT_BY_CHANCE
+from legcal.calibration.tuning import SCATTER_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
@@ -359,7 +359,7 @@ class Scatter:
         """Return whether outlines scatter more than one of so many groups does by chance."""
         squares = self.squares[self.used & of]
         chance = float(chdtrc(2.0 * len(squares), 2.0 * squares.sum())) if len(squares) else 1.0
-        return n_groups * chance < DOUBT_BY_CHANCE
+        return n_groups * chance < SCATTER_BY_CHANCE
 
 
 def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_o
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
-from legcal.calibration.tuning import DOUBT_BY_CHANCE
+from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
@@ -219,7 +219,7 @@ class ScaleComparison:
     def disagreements(self) -> list[Disagreement]:
         """The pairs that differ by more than all of them do by chance, the surest first."""
         found, pairs = list[Disagreement](), list(combinations(range(len(self.size)), 2))
-        most = -float(ndtri(0.5 * DOUBT_BY_CHANCE / len(pairs)))
+        most = -float(ndtri(0.5 * SCALE_BY_CHANCE / len(pairs)))
         for i, j in pairs:
             apart, variance = self.size[i] - self.size[j], self._contrasts([i, j])[1][0, 0]
             sigmas = float(abs(apart) / np.sqrt(variance)) if variance > 0.0 else 0.0
