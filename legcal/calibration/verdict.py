@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from legcal.calibration.clicks import click_notes
@@ -31,7 +32,7 @@ from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session
 from legcal.data.corners import Corners
 from legcal.data.dataset import PLAN_NAME, POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
-from legcal.data.measurements import few
+from legcal.data.measurements import few, few_views
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
@@ -41,6 +42,8 @@ from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
+MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
+_ALONG = 9  # points along an outline
 _ROUNDED = 0.51e-4  # [mm or deg] of the commands there
 AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
@@ -115,6 +118,7 @@ def judge(
         verdict,
         (
             *notes,
+            *_beyond_boards(dataset, solution),
             *click_notes(dataset, solution),
             *commanded(dataset),
             *_asked_lengths(dataset, solution, doubts),
@@ -133,6 +137,29 @@ def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
     return [
         f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
         for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
+    ]
+
+
+def _beyond_boards(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on views whose outlines leave the part of the image that boards covered."""
+    outlines, measurements = solution.outlines, dataset.measurements
+    view, along = measurements.view[outlines.row], np.linspace(0.0, 1.0, _ALONG)[:, None, None]
+    points = outlines.ends[:, 0] + along * (outlines.ends[:, 1] - outlines.ends[:, 0])
+    outside = dict[str, float]()
+    for v in np.unique(view[outlines.used]).tolist():
+        covered = measurements.views[v].camera.covered.astype(np.float32)
+        if len(covered):
+            pixels = points[:, (view == v) & outlines.used].reshape(-1, 2).tolist()
+            is_out = [cv2.pointPolygonTest(covered, pixel, False) < 0.0 for pixel in pixels]
+            outside[measurements.views[v].name] = float(np.mean(is_out))
+    far = [name for name, share in outside.items() if share > MAX_BEYOND]
+    if not far:
+        return []
+    share = 100.0 * max(outside[name] for name in far)
+    return [
+        f"Up to {share:.0f} % of the outlines of {few_views(far)} lie where the calibration of the "
+        "camera has seen no board: the lens is extrapolated there, beyond what its covariance "
+        "says; photograph the board there too, and calibrate the camera again."
     ]
 
 
