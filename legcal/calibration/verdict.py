@@ -24,7 +24,7 @@ from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
-from legcal.calibration.joint_fit.scale import SCALE
+from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
@@ -90,8 +90,9 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
         change, sigma, found = _change_of_platform(platform)
-        if by_scale := _share_of_scale(platform):
-            found += f"; {by_scale}"
+        by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
+        found += "".join(f"; {clause}" for clause in (by_radii, by_readings) if clause)
+        if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
@@ -230,6 +231,20 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
     return (
         f"the largest part of that is the scale of the machine ({1e3 * parts[0]:.3f} of "
         f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
+    )
+
+
+def _error_of_readings(platform: PlatformAccuracy, solution: Solution) -> str:
+    """Return a clause on what all readings may be wrong by, where that is more than the rest."""
+    predicted = (platform.workspace or platform.sigma).mean_displacement
+    parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
+    if not parts or parts[0].mean_displacement <= predicted:
+        return ""
+    witnesses = scale_witnesses(solution.posterior.problem)
+    rests = f"{witnesses[0]} alone" if len(witnesses) == 1 else few(witnesses)
+    return (
+        f"the scale rests on {rests}, and an error that all readings share, as of screws or belts, "
+        f"may add {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)} (1 sigma)"
     )
 
 
