@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.descriptions.new_model import Dimensions, create_model, description_of, write_template
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
-from legcal.machine.family import Dimensions, description_of, write_template
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
