@@ -23,6 +23,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from machine_kinds import measured_length
@@ -134,10 +135,11 @@ def with_moved_joint(
             middle = B.mean(axis=0)
             return np.asarray(Rotation.from_rotvec(x[:3]).apply(B - middle) + middle + x[3:])
 
+        def error(x: Array, k: int = k, lengths: Array = lengths, at: Any = platform) -> Array:
+            return np.asarray(np.linalg.norm(at(x) - A[k], axis=1) - lengths)
+
         found = least_squares(
-            lambda x, k=k, lengths=lengths, platform=platform: (
-                np.linalg.norm(platform(x) - A[k], axis=1) - lengths
-            ),
+            error,
             np.zeros(6),
             xtol=1e-14,
             ftol=1e-14,
@@ -198,7 +200,7 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
         if kind == "lamp":
             return relit(dataset, changed, size, rng.uniform(0.0, 2.0 * np.pi))
         return with_rays(dataset, changed, turned(size) if kind == "camera" else zoomed(size))
-    turn = np.array([2.0 * np.pi if leg.reads_angle else SCREW_PITCH for leg in machine.legs])
+    of_turn = [2.0 * np.pi if leg.reads_angle else SCREW_PITCH for leg in machine.legs]
     phase = rng.uniform(0.0, 2.0 * np.pi)
     scatter = rng.normal(size=(n, len(machine.motors)))
     of_motor = {motor: scatter[:, i] for i, motor in enumerate(machine.motors)}
@@ -211,7 +213,9 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
         "commands": lambda: (
             size * of_leg * np.column_stack([of_motor.get(i, np.zeros(n)) for i in machine.reads])
         ),
-        "eccentricity": lambda: size * is_motor * of_leg * np.sin(2.0 * np.pi * m.q / turn + phase),
+        "eccentricity": lambda: (
+            size * is_motor * of_leg * np.sin(2.0 * np.pi * m.q / of_turn + phase)
+        ),
         PITCH: lambda: size * m.q,
     }
     return replace(dataset, measurements=replace(m, q=m.q + changes[kind]()))

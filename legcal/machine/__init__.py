@@ -7,4 +7,5 @@ joints (:class:`JointType`). :class:`Parametrization` maps the numbers to the pa
 names, units and gauge. :func:`pose_equations` has derivatives by pose and by parameters, and is
 compared with Pinocchio whenever a machine is loaded. Poses and closed chains have one solver
 (:func:`solve_poses`, :func:`forward_kinematics_many`), random configurations one sampler
-(:func:`random_configurations`). Calibrated models are written as patches of the files read. """
+(:func:`random_configurations`). Calibrated models are written as patches of the files read.
+"""
