@@ -14,8 +14,8 @@ from legcal.geometry.motions import components, look_at
 from legcal.machine.configurations import random_configurations
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
-from legcal.machine.occluders import PlacedOccluders
 from legcal.machine.parameters import geometries
+from legcal.machine.shapes import PlacedOccluders
 from legcal.simulation.solids import PosedMachine, pose_machine, solids_of
 from legcal.simulation.visibility import legs_in_image
 from legcal.vision.camera import sample_camera

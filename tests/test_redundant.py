@@ -26,7 +26,7 @@ from legcal.data.image_choice import image_sequences
 from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.closing import solve_poses
+from legcal.machine.closing import generic_configurations, solve_poses
 from legcal.machine.configurations import feasible_poses, random_configurations
 from legcal.machine.kinematics import (
     Follower,
@@ -35,7 +35,6 @@ from legcal.machine.kinematics import (
     platform_in_base,
 )
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import generic_configurations
 from legcal.machine.model import Machine, slider_columns
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import reading_residuals

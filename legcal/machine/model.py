@@ -24,7 +24,6 @@ from legcal.machine.leg import (
     with_platform_points,
     with_radii,
 )
-from legcal.machine.occluders import Occluder, reordered
 from legcal.machine.rods import (
     AT_ZERO,
     actuator_index,
@@ -35,6 +34,7 @@ from legcal.machine.rods import (
     reading_legs,
     readings_of_rods,
 )
+from legcal.machine.shapes import Occluder, reordered
 from legcal.machine.tolerance import NOT_STATED, Tolerance
 from legcal.machine.urdf import Urdf
 

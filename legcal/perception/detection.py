@@ -9,7 +9,7 @@ import numpy as np
 from legcal.data.outlines import Outlines, join_outlines, no_outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array
-from legcal.machine.occluders import PlacedOccluders
+from legcal.machine.shapes import PlacedOccluders
 from legcal.perception.outline import (
     ImageSearch,
     Method,
