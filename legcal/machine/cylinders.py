@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -352,13 +353,27 @@ def _round_part(
     mesh = visual.find("geometry/mesh")
     if mesh is None or mesh_file(urdf_path, mesh.get("filename", "")) is None:
         return None
+    T_link_body = matrix_inverse(T_body_link)
+    line = np.round([matrix_applied(T_link_body, axis.origin), T_link_body[:3, :3] @ axis.along], 9)
+    ends = round(axis.start, 9), round(axis.end, 9)
+    return _cut(urdf_path, etree.tostring(visual, with_tail=False), (line + 0.0).tobytes(), ends)
+
+
+@lru_cache(maxsize=256)  # equal legs have equal meshes, and a model is read more than once
+def _cut(
+    urdf_path: Path, visual: bytes, line: bytes, ends: tuple[float, float]
+) -> tuple[float, float, float] | None:
+    """Return radius, start and end [m] of a cylinder of a mesh about a line in its link, or None.
+
+    The line is its origin and its unit vector, (2, 3).
+    """
+    origin, along = np.frombuffer(line).reshape(2, 3)
     try:
-        corners, triangles = read_mesh(urdf_path, visual)
+        corners, triangles = read_mesh(urdf_path, etree.fromstring(visual))
     except ValueError:  # pictures state the reason
         return None
-    corners = matrix_applied(T_body_link, corners) - axis.origin
-    across = rotation_between(axis.along, np.array([0.0, 0.0, 1.0])).as_matrix()
-    return cylinder_about_z(corners @ across.T, triangles, axis.start, axis.end)
+    across = rotation_between(along, np.array([0.0, 0.0, 1.0])).as_matrix()
+    return cylinder_about_z((corners - origin) @ across.T, triangles, *ends)
 
 
 def cylinder_about_z(
