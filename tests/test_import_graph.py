@@ -39,7 +39,6 @@ PUBLIC: dict[str, set[str]] = {
         "classification",
         "configurations",
         "cylinders",
-        "diagnostics",
         "equations",
         "files",
         "home",

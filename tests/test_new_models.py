@@ -290,6 +290,15 @@ def test_an_unknown_column_of_a_table_of_joints_is_refused(tmp_path: Path) -> No
         read_table(path, "mm")
 
 
+def test_cells_of_a_table_of_joints_are_refused_on_their_own_lines(tmp_path: Path) -> None:
+    path = tmp_path / "joints.csv"
+    path.write_text("point,x,y\nB1,1,2\nB2,a,2\nP1,4\nB1,4,5\nQQ,4,5\n")
+    with pytest.raises(ModelError) as refused:
+        read_table(path, "mm")
+    facts = [(problem.line, problem.found) for problem in refused.value.facts]
+    assert facts == [(3, "'a'"), (4, "2 cells"), (5, "'B1' twice"), (6, "'QQ'")]
+
+
 def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:
     path = write_table(tmp_path, unit=None)
     assert read_table(path, "mm").legs[0].offset == 0.38

@@ -48,7 +48,7 @@ from legcal.descriptions.description import (
     legs_in_words,
     look_like_base,
 )
-from legcal.errors import BadValue, Code, DatasetError, ModelError
+from legcal.errors import BadValue, Code, DatasetError, ModelError, Problem
 from legcal.files.motions import Quaternion, Vector
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
@@ -1122,39 +1122,41 @@ def _from_points(lines: Lines, keys: Sequence[str], path: Path) -> Lines:
                     Code.UNKNOWN_COLUMN,
                 )
             )
-    named = []
-    for _, cells in lines[1:]:
+    problems, named = list[Problem](), list[tuple[int, int, str, str, str, list[str]]]()
+
+    def refuse(row: int, line: int, found: str, needed: str, *columns: str) -> None:
+        what = "the joint could not be used"
+        problems.append(Problem(what, found, needed, "correct it", str(path), row, line, columns))
+
+    for row, (line, cells) in enumerate(lines[1:], start=1):
         if len(cells) != len(header):
-            raise DatasetError(
-                f"{path}: the joints could not be read: found a row of {len(cells)} cells, needed "
-                f"{len(header)} as in the header; complete it."
-            )
+            refuse(row, line, f"{len(cells)} cells", f"{len(header)} as in the header")
+            continue
         words = [cells[i] for i in of_name[:2]]
         spelt = [
             "".join(split_heading(word)[0] for word in order) for order in (words, words[::-1])
         ]
-        matches = [match for text in spelt if (match := _NAMED.fullmatch(text))]
-        named.append((" ".join(words), cells, matches[0] if matches else None))
-    wrong = [name for name, _, match in named if match is None]
-    if wrong:
-        stated = describe(wrong[0]) if wrong[0].strip() else "no name"
-        raise DatasetError(
-            f"{path}: the joints could not be read: found {stated} in a "
-            "table with a row for each joint, needed names of side and number such as B1 and P1, "
-            "or base1 and platform1; correct it."
-        )
-    sides = _sides(match[1] for *_, match in named if match)
-    joints: dict[int, dict[str, str]] = {}
-    for name, cells, match in named:
+        match = next((match for text in spelt if (match := _NAMED.fullmatch(text))), None)
+        stated = describe(" ".join(words)) if "".join(words) else "no name"
         if match is None:
+            needed = "a name of side and number such as B1 and P1, or base1 and platform1"
+            refuse(row, line, stated, needed, *(header[i] for i in of_name[:2]))
             continue
-        leg = joints.setdefault(int(match[2]), {})
         for axis, i in axes.items():
-            if leg.setdefault(f"{sides[match[1]]}_{axis}", cells[i]) is not cells[i]:
-                raise DatasetError(
-                    f"{path}: the joints could not be read: found {describe(name)} twice, "
-                    "needed each joint once; correct it."
-                )
+            if not is_number(cells[i]) and (cells[i] or axis != "z"):
+                found = describe(cells[i]) if cells[i] else "an empty cell"
+                refuse(row, line, found, f"a number below {MAX_NUMBER:g}", header[i])
+        named.append((row, line, stated, match[1], match[2], cells))
+    sides = _sides(side for _, _, _, side, *_ in named)
+    joints: dict[int, dict[str, str]] = {}
+    for row, line, stated, side, leg, cells in named:
+        of_leg = joints.setdefault(int(leg), {})
+        if f"{sides[side]}_x" in of_leg:
+            refuse(row, line, f"{stated} twice", "each joint once")
+        of_leg |= {f"{sides[side]}_{axis}": cells[i] for axis, i in axes.items()}
+    if problems:
+        problems.sort(key=lambda problem: problem.line or 0)
+        raise DatasetError(problems)
     return _rows(joints, {}, (number, lines[1][0]))
 
 
