@@ -41,8 +41,7 @@ from legcal.perception.board_poses import camera_poses_by_board, plane_poses
 from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
 from legcal.simulation.board import INK, BoardPrint
-from legcal.vision.board import Board, charuco_board
-from legcal.vision.board_file import board_document, board_of, parse_board
+from legcal.vision.board import Board, board_document, board_of, charuco_board, parse_board
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey, reduced, rescaled
 from legcal.workers import in_turn

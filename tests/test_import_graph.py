@@ -67,16 +67,12 @@ PUBLIC: dict[str, set[str]] = {
     },
     "vision": {
         "board",
-        "board_file",
         "camera",
-        "camera_export",
         "camera_file",
         "cylinder",
         "distortion",
-        "image_facts",
         "image_file",
         "point_pose",
-        "sight",
         "visibility",
     },
     "data": {

@@ -20,7 +20,7 @@ from legcal.perception.board_corners import find_corners
 from legcal.perception.board_poses import camera_poses_by_board
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, SimulationSettings
-from legcal.vision.board_file import parse_board
+from legcal.vision.board import parse_board
 
 
 @cache
