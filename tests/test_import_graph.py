@@ -106,7 +106,6 @@ PUBLIC: dict[str, set[str]] = {
         "agreement",
         "board_adjustment",
         "board_corners",
-        "board_poses",
         "camera_search",
         "candidate_pairs",
         "diagnostics",

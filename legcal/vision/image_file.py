@@ -541,3 +541,13 @@ def rescaled(image: NDArray[_Level], scale: float) -> NDArray[_Level]:
 def reduced(px: Array, scale: float) -> Array:
     """Return the coordinates in the image of pixels of a rescaled image; centres are integers."""
     return np.asarray((px + 0.5) / scale - 0.5)
+
+
+def shrink(grey: Grey, factor: int) -> Grey:
+    """Return an image made smaller by a whole factor, each pixel the mean of a square."""
+    if factor == 1:
+        return grey
+    height, width = (factor * (size // factor) for size in grey.shape)
+    size = (width // factor, height // factor)
+    small = cv2.resize(grey[:height, :width], size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.float32)
