@@ -1383,7 +1383,7 @@ def _described() -> Iterable[Refusal]:
         ("plane-home", planar | {"home": turned, "offsets": 50}, ("home",)),
     ]  # fmt: skip
     for name, changed, named in changes:
-        edits = (text("table.yaml", yaml.safe_dump(_without_none(TRIPOD | changed))),)
+        edits = (text("table.yaml", json.dumps(_without_none(TRIPOD | changed))),)
         yield Refusal(f"tripod-{name}", command, ("{in}/table.yaml", *named), "", edits)
     arms: dict[str, Any] = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
     below = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
@@ -1421,7 +1421,7 @@ def _described() -> Iterable[Refusal]:
         ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
     ]  # fmt: skip
     for name, changed, named in of_motors:
-        edits = (text("table.yaml", yaml.safe_dump(_without_none(arms | changed))),)
+        edits = (text("table.yaml", json.dumps(_without_none(arms | changed))),)
         yield Refusal(f"arms-{name}", command, named, "", edits)
 
 

@@ -130,6 +130,7 @@ def test_a_reading_out_of_reach_is_named(tmp_path: Path) -> None:
     assert len(refused.value.problems) == 1
 
 
+@pytest.mark.usefixtures("without_remedies")
 def test_a_3_upu_near_its_constraint_singularity_is_refused_and_at_it_is_named(
     tmp_path: Path,
 ) -> None:
