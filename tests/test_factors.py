@@ -209,7 +209,7 @@ def test_corners_are_where_the_camera_projects_them() -> None:
             *("tricept", "delta", "3-prs", "delta-round-arms"),
         ],
         ["nategh-agheli", "tricept", "3-prs"],
-        "system",
+        system=["hexapod", "hexapod-rod", "delta-round-arms"],
     ),
 )
 def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> None:
