@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -130,7 +130,7 @@ class GuidedSession:
         self.exposures: dict[str, Exposure] = {}
         self.facts: dict[str, ImageFacts] = {}
         self.notes: list[str] = []  # on photographs that are there
-        self.skipped: set[str] = set()  # images of the plan to leave out
+        self.skipped: set[tuple[str, str]] = set()  # views and poses of the plan to leave out
         entry = read_dataset_file(self.dataset.yaml_path)
         legs = self.machine.legs
         self._units: dict[str, ReadingUnit] = reading_units(
@@ -162,11 +162,11 @@ class GuidedSession:
                 path, self.folder, m.views, self.machine.legs, m.sigma_q, m.sigma_by_joint,
                 self._units,
             )  # fmt: skip
-        done = {_stem(cells["image"]) for cells in self._cells}
+        done = {_label(cells) for cells in self._cells}
         self._left = [
             (cells, planned.q[k])
             for k, cells in enumerate(self._planned)
-            if cells["image"] and _stem(cells["image"]) not in done
+            if cells["image"] and _label(cells) not in done
         ]
         self._vias = {}
         if (self.folder / POSES_NAME).is_file():
@@ -193,9 +193,9 @@ class GuidedSession:
         if left := self._to_take:
             cells, q = left[0]
             image = cells["image"]
-            pose = cells.get("pose") or PurePosixPath(image).stem
-            via = self._vias.get(image, "")
-            return Asked(cells["view"], pose, q, self._settings(q), via, True, _stem(image), cells)
+            pose, via = _label(cells)[1], self._vias.get(image, "")
+            stem = str(PurePosixPath(image).with_suffix(""))
+            return Asked(cells["view"], pose, q, self._settings(q), via, True, stem, cells)
         return self._best()
 
     @property
@@ -208,7 +208,7 @@ class GuidedSession:
 
     @property
     def _to_take(self) -> list[tuple[dict[str, str], Array]]:
-        return [(cells, q) for cells, q in self._left if _stem(cells["image"]) not in self.skipped]
+        return [(cells, q) for cells, q in self._left if _label(cells) not in self.skipped]
 
     @property
     def n_planned(self) -> int:
@@ -554,5 +554,6 @@ def _cells(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     return [name.strip() for name in table.fieldnames or ()], rows
 
 
-def _stem(image: str) -> str:
-    return str(PurePosixPath(image).with_suffix(""))
+def _label(cells: Mapping[str, str]) -> tuple[str, str]:
+    """Return view and pose of a row, which name its photograph."""
+    return cells["view"], cells.get("pose") or PurePosixPath(cells["image"]).stem

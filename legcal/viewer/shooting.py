@@ -87,7 +87,7 @@ class Dialogue:
         if word == "keep" and self._refused is not None:
             self._take(asked, *self._refused)
         elif word == "skip":
-            self.session.skipped.add(asked.image)
+            self.session.skipped.add((asked.view, asked.pose))
             self._ask()
         elif word == "undo":
             image = self.session.undo()
