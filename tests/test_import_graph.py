@@ -166,7 +166,7 @@ PUBLIC: dict[str, set[str]] = {
         "render",
         "session",
     },
-    "viewer": {"address", "click_server", "shooting", "source", "window"},
+    "viewer": {"address", "click_server", "local_server", "shooting", "source", "window"},
     "cli": set(),
     "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }

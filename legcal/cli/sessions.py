@@ -243,7 +243,12 @@ def shoot(
             "0.05mm.",
         ),
     ] = None,
-    noise: NoiseOption = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Serve the same as a page on this port; 0 for any that is free."
+        ),
+    ] = None,
 ) -> None:
     """Guide a session: name the next pose, check each photograph, and predict the error so far.
 
@@ -251,11 +256,12 @@ def shoot(
     """
     import threading
 
-    from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, read_noise
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning.shooting import GuidedSession
     from legcal.recordings.arrivals import Arrivals, LiveCamera, WatchedFolder
-    from legcal.viewer.shooting import WORDS, Dialogue
+    from legcal.viewer.address import Address, check_address
+    from legcal.viewer.local_server import HOST
+    from legcal.viewer.shooting import WORDS, Dialogue, DialogueServer
 
     if (watch is None) == (camera is None):
         raise UsageError(
@@ -265,7 +271,6 @@ def shoot(
     guided = GuidedSession(
         session,
         target=None if target is None else parse_quantity(target, LENGTH, "--target"),
-        noise=DEFAULT_NOISE if noise is None else read_noise(noise),
     )
     source: Arrivals
     if watch is not None:
@@ -282,6 +287,12 @@ def shoot(
 
     typer.echo(f"Type readings in mm or deg where they differ from those asked; or {WORDS}.")
     threading.Thread(target=listen, daemon=True).start()
+    if port is not None:
+        check_address(Address(HOST, port))
+        server = DialogueServer(dialogue, port)
+        threading.Thread(target=server.run, daemon=True).start()
+        typer.echo(f"The same as a page: {server.address}")
+        open_browser(str(server.address))
     if dialogue.run():
         typer.echo(f"legcal calibrate {shlex.quote(str(session))} -o calibrated")
 
@@ -485,7 +496,7 @@ def detect(
 
     if edit:
         from legcal.viewer.address import Address, check_address
-        from legcal.viewer.click_server import HOST
+        from legcal.viewer.local_server import HOST
 
         check_address(Address(HOST, port))
     examination = job.doctor(

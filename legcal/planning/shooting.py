@@ -21,11 +21,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.detection import detected
+from legcal.calibration.doctor import CLIPPED, FEW_LEGS, SOFT
 from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     Contributions,
-    PredictedNoise,
     Predictor,
 )
 from legcal.calibration.ordered_dataset import order_dataset
@@ -60,10 +60,7 @@ from legcal.vision.image_file import inspect_image, read_image
 from legcal.workers import in_turn
 
 PLANNED_NAME = "planned.csv"  # the rows of the plan, once the first photograph is there
-SOFT = 3.0  # blur of a photograph that is refused [px]
-CLIPPED = 0.1  # share of clipped pixels from which on a note says so
-FEW_LEGS = 0.5  # smallest share of the legs in sight that are found where they are predicted
-SURELY = 0.6  # the same, for photographs that place the camera of their view
+SURELY = 0.6  # share of the legs in sight that are found where photographs place their camera
 N_PLACING = 3  # photographs of a view by which its camera is placed
 N_CANDIDATES = 60  # poses from which the next one is chosen where there is no plan
 
@@ -104,8 +101,6 @@ class GuidedSession:
     target : float, optional
         Predicted error of the platform at which the session is complete [m]; without it, a session
         is complete with its plan.
-    noise : PredictedNoise
-        Errors of outlines that are predicted.
 
     Raises
     ------
@@ -120,10 +115,9 @@ class GuidedSession:
         folder: str | Path,
         *,
         target: float | None = None,
-        noise: PredictedNoise = DEFAULT_NOISE,
     ) -> None:
         self.dataset = load_dataset(folder, check_images=False)
-        self.folder, self.target, self.noise = self.dataset.folder, target, noise
+        self.folder, self.target = self.dataset.folder, target
         self.machine = self.dataset.machine
         self.cameras: dict[str, RigidTransform] = {}  # T_base_camera of placed views
         self.found: dict[str, BoolArray] = {}  # legs found in images, by their names
@@ -137,12 +131,17 @@ class GuidedSession:
             self.dataset.yaml_path, legs, entry.readings
         )
         self._read_tables()
-        if not self._planned and target is None:
+        if not self._left and target is None:
             raise UsageError(
                 f"{self.folder}: no photograph is left to take: found all of the plan, needed a "
                 "predicted error to go on to; give --target 0.05mm, or calibrate the session."
             )
         self._look_at_taken()
+        if target is not None and self._work is None:
+            raise UsageError(
+                "--target could not be used: readings or a camera in the hand do not let the error "
+                "of the platform be predicted; leave it out."
+            )
 
     # The tables
 
@@ -239,7 +238,9 @@ class GuidedSession:
         images = np.arange(first, first + len(pool.poses))
         k = int(np.argmin(criterion(session.with_one_more(slot, images))))
         q = np.where(np.isnan(m.q[0]), np.nan, pool.readings[k])
-        label = next(name for n in range(1, 10**6) if (name := f"n{n:02d}") not in m.pose_labels)
+        used = {_label(cells)[1] for cells in (*self._cells, *self._planned)}
+        labels = (f"n{n:02d}" for n in range(1, 10**6))
+        label = next(name for name in labels if not {name, f"{view}_{name}"} & used)
         before = self._configurations(self.taken[-1:])
         via, _ = ways(self.machine, np.concatenate([before, pool.configurations[[k]]]))
         cells = {"view": view, "pose": label}
@@ -252,19 +253,19 @@ class GuidedSession:
 
     # The check of a photograph
 
-    def check(self, asked: Asked, photograph: Path) -> Checked:
-        """Check a photograph of the pose that was asked; nothing is written."""
+    def check(self, asked: Asked, photograph: Path, q: Array | None = None) -> Checked:
+        """Check a photograph of the pose that was asked, or of readings *q*; nothing is written."""
         m = self.dataset.measurements
-        v = next(k for k, view in enumerate(m.views) if view.name.split("-")[0] == asked.view
-                 or view.name == asked.view)  # fmt: skip
+        names = [view.name for view in m.views]
+        held = f"{asked.view}-1"  # images of a camera in the hand are views: hand-1, hand-2
+        v = names.index(asked.view if asked.view in names else held)
         camera = m.views[v].camera
         facts, problem = inspect_image(photograph, camera)
         if problem is not None:
             return Checked((str(problem),), (), None, facts, None, 0)
         exposure = measure_exposure(read_image(photograph, camera))
         problems = [*self._other_camera(v, facts), *self._defects(v, exposure)]
-        digest = hashlib.sha256(photograph.read_bytes()).digest()
-        if digest in self._digests:
+        if _digest(photograph) in self._digests.values():
             problems.append("It is a photograph that was taken already; take a new one.")
         notes = []
         if exposure.clipped > CLIPPED:
@@ -276,7 +277,9 @@ class GuidedSession:
         if not problems and m.views[v].name in self.cameras:
             one = measurements_at(m, np.zeros(1, dtype=np.intp))
             absolute = str(photograph.absolute())
-            one = replace(one, image=(absolute,), view=np.array([v]), q=asked.q[None])
+            one = replace(
+                one, image=(absolute,), view=np.array([v]), q=(asked.q if q is None else q)[None]
+            )
             legs, n_visible = self._legs_in(replace(self.dataset, measurements=one))
             if legs.sum() < FEW_LEGS * n_visible:
                 problems.append(
@@ -347,6 +350,11 @@ class GuidedSession:
         *q* (n_legs,) are the readings [m or rad] where they differ from the commanded ones. Without
         a photograph, its outlines are given otherwise.
         """
+        if photograph is None and "pose" not in self._header:
+            raise UsageError(
+                "The row could not be written: found neither a photograph nor a column pose, "
+                "needed one to tell rows apart; add the column."
+            )
         image, cells = "", {**asked.cells, "view": asked.view}
         if q is not None or not asked.is_planned:
             cells |= self._readings(asked.q if q is None else q)
@@ -361,7 +369,7 @@ class GuidedSession:
                 self.found[image] = checked.legs
         self._write_tables([*self._cells, cells])
         if photograph is not None:
-            self._digests.add(hashlib.sha256(photograph.read_bytes()).digest())
+            self._digests[image] = _digest(photograph)
             self._place(asked.view)
 
     def undo(self) -> str:
@@ -370,14 +378,15 @@ class GuidedSession:
             return ""
         image = self._cells[-1]["image"]
         self._write_tables(self._cells[:-1])
-        (self.folder / image).unlink(missing_ok=True)
-        self._read_tables()
+        if self._digests.pop(image, None):
+            (self.folder / image).unlink(missing_ok=True)
+            self._read_tables()
         return image
 
     def parsed(self, asked: Asked, text: str) -> Array:
         """Return readings (n_legs,) from numbers in mm or deg, in the order of the settings.
 
-        Raises UsageError if they are no readings of this machine.
+        Raises UsageError or DidNotConverge if they are no readings of this machine.
         """
         legs, motors = self.machine.legs, self.machine.motors
         names = list(dict.fromkeys(str(legs[j].prismatic) for j in motors))
@@ -400,6 +409,8 @@ class GuidedSession:
                     "travel, needed mm or deg as in the settings above; type them again."
                 )
             q[j] = value
+        if self.machine.is_determined:
+            list(follow_each(self.machine, q[None, list(motors)]))
         return q
 
     def _readings(self, q: Array) -> dict[str, str]:
@@ -410,14 +421,9 @@ class GuidedSession:
 
     def _look_at_taken(self) -> None:
         """Look at the photographs that are there."""
-        m, rows = (
-            self.dataset.measurements,
-            [r for r in self.taken if self.dataset.measurements.image[r]],
-        )
-        self._digests = set[bytes]()
-        for row in rows:
-            path = self.folder / m.image[row]
-            self._digests.add(hashlib.sha256(path.read_bytes()).digest())
+        m = self.dataset.measurements
+        rows = [row for row in self.taken if m.image[row]]
+        self._digests = {m.image[row]: _digest(self.folder / m.image[row]) for row in rows}
         if not rows:
             return
         some = dataset_at(self.dataset, np.array(rows))
@@ -484,7 +490,7 @@ class GuidedSession:
         m, board = self.dataset.measurements, self.dataset.board_on("base")
         lengths, _ = measured_length(self.machine, board=board is not None)
         predictor = Predictor(
-            self.machine, m.views[0].camera, self.noise, m.sigma_q, lengths, m.sigma_by_joint
+            self.machine, m.views[0].camera, DEFAULT_NOISE, m.sigma_q, lengths, m.sigma_by_joint
         )
         return Scene.nominal(Task(predictor, 1, 1, default_setting(self.machine.size)))
 
@@ -557,3 +563,7 @@ def _cells(path: Path) -> tuple[list[str], list[dict[str, str]]]:
 def _label(cells: Mapping[str, str]) -> tuple[str, str]:
     """Return view and pose of a row, which name its photograph."""
     return cells["view"], cells.get("pose") or PurePosixPath(cells["image"]).stem
+
+
+def _digest(path: Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import queue
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +10,11 @@ from typing import Any
 from legcal.calibration.quantities import mm_deg
 from legcal.errors import LegcalError, printable
 from legcal.geometry.types import Array
+from legcal.pages.document import Dialogue as DialogueBlock
+from legcal.pages.document import Page, Section, page_html
 from legcal.planning.shooting import Asked, Checked, GuidedSession
 from legcal.recordings.arrivals import Arrivals
+from legcal.viewer.local_server import HTML, LocalServer
 
 WORDS = "keep (take the refused one), skip (leave the pose out), undo (take the last one out), quit"
 PAUSE = 0.5  # between two looks for photographs [s]
@@ -38,6 +40,7 @@ class Dialogue:
         self._before: list[str] = []  # incomplete files of the last look
         self._told: set[str] = set()  # of these, those that were named
         self.asked: Asked | None = None
+        self._shown: dict[str, Any] = {"prompt": [], "known": "", "taken": 0, "of": 1}
 
     def say(self, text: str) -> None:
         """Show a sentence in the terminal and on the page."""
@@ -64,16 +67,27 @@ class Dialogue:
             except LegcalError as error:
                 self.say(str(error))
             self._tell_waiting()
-        self.say(f"The session is complete. {self.known}")
-        return True
+        complete = self.session.is_complete
+        self.say(
+            f"The session is complete. {self.known}"
+            if complete
+            else f"The plan is done, and no further pose can be named here. {self.known}"
+        )
+        return complete
 
     def _ask(self) -> None:
         self.asked, self._q, self._refused = self.session.next(), None, None
-        if self.asked is not None:
-            for line in self.prompt(self.asked):
-                self.say(line)
+        prompt = [] if self.asked is None else self._prompt(self.asked)
+        self._shown = {
+            "prompt": prompt,
+            "known": self.known,
+            "taken": len(self.session.taken),
+            "of": self.session.n_planned,
+        }
+        for line in prompt:
+            self.say(line)
 
-    def prompt(self, asked: Asked) -> list[str]:
+    def _prompt(self, asked: Asked) -> list[str]:
         """Return what is asked now."""
         n, of = len(self.session.taken), self.session.n_planned
         number = f"{n + 1} of {of}" if asked.is_planned else f"{n + 1}, beyond the plan"
@@ -100,9 +114,10 @@ class Dialogue:
             self.say(f"'{word}' is not understood. Readings in mm or deg, or {WORDS}.")
 
     def _look(self, asked: Asked, photograph: Path) -> None:
-        checked = self.session.check(asked, photograph)
+        checked = self.session.check(asked, photograph, self._q)
         if checked.problems:
-            self._refused = (photograph, checked)
+            if checked.exposure is not None:
+                self._refused = (photograph, checked)
             for problem in checked.problems:
                 self.say(f"  {photograph.name} was not taken: {problem}")
             return
@@ -141,13 +156,25 @@ class Dialogue:
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows."""
-        error, asked = self.session.error, self.asked
-        dX = math.nan if error is None else error.mean_displacement
-        return {
-            "prompt": [] if asked is None else self.prompt(asked),
-            "lines": self.lines[-12:],
-            "known": self.known,
-            "taken": len(self.session.taken),
-            "of": self.session.n_planned,
-            "dX_m": dX if math.isfinite(dX) else None,
-        }
+        return {**self._shown, "lines": self.lines[-12:]}
+
+
+class DialogueServer(LocalServer):
+    """The page of a dialogue, which shows what is asked and takes the same words."""
+
+    def __init__(self, dialogue: Dialogue, port: int = 0) -> None:
+        super().__init__(port)
+        self.dialogue = dialogue
+        folder = str(dialogue.session.folder)
+        blocks = [DialogueBlock(self.token)]
+        self._page = page_html(Page("Session", folder, None, [Section("next", "Next", blocks)]))
+
+    def content(self, path: str) -> tuple[str, bytes] | None:
+        """Return the page; None for other paths."""
+        return (HTML, self._page.encode()) if path == "/" else None
+
+    def answer(self, path: str, query: dict[str, list[str]], text: bytes) -> dict[str, Any] | None:
+        """Hear a posted word, and return what the page shows."""
+        if path == "/word":
+            self.dialogue.words.put(text.decode(errors="replace"))
+        return self.dialogue.state() if path in ("/word", "/state") else None
