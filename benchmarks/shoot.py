@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--machine", default="hexapod")
     parser.add_argument("--images", type=int, default=15, help="photographs of a guided session")
     parser.add_argument("--planned", type=int, help="of these, those of the plan")
+    parser.add_argument("--plan", type=Path, help="the folder of a plan, in place of a new one")
     parser.add_argument("--unguided", type=int, default=30, help="photographs beside them")
     parser.add_argument("--cameras", type=int, default=3)
     parser.add_argument(
@@ -51,13 +52,14 @@ def main() -> None:
     guided, unguided, seconds = list[float](), list[float](), list[float]()
     with TemporaryDirectory() as name:
         folder = Path(name)
-        planned = legcal.plan(args.machine, images=args.planned or args.images,
-                              cameras=args.cameras)  # fmt: skip
-        write_session(planned, folder / "plan")
+        plan = args.plan or folder / "plan"
+        if args.plan is None:
+            n = args.planned or args.images
+            write_session(legcal.plan(args.machine, images=n, cameras=args.cameras), plan)
         for seed in range(args.first, args.first + args.runs):
             here = folder / str(seed)
             try:
-                dataset, truth = shot(args, folder / "plan", here, level, seed, seconds)
+                dataset, truth = shot(args, plan, here, level, seed, seconds)
                 mine = error_of(dataset, truth)
                 owner = simulate(
                     args.machine,
@@ -68,7 +70,7 @@ def main() -> None:
                         views=args.cameras,
                         sampling=args.sampling,
                         poses=args.unguided // args.cameras,
-                        camera=folder / "plan" / "camera_info.yaml",
+                        camera=plan / "camera_info.yaml",
                     ),
                 )
                 theirs = error_of(owner.folder, owner.truth_path)

@@ -188,7 +188,7 @@ class Frames:
     def read(self) -> tuple[bool, Array]:
         image = cv2.imread(str(HEXAPOD / "images" / "c1_k01.jpg"))
         self.moving -= 1
-        rng = np.random.default_rng(self.moving)
+        rng = np.random.default_rng(abs(self.moving))
         noisy = image + rng.normal(0.0, 3.0, image.shape) + 2.0 * (self.moving % 2)
         self.last = np.roll(noisy, 9 * max(self.moving, 0), axis=1).clip(0, 255).astype(np.uint8)
         return True, self.last
