@@ -62,11 +62,19 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Step:
+    """A thing to do, with a command to copy."""
+
+    what: str
+    command: str = ""
+
+
+@dataclass(frozen=True)
 class Items:
     """A list."""
 
     kind: ClassVar = "items"
-    items: Sequence[str]
+    items: Sequence[str | Step]
     ordered: bool = False
     title: str = ""
 
