@@ -11,8 +11,7 @@
    to four times.
 6. Judge what the platform gains, and write the result.
 
-Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
-are searched like the others, and not fitted. Phases 2 to 5 work in canonical order;
+Held-out images are searched like the others, and not fitted. Phases 2 to 5 work in canonical order;
 :meth:`.estimate.Estimate.in_file_order` restores the order of the files.
 """
 
@@ -390,7 +389,6 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     known = known_parameters(
         dataset.machine,
         dataset.measurements.views,
-        axes_given=dataset.axes is not None,
         boards=dataset.boards,
     )
     choices = resolve([*dataset.overrides, *overrides], known)
@@ -414,11 +412,6 @@ def _fitted_and_held_out(
         return rows[fitted], rows[held_out]
     if holdout is None:
         return rows, rows[:0]
-    if dataset.axes is not None:
-        raise UsageError(
-            f"{dataset.folder}: --holdout needs images or outlines, and this dataset has a table "
-            "of axes; leave it out."
-        )
     if not dataset.machine.is_determined:
         raise UsageError(
             f"{dataset.folder}: --holdout needs readings that determine the pose of an image, but "
@@ -457,8 +450,6 @@ def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     """Return a note on cameras taken as exact because no covariance is stated."""
-    if dataset.axes is not None:
-        return []
     views = dataset.measurements.views
     names, cameras = [view.name for view in views], [view.camera for view in views]
     stated = (*choices.free, *choices.priors, *choices.fixed)

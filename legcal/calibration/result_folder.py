@@ -126,9 +126,8 @@ def write_result(
                 shutil.rmtree(folder / OVERLAYS, ignore_errors=True)
         document = json.dumps(calibration.result.document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
-        if dataset.axes is None:
-            table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
-            write_observations(table, solution.outlines, measurements, machine.leg_names)
+        table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
+        write_observations(table, solution.outlines, measurements, machine.leg_names)
         if calibration.corners is not None:
             write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
         if beside is not None:

@@ -183,7 +183,7 @@ def _untested(
 ) -> list[str]:
     """Return notes on changes in the course of a session that would not show."""
     m = dataset.measurements
-    if dataset.axes is not None or m.n_rows < 2 * MIN_IMAGES or session.findings:
+    if m.n_rows < 2 * MIN_IMAGES or session.findings:
         return []
     if not sequences:
         return [
