@@ -40,8 +40,10 @@ from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known_parameters, resolve
+from legcal.calibration.joint_fit.part_errors import Group
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
+from legcal.calibration.only import built_of, estimate_group
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -99,6 +101,7 @@ def calibrate(
     leave_out: str = "",
     split: Sequence[str] = (),
     overlays: bool = False,
+    only: Group | None = None,
     beside: Beside | None = None,
 ) -> Calibration:
     """Compute joint positions and offsets of a mechanism from a dataset.
@@ -140,6 +143,9 @@ def calibrate(
         others, whose zero the model has.
     overlays : bool
         Draw the outlines over every photograph, into ``overlays`` of the result folder.
+    only : {"zeros", "lengths", "all"}, optional
+        Tolerances of the model or dataset are priors of all parameters, so that few photographs are
+        enough for what is worst. This group is estimated; the model keeps nominal values elsewhere.
     beside : callable, optional
         Called as ``beside(calibration, folder)`` when all other files are in the folder that
         becomes the result folder: what it writes there appears with them, or nothing does.
@@ -171,6 +177,8 @@ def calibrate(
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides)
+    if only is not None:
+        choices = replace(choices, built=built_of(dataset.machine))
     left_out = chosen_images(dataset, leave_out) if leave_out else None
     if zeros := own_zeros(dataset, listed(split), left_out):
         dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
@@ -181,12 +189,15 @@ def calibrate(
     key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
-        estimate = estimate_parameters(data, fitted, Options(choices, criteria))
+        options = Options(choices, None if only else criteria)
+        estimate, turned = estimate_teeth(data, fitted, options)
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None
 
     # 6. Judge and write.
-    found = estimate.in_file_order()
+    found, group = estimate.in_file_order(), None
+    if only is not None and choices.built is not None:
+        group = estimate_group(dataset.machine, found.solution, choices.built, turned, only)
     on_images = notes_beside(
         found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
     )
@@ -213,6 +224,7 @@ def calibrate(
         corners=None if found.corners is None else found.corners.at(fitted),
         held_out=prediction,
         diagnosis=found.diagnosis,
+        group=group,
     )
     if output is not None:
         drawing = worker_pool(workers if overlays else 1)
@@ -225,6 +237,36 @@ def calibrate(
                 beside=beside,
             )
     return calibration
+
+
+def estimate_teeth(
+    data: OrderedDataset, file_rows: IntArray, options: Options
+) -> tuple[Estimate, dict[str, float]]:
+    """Estimate as :func:`estimate_parameters`, with a horn on another tooth where images say so.
+
+    With tolerances as priors, and a spline that the model states. A fit from the nominal model may
+    not reach an offset of a tooth, and legs are not found where they are not: each motor is tried a
+    tooth further and back. Return also by how much a motor stands further than it reads [rad].
+    """
+    machine = data.machine
+    if options.choices.built is None or machine.spline_teeth is None:
+        return estimate_parameters(data, file_rows, options), {}
+    step = 2.0 * np.pi / machine.spline_teeth
+    motors = [machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle]
+    tried: list[dict[str, float]] = [{}, *({m: s * step} for m in motors for s in (1.0, -1.0))]
+    found = list[tuple[float, int, Estimate]]()
+    failures = list[Exception]()
+    for k, turned in enumerate(tried):
+        try:
+            estimate = estimate_parameters(data.turned(turned), file_rows, options)
+        except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
+            failures.append(error)
+            continue
+        found.append((estimate.solution.quality.cost, k, estimate))
+    if not found:
+        raise failures[0]
+    _, k, best = min(found, key=lambda one: one[:2])
+    return best, tried[k]
 
 
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
