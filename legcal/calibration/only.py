@@ -30,7 +30,7 @@ from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.machine.parameters import in_joint_frames, vector_of
+from legcal.machine.parameters import geometries, in_joint_frames, vector_of
 from legcal.machine.tolerance import NOT_STATED, Tolerance
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
@@ -147,6 +147,21 @@ def built_of(machine: Machine) -> Tolerance:
             "the block legcal of the model."
         )
     return machine.tolerance.completed(machine.size)
+
+
+def teeth_of(
+    machine: Machine, solution: Solution, tolerance: Tolerance, step: float
+) -> dict[str, float]:
+    """Return by motor how far its horn is nearer to another tooth than to its own [rad].
+
+    *step* is a tooth. Motors on their own teeth are left out.
+    """
+    errors = part_errors(fitted_legs(machine), tolerance)
+    x = vector_of(solution.kinematic.parametrization, solution.legs, geometries(machine))
+    value, _ = errors.posterior(x, solution.kinematic.value_covariance)
+    turns = {machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle}
+    found = {errors.names[i]: step * round(value[i] / step) for i in errors.of("zeros").tolist()}
+    return {motor: angle for motor, angle in found.items() if angle and motor in turns}
 
 
 def estimate_group(

@@ -18,7 +18,7 @@ are searched like the others, and not fitted. Phases 2 to 5 work in canonical or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,7 +26,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.board import board_notes, rough_placement
-from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
+from legcal.calibration.diagnosis.diagnosis import (
+    Diagnosis,
+    agreement_with_zeros,
+    diagnose,
+    notes_beside,
+)
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import (
     TRIAL,
@@ -43,7 +48,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known
 from legcal.calibration.joint_fit.part_errors import Group
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.only import built_of, estimate_group
+from legcal.calibration.only import built_of, estimate_group, teeth_of
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -63,6 +68,7 @@ from legcal.data.outlines import reject_unused_legs
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
+    LegcalError,
     NotIdentifiable,
     NotVisible,
     Problem,
@@ -84,6 +90,8 @@ from legcal.perception.photographs import (
 from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
+
+_GUESSES = 3  # horns on another tooth at which images are measured, if those before show no legs
 
 
 def calibrate(
@@ -242,31 +250,49 @@ def calibrate(
 def estimate_teeth(
     data: OrderedDataset, file_rows: IntArray, options: Options
 ) -> tuple[Estimate, dict[str, float]]:
-    """Estimate as :func:`estimate_parameters`, with a horn on another tooth where images say so.
+    """Estimate as :func:`estimate_parameters`, with horns on other teeth where images say so.
 
-    With tolerances as priors, and a spline that the model states. A fit from the nominal model may
-    not reach an offset of a tooth, and legs are not found where they are not: each motor is tried a
-    tooth further and back. Return also by how much a motor stands further than it reads [rad].
+    With tolerances as priors, and a spline that the model states. A first estimate leaves the zeros
+    open by a tooth: where they are nearer to other teeth, readings are corrected by these, images
+    are searched again, and zeros have their tolerance as prior about there. If the first finds no
+    legs, motors are tried a tooth further and back, those first with which images agree best.
+    Return also by how much motors stand further than they read [rad].
     """
-    machine = data.machine
-    if options.choices.built is None or machine.spline_teeth is None:
+    machine, built = data.machine, options.choices.built
+    if built is None or machine.spline_teeth is None:
         return estimate_parameters(data, file_rows, options), {}
     step = 2.0 * np.pi / machine.spline_teeth
-    motors = [machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle]
-    tried: list[dict[str, float]] = [{}, *({m: s * step} for m in motors for s in (1.0, -1.0))]
-    found = list[tuple[float, int, Estimate]]()
-    failures = list[Exception]()
-    for k, turned in enumerate(tried):
+    wide = replace(built, angles_at_zero=max(step, built.angles_at_zero or 0.0))
+    first = replace(options, choices=replace(options.choices, built=wide))
+    failure: LegcalError | None = None
+    for guess in _guesses(data, step):
         try:
-            estimate = estimate_parameters(data.turned(turned), file_rows, options)
+            near = estimate_parameters(data.turned(guess), file_rows, first)
         except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
-            failures.append(error)
+            failure = failure or error
             continue
-        found.append((estimate.solution.quality.cost, k, estimate))
-    if not found:
-        raise failures[0]
-    _, k, best = min(found, key=lambda one: one[:2])
-    return best, tried[k]
+        teeth = teeth_of(near.fitted.machine, near.solution, wide, step)
+        turned = {m: teeth.get(m, 0.0) + guess.get(m, 0.0) for m in {**guess, **teeth}}
+        if teeth:
+            return estimate_parameters(data.turned(turned), file_rows, options), turned
+        placement, board = rough_placement(near.fitted)
+        cameras = near.solution.cameras_in_base(machine.T_base_Rb)
+        placement = replace(placement, T_base_camera=cameras)
+        again = fit_outlines(near.fitted, near.outlines, placement, board, options)
+        return replace(near, solution=again.solution, steps=again.steps), turned
+    assert failure is not None
+    raise failure
+
+
+def _guesses(data: OrderedDataset, step: float) -> Iterator[dict[str, float]]:
+    """Yield the horns as they should be, then a few with one a tooth off that images agree with."""
+    yield {}
+    machine = data.machine
+    motors = [machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle]
+    tried = [{motor: side * step} for motor in motors for side in (1.0, -1.0)]
+    if len(data.photographs.detect):
+        shown = agreement_with_zeros(data, tried)
+        yield from (tried[k] for k in np.argsort(-np.array(shown), kind="stable")[:_GUESSES])
 
 
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
