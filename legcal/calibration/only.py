@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from legcal.machine.parameters import geometries, in_joint_frames, vector_of
 from legcal.machine.tolerance import NOT_STATED, Tolerance
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
+RARE = 10.0  # by which a horn on another tooth must raise twice the logarithm of a likelihood
 _SURE = 2.5  # standard deviations within which an offset is a whole number of teeth
 
 
@@ -149,19 +151,37 @@ def built_of(machine: Machine) -> Tolerance:
     return machine.tolerance.completed(machine.size)
 
 
-def teeth_of(
-    machine: Machine, solution: Solution, tolerance: Tolerance, step: float
-) -> dict[str, float]:
-    """Return by motor how far its horn is nearer to another tooth than to its own [rad].
+def likely_teeth(
+    machine: Machine, solution: Solution, built: Tolerance, wide: Tolerance, step: float
+) -> list[tuple[float, dict[str, float]]]:
+    """Return horns on other teeth with their evidence against the likeliest, which is first.
 
-    *step* is a tooth. Motors on their own teeth are left out.
+    Of a fit with *wide* tolerances of zeros in place of those that are *built*. Hypotheses are no
+    horn, any one or two of them a *step* [rad] further or back; evidence is twice a logarithm, by
+    the fit linearised. A horn on another tooth is rare.
     """
-    errors = part_errors(fitted_legs(machine), tolerance)
+    errors = part_errors(fitted_legs(machine), wide)
     x = vector_of(solution.kinematic.parametrization, solution.legs, geometries(machine))
-    value, _ = errors.posterior(x, solution.kinematic.value_covariance)
-    turns = {machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle}
-    found = {errors.names[i]: step * round(value[i] / step) for i in errors.of("zeros").tolist()}
-    return {motor: angle for motor, angle in found.items() if angle and motor in turns}
+    value, covariance = errors.posterior(x, solution.kinematic.value_covariance)
+    at = errors.of("zeros")
+    known = np.linalg.inv(covariance[np.ix_(at, at)])
+    by_images = known - np.diag(errors.sigma[at] ** -2.0)  # information
+    zeros = part_errors(fitted_legs(machine), built).sigma[at]
+    both = np.linalg.inv(by_images + np.diag(zeros**-2.0))
+    S = np.diag(zeros**-2.0)
+    A, b = S - S @ both @ S, S @ both @ known @ value[at]
+    legs = [machine.legs[j] for j in machine.motors]
+    one = [(k, s) for k, leg in enumerate(legs) if leg.reads_angle for s in (step, -step)]
+    ranked = []
+    for some in ((), *((x,) for x in one), *combinations(one, 2)):
+        if len({k for k, _ in some}) < len(some):
+            continue
+        h = np.zeros(len(at))
+        h[[k for k, _ in some]] = [angle for _, angle in some]
+        evidence = float(h @ A @ h - 2.0 * b @ h) + RARE * len(some)
+        ranked.append((evidence, {legs[k].motor_label: angle for k, angle in some}))
+    ranked.sort(key=lambda each: each[0])
+    return [(evidence - ranked[0][0], turned) for evidence, turned in ranked]
 
 
 def estimate_group(

@@ -48,7 +48,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known
 from legcal.calibration.joint_fit.part_errors import Group
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.only import built_of, estimate_group, teeth_of
+from legcal.calibration.only import RARE, built_of, estimate_group, likely_teeth
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -91,6 +91,7 @@ from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
+_TEETH, _UNLIKELY = 5, 60.0  # hypotheses that are fitted, and evidence against them at most
 _GUESSES = 3  # horns on another tooth at which images are measured, if those before show no legs
 
 
@@ -253,9 +254,11 @@ def estimate_teeth(
     """Estimate as :func:`estimate_parameters`, with horns on other teeth where images say so.
 
     With tolerances as priors, and a spline that the model states. A first estimate leaves the zeros
-    open by a tooth: where they are nearer to other teeth, readings are corrected by these, images
-    are searched again, and zeros have their tolerance as prior about there. If the first finds no
-    legs, motors are tried a tooth further and back, those first with which images agree best.
+    open by a tooth and says which horns may be on others. Each of these is fitted with readings
+    corrected, so that zeros have their tolerance as prior about there, and the likeliest wins;
+    images are searched again. If the first finds no legs, motors are tried a tooth further and
+    back, those first with which images agree best.
+
     Return also by how much motors stand further than they read [rad].
     """
     machine, built = data.machine, options.choices.built
@@ -271,15 +274,28 @@ def estimate_teeth(
         except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
             failure = failure or error
             continue
-        teeth = teeth_of(near.fitted.machine, near.solution, wide, step)
-        turned = {m: teeth.get(m, 0.0) + guess.get(m, 0.0) for m in {**guess, **teeth}}
-        if teeth:
+        ranked = likely_teeth(machine, near.solution, built, wide, step)
+        likely = [teeth for against, teeth in ranked[:_TEETH] if against < _UNLIKELY]
+        fits = list[tuple[float, dict[str, float], Estimate]]()
+        for teeth in likely:
+            turned = {m: teeth.get(m, 0.0) + guess.get(m, 0.0) for m in {**guess, **teeth}}
+            turned = {m: angle for m, angle in turned.items() if angle}
+            fitted = data.turned(turned).at(data.rows_of(file_rows))
+            placement, board = rough_placement(fitted)
+            cameras = near.solution.cameras_in_base(machine.T_base_Rb)
+            placement = replace(placement, T_base_camera=cameras)
+            try:
+                fit = fit_outlines(fitted, near.outlines, placement, board, options)
+            except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
+                failure = failure or error
+                continue
+            fits.append((fit.solution.quality.cost + 0.5 * RARE * len(turned), turned, fit))
+        if not fits:
+            continue
+        _, turned, fit = min(fits, key=lambda one: one[0])
+        if turned != guess and len(data.photographs.detect):
             return estimate_parameters(data.turned(turned), file_rows, options), turned
-        placement, board = rough_placement(near.fitted)
-        cameras = near.solution.cameras_in_base(machine.T_base_Rb)
-        placement = replace(placement, T_base_camera=cameras)
-        again = fit_outlines(near.fitted, near.outlines, placement, board, options)
-        return replace(near, solution=again.solution, steps=again.steps), turned
+        return replace(near, fitted=fit.fitted, solution=fit.solution, steps=fit.steps), turned
     assert failure is not None
     raise failure
 
