@@ -55,8 +55,7 @@ from legcal.planning.planner import Scene, Task
 from legcal.planning.poses import candidate_poses, ways
 from legcal.planning.request import measured_length
 from legcal.progress import no_progress
-from legcal.vision.image_facts import ImageFacts
-from legcal.vision.image_file import inspect_image, read_image
+from legcal.vision.image_file import ImageFacts, inspect_image, read_image
 from legcal.workers import in_turn
 
 PLANNED_NAME = "planned.csv"  # the rows of the plan, once the first photograph is there

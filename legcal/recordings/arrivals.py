@@ -14,9 +14,9 @@ import numpy as np
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
-from legcal.vision.image_facts import HEIC_SUFFIXES
 from legcal.vision.image_file import (
     COPY_AGAIN,
+    HEIC_SUFFIXES,
     SUFFIXES,
     BadImage,
     image_size,
