@@ -52,7 +52,7 @@ from legcal.simulation.session import simulate_session, streams
 from legcal.simulation.settings import Level
 
 MACHINES = "hexapod", "6-sps", "3-rpr", "3-rps", "linear-delta", "hexaglide", "servo-hexapod"
-POINT_TO_POINT = "hexapod", "6-sps", "hexaglide", "servo-hexapod"
+POINT_TO_POINT = "hexapod", "6-sps", "hexaglide"
 HEALTHY, PITCH = "healthy", "pitch"
 N_SIGMAS = 3.0
 SCREW_PITCH = 0.005  # [m]

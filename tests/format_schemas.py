@@ -33,7 +33,7 @@ from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
 from legcal.simulation.paper import PaperDocument
 from legcal.simulation.study import StudyHeading
-from legcal.vision.board_file import AprilgridEntry, CharucoEntry, ChessboardEntry
+from legcal.vision.board import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
 
 ROOT = Path(__file__).parents[1]

@@ -47,7 +47,7 @@ def shipped_names() -> list[str]:
 def find_model(model: str | Path) -> Path:
     """Return the file of a mechanism, from a path or the name of a shipped model.
 
-    A result folder gives its calibrated model.
+    A result folder gives its calibrated model, a folder with a single model in ``models`` that.
     """
     path = Path(model)
     names = shipped_names()
@@ -83,8 +83,12 @@ def find_model(model: str | Path) -> Path:
         )
     if (path / DATASET_YAML).is_file():
         raise ModelError(what_a_dataset_is_for(path))
-    needed = "a folder with it, a result folder, or a YAML, URDF or MJCF file"
-    raise ModelError(refused, f"a folder without {FOLDER_YAML}", needed, "give the file", path)
+    written = sorted((path / "models").glob("*.yaml"))  # by new, inspect and locate
+    if len(written) == 1:
+        return written[0]
+    needed = "a folder with one model, a result folder, or a YAML, URDF or MJCF file"
+    found = f"a folder without {FOLDER_YAML} and with {len(written) or 'no'} models/*.yaml"
+    raise ModelError(refused, found, needed, "give the file", path)
 
 
 def dimensions_alone(kind: str, path: Path) -> ModelError:

@@ -64,6 +64,7 @@ class Machine:
     platform_normal: Array | None = None  # the same in the platform link; both None in space
     occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
     tolerance: Tolerance = NOT_STATED  # how well it is built
+    spline_teeth: int | None = None  # of the shafts that horns of servos sit on
 
     @property
     def upward(self) -> Array:

@@ -22,8 +22,7 @@ from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import SHEET
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values
-from legcal.vision.camera_export import camera_info
-from legcal.vision.camera_file import CALIBRATED
+from legcal.vision.camera_file import CALIBRATED, camera_info
 
 CAMERA_FILE = OutputFile(
     "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
