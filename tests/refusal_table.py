@@ -424,8 +424,6 @@ def _datasets() -> Iterable[Refusal]:
         ("yaml", text("dataset.yaml", "legcal_dataset: 1\nviews: {c1: [}\n"), ("line 2",)),
         ("repeated", swap("dataset.yaml", "  c2:", "  c1:"), ("'c1'",)),
         ("gone", remove("dataset.yaml"), ("dataset.yaml",)),
-        ("axes-and-outlines", (text("axes.csv", "x\n"), text("observations.csv", "x\n")),
-         ("axes.csv", "observations.csv")),
     ]  # fmt: skip
     yield from _spoiled("dataset", "calibrate {in} -o {out}", "plain", rows)
 
@@ -711,33 +709,6 @@ def _tables() -> Iterable[Refusal]:
     ]
     yield from _spoiled("outlines", "calibrate {in} -o {out}", "3-rpr-outlines", outlines)
 
-    a = "axes.csv"
-    axes: Rows = [
-        ("nan", cell(a, 5, z="nan"), ("column z", "'nan'")),
-        ("degrees", cell(a, 5, theta="-12"), ("-12", "3.1416", "rad")),
-        ("tilt", cell(a, 5, psi="1.7"), ("1.7", "1.5708", "rad")),
-        ("farther", cell(a, 5, z="-1e300"), ("column z", "-1000 to 1000 m")),
-        ("level", cell(a, 5, psi="1.5707963"), ("columns psi, theta", "(x, 0, z)")),
-        ("sigma-rad", cell(a, 5, sigma_theta="3"), ("column sigma_theta", "1e-09 to 1 rad")),
-        ("sigma-large", cell(a, 5, sigma_z="50"), ("sigma_z", "1", "m")),
-        ("no-point", cell(a, 5, theta="1.5707963"), ("psi, theta",)),
-        ("twice", doubled(a), ("row 1",)),
-        ("header", header(a, "sigma_z", "sigma_y"), ("sigma_z",)),
-        ("all-at-once", (cell(a, 2, psi="x", sigma_x="0"), cell(a, 4, leg="leg9")),
-         ("'x'", "sigma_x", "'leg9'")),
-        ("few", (kept("measurements.csv", 1), kept(a, 3)), ()),
-        ("missing", kept(a, 60), ("row",)),
-    ]  # fmt: skip
-    yield from _spoiled("axes", "calibrate {in} -o {out}", "3-rpr-axes", axes)
-    for name, words, named in (
-        ("radius", "--set leg1.radius.leg1_rod=free", ("leg1.radius.leg1_rod", "axes")),
-        ("intrinsic", "--set c1.fx=free", ("c1.fx", "axes")),
-        ("holdout", "--holdout 0.2", ("axes",)),
-    ):
-        command = f"calibrate {{in}} -o {{out}} {words}"
-        yield Refusal(f"axes-{name}", command, named, "3-rpr-axes")
-    yield Refusal("axes-detect", "detect {in} -o {out}", ("axes",), "3-rpr-axes")
-
     c = "corners.csv"
     line = f"{CORNER_COLUMNS}\n"
     good = "c1,images/c1_1.png,0,5.0,5.0,0.1,used,,detected\n"
@@ -846,7 +817,7 @@ def _overrides() -> Iterable[Refusal]:
         ("axis", "--set leg1.base_axis.1", ("leg1.base_axis.1", "RPR")),
     ]
     for name, words, named in planar:
-        yield Refusal(f"planar-{name}", f"{command} {words}", named, "3-rpr-axes")
+        yield Refusal(f"planar-{name}", f"{command} {words}", named, "3-rpr-outlines")
 
 
 def _models() -> Iterable[Refusal]:
@@ -1438,7 +1409,7 @@ def _scenes() -> Iterable[Refusal]:
         "scene-board", f"{command} --board {{in}}/b.yaml", ("board",), "", (text("b.yaml", "a: 1"),)
     )
     yield Refusal("scene-again", "simulate 3-rpr -o {in} --level outlines --poses 1",
-                  ("simulated dataset",), "3-rpr-axes")  # fmt: skip
+                  ("simulated dataset",), "3-rpr-outlines")  # fmt: skip
     invisible = Refusal(
         "scene-invisible",
         "simulate {in}/models/hexapod.yaml -o {out} --level outlines --poses 1",

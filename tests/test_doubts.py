@@ -300,7 +300,7 @@ def test_verdict_document_summary_and_next_step_follow_any_doubt(
         assert document["doubts"] == [{name: getattr(doubt, name) for name in names}]
         assert found.verdict.sentence in found.summary()
         first = next_steps(found, "out", "")[0]
-        assert first == "Something is wrong. Mend it, and calibrate again."
+        assert first.what == "Something is wrong. Mend it, and calibrate again."
 
 
 @pytest.mark.parametrize("spoil", [_nothing, BACKLASH])
