@@ -90,6 +90,7 @@ Size = tuple[_PixelCount, _PixelCount]
 
 _Text = Annotated[str, Field(max_length=200)]
 _Positive = Annotated[float, Field(gt=0.0)]
+_Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class PhotographsEntry(_OpenSchema):
@@ -113,6 +114,8 @@ class CalibratedEntry(_OpenSchema):
     sigma: dict[str, Sigma] = Field(default_factory=dict)
     names: list[str] | None = None  # of the rows of the covariance
     covariance: list[list[float]] | None = None
+    # corners of the part of the image in which boards were seen [px]
+    covered: list[tuple[_Coordinate, _Coordinate]] = Field(default_factory=list)
     photographs: PhotographsEntry = Field(default_factory=PhotographsEntry)
 
 
@@ -344,7 +347,8 @@ def _from_ros(document: Mapping[str, Any], path: Path) -> Camera:
     photographs = entry.legcal_camera.photographs.model_dump()
     recorded = {name: values for name, values in photographs.items() if values}
     covariance = _covariance(entry.legcal_camera, camera, path)
-    return replace(camera, covariance=covariance, photographs=recorded)
+    covered = np.array(entry.legcal_camera.covered).reshape(-1, 2)
+    return replace(camera, covariance=covariance, photographs=recorded, covered=covered)
 
 
 def _covariance(entry: CalibratedEntry, camera: Camera, path: Path) -> Array | None:
