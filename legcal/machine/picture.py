@@ -265,8 +265,8 @@ def _joints(
             )
         away = np.array([x, y]) - middle if is_plan else np.array([0.0, 1.0])
         away = away / max(float(np.linalg.norm(away)), 1e-9) * sign
-        at = names.place(np.array([x, y + 4.0]) + 17.0 * away, away)
-        canvas.text(*at, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
+        x, y = names.place(np.array([x, y + 4.0]) + 17.0 * away, away)
+        canvas.text(x, y, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
 
 
 def joint_letter(end: str) -> str:
@@ -281,9 +281,9 @@ def _frame(canvas: Canvas, name: str, points: Array, names: _Names) -> None:
             continue
         canvas.segment(points[0], end, colour, 2.0)
         along = (end - points[0]) / np.linalg.norm(end - points[0])
-        at = names.place(points[0] + 1.2 * (end - points[0]) - np.array([0.0, 2.0]), along)
+        x, y = names.place(points[0] + 1.2 * (end - points[0]) - np.array([0.0, 2.0]), along)
         letter = f"{name} {'xyz'[axis]}" if axis == 0 else "xyz"[axis]
-        canvas.text(*at, letter, colour=colour, anchor="middle", size=11)
+        canvas.text(x, y, letter, colour=colour, anchor="middle", size=11)
 
 
 def _legend(machine: Machine, width: float) -> list[str]:
