@@ -278,13 +278,19 @@ def mechanism_yaml(
     loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
 ) -> str:
     """Return the YAML of a mechanism from closures (two frames, kind), motors and block."""
-    document = {
-        "closed_loop": [[first, second] for first, second, _ in loops],
-        "type": [kind for *_, kind in loops],
-        "name_mot": motors,
-        "joint_name": [],
-        "joint_type": [],
-        "legcal": {"version": 1, **legcal},
-    }
+    return yaml_text(
+        {
+            "closed_loop": [[first, second] for first, second, _ in loops],
+            "type": [kind for *_, kind in loops],
+            "name_mot": motors,
+            "joint_name": [],
+            "joint_type": [],
+            "legcal": {"version": 1, **legcal},
+        }
+    )
+
+
+def yaml_text(document: dict[str, Any]) -> str:
+    """Return a mechanism YAML from its entries."""
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
     return with_schema("mechanism", text)

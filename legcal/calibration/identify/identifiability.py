@@ -118,7 +118,6 @@ def answer(
     parameters = known_parameters(
         dataset.machine,
         dataset.measurements.views,
-        axes_given=dataset.axes is not None,
         boards=dataset.boards,
     )
     return identifiability_of_dataset(dataset, resolve(dataset.overrides, parameters), expected)
@@ -211,9 +210,7 @@ def identifiability_of_dataset(
     """
     analysis = replace(_analysis_of(dataset, choices), noise=noise)
     report = _report_on(dataset.machine, analysis, None, None)
-    if dataset.axes is None:
-        intrinsics = expected_intrinsics(analysis)
-        report = report.model_copy(update={"intrinsics": intrinsics})
+    report = report.model_copy(update={"intrinsics": expected_intrinsics(analysis)})
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
@@ -440,7 +437,7 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
     """Describe why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
     unseen = [leg.name for leg in dataset.machine.legs if not leg.cylinders]
-    if unseen and dataset.axes is None:
+    if unseen:
         names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
         remedies.insert(0, f"add a <visual> cylinder along {names}: without it, no image shows it")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
