@@ -153,7 +153,7 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
         if kind == "lamp":
             return relit(dataset, changed, size, rng.uniform(0.0, 2.0 * np.pi))
         return with_rays(dataset, changed, turned(size) if kind == "camera" else zoomed(size))
-    turn = np.array([2.0 * np.pi if leg.reads_angle else SCREW_PITCH for leg in machine.legs])
+    per = [2.0 * np.pi if leg.reads_angle else SCREW_PITCH for leg in machine.legs]
     phase = rng.uniform(0.0, 2.0 * np.pi)
     scatter = rng.normal(size=(n, len(machine.motors)))
     of_motor = {motor: scatter[:, i] for i, motor in enumerate(machine.motors)}
@@ -166,7 +166,7 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
         "commands": lambda: (
             size * of_leg * np.column_stack([of_motor.get(i, np.zeros(n)) for i in machine.reads])
         ),
-        "eccentricity": lambda: size * is_motor * of_leg * np.sin(2.0 * np.pi * m.q / turn + phase),
+        "eccentricity": lambda: size * is_motor * of_leg * np.sin(2.0 * np.pi * m.q / per + phase),
         PITCH: lambda: size * m.q,
     }
     return replace(dataset, measurements=replace(m, q=m.q + changes[kind]()))

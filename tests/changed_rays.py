@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -57,15 +58,10 @@ def with_moved_joint(
             middle = B.mean(axis=0)
             return np.asarray(Rotation.from_rotvec(x[:3]).apply(B - middle) + middle + x[3:])
 
-        found = least_squares(
-            lambda x, k=k, lengths=lengths, platform=platform: (
-                np.linalg.norm(platform(x) - A[k], axis=1) - lengths
-            ),
-            np.zeros(6),
-            xtol=1e-14,
-            ftol=1e-14,
-            gtol=1e-14,
-        )
+        def error(x: Array, k: int = k, lengths: Array = lengths, at: Any = platform) -> Array:
+            return np.asarray(np.linalg.norm(at(x) - A[k], axis=1) - lengths)
+
+        found = least_squares(error, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
         B[k] = platform(found.x)
     before, after = outlines_of(scene), outlines_of(replace(scene, A=A, B=B))
     at, place = (

@@ -59,7 +59,7 @@ from legcal.machine.parameters import moved_legs, parametrize
 from legcal.simulation.observe import moved_outlines
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
-LIKE_OTHERS = ("hexapod-strut", "nategh-agheli", "6-sps", "3-upu-tilted")  # in their legs
+LIKE_OTHERS = ("hexapod-strut", "nategh-agheli", "6-sps", "3-upu-tilted", "3-spr")  # in their legs
 SCALE = 2.5
 
 

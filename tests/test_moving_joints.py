@@ -117,7 +117,7 @@ def test_an_unknown_scale_is_refused_with_what_would_fix_it(
         readings_carry_length=False,
         length_option="--length leg1.base:leg1.platform=MEASURED±SIGMAmm",
     )
-    dataset: Any = SimpleNamespace(folder="servo", machine=known, axes=None)
+    dataset: Any = SimpleNamespace(folder="servo", machine=known)
     wanted = (
         "leg1.length measured to 0.019 mm, or a calibration board on the base .*=MEASURED.*--set"
     )

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from legcal.calibration.clicks import click_notes
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.doubts import (
     CAMERA,
+    TOLERANCE,
     Doubt,
     doubts_of,
     model_error,
@@ -26,13 +28,14 @@ from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.only import GroupEstimate
 from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
 from legcal.data.dataset import PLAN_NAME, POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
-from legcal.data.measurements import few
+from legcal.data.measurements import few, few_views
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
@@ -42,6 +45,8 @@ from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
+MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
+_ALONG = 9  # points along an outline
 _ROUNDED = 0.51e-4  # [mm or deg] of the commands there
 AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
@@ -55,8 +60,9 @@ def judge(
     corners: Corners | None = None,
     held_out: HeldOut | None = None,
     diagnosis: Sequence[Diagnosis] = (),
+    group: GroupEstimate | None = None,
 ) -> Calibration:
-    """Return the calibration with its verdict.
+    """Return the calibration with its verdict; of a *group* of its parameters, if given.
 
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
@@ -75,18 +81,19 @@ def judge(
         measurements.own_zeros, solution.posterior.state.own_zeros.tolist(), strict=True
     ):
         q[np.ix_(of.rows[measurements.first_rows], motors == of.motor)] -= zero
+    reported = solution if group is None else group.solution
     platform = platform_accuracy(
         machine,
-        solution.legs,
-        solution.kinematic.parametrization,
-        solution.kinematic.total_covariance,
+        reported.legs,
+        reported.kinematic.parametrization,
+        reported.kinematic.total_covariance,
         q,
-        solution.T_Rb_Re,
-        solution.sensitivities,
+        reported.T_Rb_Re,
+        reported.sensitivities,
     )
     remedy = ""
     if platform is None:
-        change, sigma, found = _change_of_parameters(dataset, solution)
+        change, sigma, found = _change_of_parameters(dataset, reported)
     else:
         change, sigma, found = _change_of_platform(platform)
         by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
@@ -95,9 +102,14 @@ def judge(
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
+    doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
+    if group is not None:
+        found = f"{group.sentence}; {found}"
+        others = (doubt for doubt in doubts if doubt.code != TOLERANCE)
+        doubts = (*others, *group.doubts)
     doubts = tuple(
         replace(doubt, is_grave=doubt.is_grave or (doubt.sigma_dX_m or 0.0) > change)
-        for doubt in doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
+        for doubt in doubts
     )
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
@@ -115,12 +127,13 @@ def judge(
         notes = [*notes, *camera_file_notes(dataset, solution)]
     return Calibration(
         dataset,
-        solution,
+        reported,
         steps,
         platform,
         verdict,
         (
             *notes,
+            *_beyond_boards(dataset, solution),
             *click_notes(dataset, solution),
             *commanded(dataset),
             *_asked_lengths(dataset, solution, doubts),
@@ -130,6 +143,7 @@ def judge(
         held_out,
         corners,
         tuple(diagnosis),
+        group=group,
     )
 
 
@@ -139,6 +153,29 @@ def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
     return [
         f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
         for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
+    ]
+
+
+def _beyond_boards(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on views whose outlines leave the part of the image that boards covered."""
+    outlines, measurements = solution.outlines, dataset.measurements
+    view, along = measurements.view[outlines.row], np.linspace(0.0, 1.0, _ALONG)[:, None, None]
+    points = outlines.ends[:, 0] + along * (outlines.ends[:, 1] - outlines.ends[:, 0])
+    outside = dict[str, float]()
+    for v in np.unique(view[outlines.used]).tolist():
+        covered = measurements.views[v].camera.covered.astype(np.float32)
+        if len(covered):
+            pixels = points[:, (view == v) & outlines.used].reshape(-1, 2).tolist()
+            is_out = [cv2.pointPolygonTest(covered, pixel, False) < 0.0 for pixel in pixels]
+            outside[measurements.views[v].name] = float(np.mean(is_out))
+    far = [name for name, share in outside.items() if share > MAX_BEYOND]
+    if not far:
+        return []
+    share = 100.0 * max(outside[name] for name in far)
+    return [
+        f"Up to {share:.0f} % of the outlines of {few_views(far)} lie where the calibration of the "
+        "camera has seen no board: the lens is extrapolated there, beyond what its covariance "
+        "says; photograph the board there too, and calibrate the camera again."
     ]
 
 
@@ -161,7 +198,7 @@ def _untested(
 ) -> list[str]:
     """Return notes on changes in the course of a session that would not show."""
     m = dataset.measurements
-    if dataset.axes is not None or m.n_rows < 2 * MIN_IMAGES or session.findings:
+    if m.n_rows < 2 * MIN_IMAGES or session.findings:
         return []
     if not sequences:
         return [

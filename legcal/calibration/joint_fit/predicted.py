@@ -56,7 +56,7 @@ from legcal.machine.model import Machine
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.sight import Seen
+from legcal.vision.visibility import Seen
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
@@ -278,7 +278,7 @@ def information_of_images(
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
     """Add the priors of a calibration: of twists, and of lines of arms, also of those not seen."""
     seen = [j for j, leg in enumerate(legs.nominal) if leg.arm is not None]
-    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen)
+    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen) if choices.built is None else {}
     twist = float(np.radians(TWIST_SIGMA_DEG))
     names = legs.parametrization.names
     sigmas |= {name: twist for name in names if ParameterId.parse(name).kind == "twist"}
