@@ -78,6 +78,7 @@ def refine(
     axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
+    edges: Outlines | None = None,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii jointly to all data.
 
@@ -103,6 +104,8 @@ def refine(
         Calibration boards fixed to base and platform, and their corners in images.
     choices : Choices
         Fixed and freed parameters, and priors.
+    edges : Outlines, optional
+        Straight edges of bodies, parallel to their legs; only the used ones enter.
 
     Returns
     -------
@@ -122,11 +125,12 @@ def refine(
 
     def fitted(used: Outlines) -> Solution:
         problem = build_fit(
-            legs, measurements, used, settings, axes=axes, board=board, choices=choices
+            legs, measurements, used, settings, axes=axes, board=board, choices=choices, edges=edges
         )
         problem.require_determined()
         with explaining_missing_scale(problem):
-            return _fit_from_best_start(problem, used, starts)
+            solution = _fit_from_best_start(problem, used, starts)
+        return dataclasses.replace(solution, edges=_edges_of(solution, edges))
 
     return _fit_without_wrong_arms(fitted, outlines, legs.nominal)
 
@@ -158,6 +162,16 @@ def _fit_without_wrong_arms(
         else:
             if not wrong:
                 return dataclasses.replace(solution, notes=(*notes, *solution.notes))
+
+
+def _edges_of(solution: Solution, edges: Outlines | None) -> Outlines | None:
+    """Return the edges of bodies with the rejections of a fit."""
+    if edges is None:
+        return None
+    problem = solution.posterior.problem
+    disagrees = np.zeros(len(edges), dtype=np.bool_)
+    disagrees[problem.edges.index] = np.ravel(problem.factor("edges").whitening) == 0.0
+    return edges.reject(disagrees, Reason.DISAGREES)
 
 
 def _origin(start: Start) -> str:

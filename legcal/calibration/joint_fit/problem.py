@@ -23,12 +23,14 @@ from legcal.calibration.joint_fit.factors import (
     Observed,
     ObservedAxes,
     ObservedCorners,
+    ObservedEdges,
     ObservedOutlines,
     Readings,
     measured_lengths,
     observed_arrays,
     observed_axes,
     observed_corners,
+    observed_edges,
     observed_readings,
 )
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel
@@ -51,7 +53,7 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
-from legcal.calibration.tuning import EDGE_BIAS_PX
+from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
 from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.outlines import Outlines
@@ -128,6 +130,11 @@ class FitProblem(EstimationProblem[State]):
         return self.observed.axes
 
     @property
+    def edges(self) -> ObservedEdges:
+        """The edges of bodies."""
+        return self.observed.edges
+
+    @property
     def boards(self) -> tuple[ObservedCorners, ...]:
         """Corners of the calibration board on each link; empty without a board."""
         return self.observed.boards
@@ -191,6 +198,7 @@ class FitProblem(EstimationProblem[State]):
             Frames.of([start.T_Rb_board, start.T_Re_board]),
             self.postures(start.legs, start.T_Rb_Re),
             np.zeros(self.block("own_zeros").n_unknowns),
+            np.zeros((len(self.edges.bodies), 3)),
         )
 
     def postures(self, legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
@@ -241,6 +249,11 @@ class FitProblem(EstimationProblem[State]):
         )
         return other.with_factors(corners.factor(self.keys))
 
+    def with_edges(self, edges: ObservedEdges) -> FitProblem:
+        """Replace the edges of bodies; those left out keep their lean."""
+        other = self.changed(observed=self.observed._replace(edges=edges))
+        return other.with_factors(edges.factor(self.keys))
+
     def with_measurements(
         self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
     ) -> FitProblem:
@@ -253,6 +266,7 @@ class FitProblem(EstimationProblem[State]):
             observed_readings(measurements, self.legs),
             observed_axes(None, measurements, self.legs),
             *observed_corners(None, measurements, ()),
+            replace(observed_edges(None, measurements, self.legs, ()), bodies=self.edges.bodies),
         )
         radii = self.block("radii")
         more = np.full((len(outlines.parts) - len(radii.unknown), 1), -1)
@@ -285,6 +299,7 @@ def build_fit(
     axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
+    edges: Outlines | None = None,
 ) -> FitProblem:
     """Build the joint fit without solving it; arguments as those of :func:`refine`.
 
@@ -301,7 +316,7 @@ def build_fit(
     cameras = tuple(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
-    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
+    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras, edges)
     n_poses, images = measurements.n_poses, _images(measurements)
     return _build_problem(
         _FitInputs(legs, observed, cameras, owners, n_poses, images, settings), choices
@@ -342,7 +357,7 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
     outlines, boards = observed.outlines, observed.boards
     parameters, kinematic = _kinematic(given, choices)
     views_with_outlines_or_corners = np.concatenate(
-        [outlines.view, *(corners.view for corners in boards)]
+        [outlines.view, observed.edges.view, *(corners.view for corners in boards)]
     )
     observed_owners = {given.owners[v] for v in np.unique(views_with_outlines_or_corners).tolist()}
     intrinsics, keys = _intrinsics(outlines.views, cameras, given.owners, observed_owners, choices)
@@ -365,6 +380,7 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
         Variables("camera_pose", camera_pose, Frames.moved, max_step=_MAX_STEP),
         Variables("board_pose", board_pose, Frames.moved, max_step=_MAX_STEP),
         Variables("own_zeros", all_free(observed.readings.by_zero.shape[1], 1)),
+        _leans(len(observed.edges.bodies)),
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
@@ -449,6 +465,14 @@ def arm_sigmas(
         for leg in seen
         for i, sigma in zip(place[leg].tolist(), sigmas, strict=True)
     }
+
+
+def _leans(n: int) -> Variables:
+    """Return the block of the leans of n bodies, with their prior."""
+    prior = GaussianPrior(
+        np.arange(3 * n, dtype=np.intp), np.zeros(3 * n), np.full(3 * n, LEAN_SIGMA)
+    )
+    return Variables("leans", all_free(n, 3), prior=prior)
 
 
 def _poses(n_poses: int, n_actuators: int) -> Variables:

@@ -188,6 +188,7 @@ class Solution:
     notes: tuple[str, ...] = ()  # one sentence each
     details: tuple[str, ...] = ()  # on the starts, one sentence each
     left_out: tuple[str, ...] = ()  # legs in views with most outlines rejected, unconfirmed
+    edges: Outlines | None = None  # straight edges of bodies, with the rejections of the fit
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -467,6 +468,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
+        edges=None if solution.edges is None else order.restore(solution.edges),
         quality=replace(
             solution.quality,
             redundant_readings=readings and readings.renumbered(order.legs.tolist(), file_pose),
