@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.data.outlines import (
     FIRST_EDGE,
@@ -47,7 +48,7 @@ from legcal.perception.placement import (
 from legcal.progress import Report
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
-from legcal.vision.visibility import hidden_by, in_picture, longest_runs
+from legcal.vision.visibility import PredictedLeg, hidden_by, in_picture, longest_runs
 
 REACH = 1.4  # half-width of what is searched, of the radius of a body
 BLOCK = 8  # length of a block along the body [px]
@@ -97,28 +98,75 @@ def _of_image(search: Search, placement: Placement, row: int) -> Outlines:
     view = int(search.measurements.view[row])
     camera, T = search.measurements.views[view].camera, placement.T_base_camera[view]
     bodies = bodies_of(search.occluders, search.n_legs)
-    wanted = [(j, b) for j, of_leg in enumerate(bodies) for b in of_leg if search.wanted[view, j]]
-    if T is None or not wanted:
+    if T is None or not any(bodies):
         return no_outlines()
-    grey, T_base_camera = search.load(row), T.as_matrix()
     ends = placement.A_base, placement.B_base
-    A, B = ((X[row] - T_base_camera[:3, 3]) @ T_base_camera[:3, :3] for X in ends)
     legs = predict_legs_and_arms(camera, T, ends, search.cylinders, placement.arms, row)
-    (occluders,) = PlacedOccluders.at(search.occluders, *(X[row : row + 1] for X in ends))
-    occluders = occluders.before(T_base_camera)
-    tables = []
-    for j, body in wanted:
-        along = _in_view(camera, A[j], B[j], body)
-        if len(along) < LEAST_BLOCKS * BLOCK:
-            continue
-        P = A[j] + along[:, None] * ((B[j] - A[j]) / np.linalg.norm(B[j] - A[j]))
-        every = np.full(len(P), j)
-        hidden = hidden_by(legs, every, P, body.radius / P[:, 2]) >= 0 if legs else every < 0
-        reach, none = np.full(len(P), body.radius), np.full(len(P), body.radius)
-        hidden |= occluders.without_leg(j).hide(P, every, reach, none) >= 0
-        found = edges_of_body(grey, camera, A[j], B[j], along, hidden, body.radius)
-        tables.append(_table(row, j, body.link, camera, found))
+    here = ends[0][row], ends[1][row]
+    grey, tables = search.load(row), []
+    for seen in bodies_in_view(search.occluders, camera, T, here, search.wanted[view], legs):
+        found = edges_of_body(grey, camera, seen)
+        tables.append(_table(row, seen.leg, seen.body.link, camera, found))
     return join_outlines(tables)
+
+
+class BodyInView(NamedTuple):
+    """A body of a leg where an image shows it."""
+
+    leg: int
+    body: Cylinder
+    A: Array  # (3,) joints of the leg in the camera frame [m]
+    B: Array
+    along: Array  # (n,) distances from A at which its axis is in view, a pixel apart [m]
+    hidden: BoolArray  # (n,) which of them other things hide
+
+
+def bodies_in_view(
+    occluders: Sequence[Occluder],
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    ends: tuple[Array, Array],  # A and B in the base link, (n_legs, 3) each [m]
+    wanted: BoolArray,  # (n_legs,)
+    legs: Sequence[PredictedLeg] = (),  # round parts that may hide bodies
+) -> list[BodyInView]:
+    """Return the bodies of wanted legs, as far as their axes are in view."""
+    T = T_base_camera.as_matrix()
+    A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in ends)
+    (placed,) = PlacedOccluders.at(occluders, ends[0][None], ends[1][None])
+    placed, shown = placed.before(T), []
+    for j, of_leg in enumerate(bodies_of(occluders, len(A))):
+        for body in of_leg if wanted[j] else ():
+            along = _in_view(camera, A[j], B[j], body)
+            if len(along) < LEAST_BLOCKS * BLOCK:
+                continue
+            P = A[j] + along[:, None] * ((B[j] - A[j]) / np.linalg.norm(B[j] - A[j]))
+            every, reach = np.full(len(P), j), np.full(len(P), body.radius)
+            hidden = placed.without_leg(j).hide(P, every, reach, reach) >= 0
+            if legs:
+                hidden |= hidden_by(legs, every, P, reach / P[:, 2]) >= 0
+            shown.append(BodyInView(j, body, A[j], B[j], along, hidden))
+    return shown
+
+
+def predicted_edges(row: int, camera: Camera, seen: BodyInView, sigma_px: float) -> Outlines:
+    """Return the two edges of a body as its silhouette has them, where nothing hides it.
+
+    The body counts as round: what a fit learns from edges does not depend on where they are.
+    """
+    first, last = longest_runs(~seen.hidden)
+    if last - first < LEAST_BLOCKS * BLOCK:
+        return no_outlines()
+    u = (seen.B - seen.A) / np.linalg.norm(seen.B - seen.A)
+    axis = seen.A + seen.along[[first, last], None] * u
+    beside = cross(u, axis.mean(axis=0))
+    beside *= seen.body.radius / np.linalg.norm(beside)
+    covariance = sigma_px**2 * np.eye(2)
+    length = float(last - first)
+    edges = [
+        BodyEdge(camera.project(axis + side * beside), covariance, np.nan, length, np.nan)
+        for side in (-1.0, 1.0)
+    ]
+    return _table(row, seen.leg, seen.body.link, camera, edges)
 
 
 def _in_view(camera: Camera, A: Array, B: Array, body: Cylinder) -> Array:
@@ -169,27 +217,18 @@ class BodyEdge(NamedTuple):
     residual: float  # robust standard deviation of the blocks about the line [px]
 
 
-def edges_of_body(
-    grey: Grey,
-    camera: Camera,
-    A: Array,
-    B: Array,
-    along: Array,  # (n,) distances from A at which the body is in view, a pixel apart [m]
-    hidden: BoolArray,  # (n,)
-    radius: float,
-) -> list[BodyEdge]:
-    """Return the edges of a body on the leg from A to B (3,), in the camera frame [m]."""
+def edges_of_body(grey: Grey, camera: Camera, body_in_view: BodyInView) -> list[BodyEdge]:
+    """Return the edges of a body in an image."""
+    _, body, A, B, along, hidden = body_in_view
     n_blocks = len(along) // BLOCK
-    if n_blocks < LEAST_BLOCKS:
-        return []
     along, hidden = along[: n_blocks * BLOCK], hidden[: n_blocks * BLOCK]
     u = (B - A) / np.linalg.norm(B - A)
     middle = A + 0.5 * (along[0] + along[-1]) * u
     beside = cross(u, middle)
     beside /= np.linalg.norm(beside)
     pixel = _pixel_size(camera, middle, beside)
-    n_side = int(np.ceil((REACH * radius / pixel + WINDOW) / STEP))
-    across = np.arange(-n_side, n_side + 1) * STEP  # [px] at the middle
+    n_side = int(np.ceil((REACH * body.radius / pixel + WINDOW) / STEP))
+    across: Array = np.arange(-n_side, n_side + 1) * STEP  # [px] at the middle
 
     def pixels(s: Array, v: Array) -> Array:
         X = A + s[..., None] * u + (pixel * v)[..., None] * beside
@@ -200,7 +239,7 @@ def edges_of_body(
         grey, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     in_blocks = np.asarray(light, dtype=np.float32).reshape(n_blocks, BLOCK, -1).mean(axis=1)
-    seen = ~hidden.reshape(n_blocks, BLOCK).any(axis=1)
+    seen: BoolArray = ~np.any(hidden.reshape(n_blocks, BLOCK), axis=1)
     block, place, slope = _steep_places(in_blocks, seen, across)
     position = (block + 0.5) / n_blocks
     lines = _lines(position, place, slope, LEAST_VOTES * n_blocks, float(across[-1]))

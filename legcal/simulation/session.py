@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.corners import Corners
 from legcal.data.dataset import PLAN_NAME, load_dataset
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, join_outlines
 from legcal.errors import DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
 from legcal.files.schema import validate
@@ -49,6 +49,7 @@ from legcal.simulation.observe import (
     Scene,
     axes_in_images,
     corners_in_images,
+    edges_of_bodies,
     outlines_of,
 )
 from legcal.simulation.poses import commanded_poses, given_poses
@@ -303,6 +304,8 @@ class _Simulator:
         if settings.level == Level.OUTLINES:
             noise = OutlineNoise(settings.sigma_px, n_points=None)
             outlines = outlines_of(scene, noise, rngs["observations"])
+            edges = edges_of_bodies(scene, self.truth.occluders, noise, rngs["observations"])
+            outlines = join_outlines([outlines, edges])
         elif settings.level == Level.AXES:
             axes = axes_in_images(scene, settings.table, rngs["observations"])
         if setup.boards and settings.level != Level.PHOTOGRAPHS:

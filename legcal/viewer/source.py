@@ -114,7 +114,7 @@ def _session(machine: Machine, given: str | Path, result: EarlierResult | None) 
         )
     outlines = dataset.observations
     if result is not None and os.path.isfile(result.folder / OBSERVATIONS_NAME):
-        outlines, _ = read_outlines(result.folder, dataset.machine, dataset.measurements)
+        outlines = read_outlines(result.folder, dataset.machine, dataset.measurements)
     order = [names.index(name) for name in machine.leg_names]
     measurements = replace(dataset.measurements, q=dataset.measurements.q[:, order])
     return replace(dataset, measurements=measurements, observations=outlines)

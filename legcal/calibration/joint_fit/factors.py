@@ -47,9 +47,9 @@ class Observed(NamedTuple):
     outlines: ObservedOutlines
     readings: Readings
     axes: ObservedAxes
+    edges: ObservedEdges  # of bodies
     corners: ObservedCorners  # of the board on the base
     platform_corners: ObservedCorners
-    edges: ObservedEdges  # of bodies
 
     def factors(self, keys: tuple[str, ...]) -> tuple[Factor[State], ...]:
         """Return the factor of each kind; *keys* are the estimated intrinsics."""
@@ -58,7 +58,7 @@ class Observed(NamedTuple):
     @property
     def views(self) -> IntArray:
         """Indices of views with measurements."""
-        seen = (self.outlines, self.axes, self.corners, self.platform_corners, self.edges)
+        seen = (self.outlines, self.axes, self.edges, self.corners, self.platform_corners)
         return np.unique(np.concatenate([kind.view for kind in seen]))
 
     @property
@@ -97,8 +97,8 @@ def observed_arrays(
         observed,
         observed_readings(measurements, legs),
         observed_axes(axes, measurements, legs),
-        *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
         observed_edges(edges, measurements, legs, view_cameras if cameras is None else cameras),
+        *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
     )
 
 

@@ -265,8 +265,8 @@ class FitProblem(EstimationProblem[State]):
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
             observed_readings(measurements, self.legs),
             observed_axes(None, measurements, self.legs),
-            *observed_corners(None, measurements, ()),
             replace(observed_edges(None, measurements, self.legs, ()), bodies=self.edges.bodies),
+            *observed_corners(None, measurements, ()),
         )
         radii = self.block("radii")
         more = np.full((len(outlines.parts) - len(radii.unknown), 1), -1)
@@ -376,11 +376,11 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
         _scalars("radii", radii, "m", nominal, settings.radius_sigma * nominal, choices),
         intrinsics,
         _board_scales(boards, settings, choices),
+        _leans(legs.names, observed.edges.bodies),
         no_biases,
         Variables("camera_pose", camera_pose, Frames.moved, max_step=_MAX_STEP),
         Variables("board_pose", board_pose, Frames.moved, max_step=_MAX_STEP),
         Variables("own_zeros", all_free(observed.readings.by_zero.shape[1], 1)),
-        _leans(len(observed.edges.bodies)),
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
@@ -467,12 +467,12 @@ def arm_sigmas(
     }
 
 
-def _leans(n: int) -> Variables:
-    """Return the block of the leans of n bodies, with their prior."""
-    prior = GaussianPrior(
-        np.arange(3 * n, dtype=np.intp), np.zeros(3 * n), np.full(3 * n, LEAN_SIGMA)
-    )
-    return Variables("leans", all_free(n, 3), prior=prior)
+def _leans(names: Sequence[str], bodies: Sequence[tuple[int, str]]) -> Variables:
+    """Return the block of the leans of bodies, with their prior."""
+    labels = tuple(f"{names[leg]}.lean.{link}.{axis}" for leg, link in bodies for axis in "xyz")
+    n = len(labels)
+    prior = GaussianPrior(np.arange(n, dtype=np.intp), np.zeros(n), np.full(n, LEAN_SIGMA))
+    return Variables("leans", all_free(n // 3, 3), labels=labels, units=("rad",) * n, prior=prior)
 
 
 def _poses(n_poses: int, n_actuators: int) -> Variables:

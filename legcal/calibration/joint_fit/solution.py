@@ -323,13 +323,10 @@ def _estimates(
     problem: FitProblem, state: State, held: HeldDirections, covariance: Array
 ) -> Estimates:
     """Estimates of all parameters; *covariance* is of the named unknowns."""
-    legs, biases, parametrization = (
-        problem.legs,
-        problem.block("biases").labels,
-        problem.legs.parametrization,
-    )
+    legs, parametrization = problem.legs, problem.legs.parametrization
+    nuisance = {*problem.block("biases").labels, *problem.block("leans").labels}
     radii = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
-    unknown = [name for name in problem.named if name not in biases]
+    unknown = [name for name in problem.named if name not in nuisance]
     unknown_values = dict(zip(problem.named, problem.coordinates(state).tolist(), strict=True))
     values = dict(zip(parametrization.names, legs.vector(state.legs).tolist(), strict=True))
     values |= dict(zip(radii, state.radii.tolist(), strict=True))
