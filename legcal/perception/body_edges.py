@@ -228,7 +228,7 @@ def edges_of_body(grey: Grey, camera: Camera, body_in_view: BodyInView) -> list[
     beside /= np.linalg.norm(beside)
     pixel = _pixel_size(camera, middle, beside)
     n_side = int(np.ceil((REACH * body.radius / pixel + WINDOW) / STEP))
-    across: Array = np.arange(-n_side, n_side + 1) * STEP  # [px] at the middle
+    across = np.arange(-n_side, n_side + 1, dtype=np.float64) * STEP  # [px] at the middle
 
     def pixels(s: Array, v: Array) -> Array:
         X = A + s[..., None] * u + (pixel * v)[..., None] * beside
