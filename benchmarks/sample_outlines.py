@@ -24,7 +24,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics
 from legcal.machine.model import Machine
-from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognition import place_views
 from legcal.vision.cylinder import EPSILON

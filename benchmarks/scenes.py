@@ -36,7 +36,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.perception.camera_search import place_camera, refined, scores
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
-from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import TWO_POSES, place_views

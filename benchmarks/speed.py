@@ -39,9 +39,8 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.machine.kinematics import forward_kinematics
-from legcal.perception.detection import measure_outlines
 from legcal.perception.image_quality import measure_exposure
-from legcal.perception.outline import measure_in_brief
+from legcal.perception.outline import measure_in_brief, measure_outlines
 from legcal.perception.photographs import Photographs, measure_photographs, recognise_and_place
 from legcal.perception.placement import Placement, group_views
 from legcal.perception.view_fit import refine_views

@@ -17,11 +17,11 @@ from .data.dataset import Dataset as Dataset
 from .data.dataset import load_dataset as load_dataset
 from .data.new_dataset import SheetOptions as SheetOptions
 from .data.new_dataset import init as init
+from .descriptions.new_model import new as new
 from .errors import LegcalError as LegcalError
 from .exports.formats import export as export
 from .exports.subject import ExportOptions as ExportOptions
 from .machine.configurations import random_configurations as random_configurations
-from .machine.family import new as new
 from .machine.kinematics import Follower as Follower
 from .machine.kinematics import forward_kinematics as forward_kinematics
 from .machine.kinematics import inverse_kinematics as inverse_kinematics

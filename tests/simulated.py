@@ -12,7 +12,7 @@ from legcal.simulation.dataset import SimulatedDataset, simulate
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera
-from legcal.vision.camera_export import camera_info
+from legcal.vision.camera_file import camera_info
 
 PLACES = Path(__file__).parent / "data/camera_places.json"  # by machine and view
 SMALL = SimulationSettings(level=Level.OUTLINES, poses=3, views=2, seed=5)

@@ -20,8 +20,8 @@ from pydantic import BaseModel
 from legcal import evaluate, load_mechanism
 from legcal.cli.app import app
 from legcal.data.dataset_file import DatasetEntry
+from legcal.descriptions.table import TableFile
 from legcal.files.schema import parse_yaml, validate
-from legcal.machine.description_table import TableFile
 from legcal.machine.files import MechanismFile
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -25,12 +25,12 @@ from legcal.data.image_choice import dataset_at
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
+from legcal.descriptions.new_model import create_model
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry.motions import look_at, pose_distance
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.free_poses import find_free_poses, require_standing_joints

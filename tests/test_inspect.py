@@ -18,9 +18,9 @@ from simulated import simulated
 
 from legcal import evaluate, load_mechanism
 from legcal.calibration.evaluation import Evaluation
+from legcal.descriptions.new_model import create_model
 from legcal.errors import DidNotConverge, ModelError
 from legcal.machine.inspection import machine_document
-from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import geometries
 from legcal.report.calibration import accuracy_table

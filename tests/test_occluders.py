@@ -19,8 +19,7 @@ from legcal.machine.parameters import geometries
 from legcal.simulation.solids import PosedMachine, pose_machine, solids_of
 from legcal.simulation.visibility import legs_in_image
 from legcal.vision.camera import sample_camera
-from legcal.vision.sight import Bodies, visible_parts
-from legcal.vision.visibility import visible_segments
+from legcal.vision.visibility import Bodies, visible_parts, visible_segments
 
 ROOT = Path(__file__).parents[1]
 

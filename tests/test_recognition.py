@@ -30,6 +30,7 @@ from legcal.perception.camera_search import (
     place_by_edges,
     place_camera,
     place_near,
+    pose_hypotheses,
 )
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.edge_maps import EdgeMaps
@@ -46,7 +47,6 @@ from legcal.perception.pair_matching import (
     segment_equations,
 )
 from legcal.perception.placement import Group, Search, group_views
-from legcal.perception.pose_hypotheses import pose_hypotheses
 from legcal.perception.radii import MIN_CHANGE, RadiusFactors, estimate_radii
 from legcal.perception.view_fit import (
     ViewFit,

@@ -33,7 +33,7 @@ from legcal.simulation.solids import (
     Sphere,
 )
 from legcal.vision.camera import Camera
-from legcal.vision.camera_export import camera_info
+from legcal.vision.camera_file import camera_info
 from legcal.vision.cylinder import outlines_of_axis
 
 ROOT = Path(__file__).resolve().parents[1]

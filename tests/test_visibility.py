@@ -28,8 +28,7 @@ from legcal.simulation.visibility import (
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import DistortionModel
-from legcal.vision.sight import Bodies, visible_parts
-from legcal.vision.visibility import in_picture, pixels_inside
+from legcal.vision.visibility import Bodies, in_picture, pixels_inside, visible_parts
 
 SHIPPED = (
     "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from legcal.calibration.clicks import click_notes
@@ -23,7 +24,7 @@ from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
-from legcal.calibration.joint_fit.scale import SCALE
+from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
@@ -31,7 +32,7 @@ from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session
 from legcal.data.corners import Corners
 from legcal.data.dataset import PLAN_NAME, POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
-from legcal.data.measurements import few
+from legcal.data.measurements import few, few_views
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
@@ -41,6 +42,8 @@ from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
+MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
+_ALONG = 9  # points along an outline
 _ROUNDED = 0.51e-4  # [mm or deg] of the commands there
 AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
@@ -87,8 +90,9 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, solution)
     else:
         change, sigma, found = _change_of_platform(platform)
-        if by_scale := _share_of_scale(platform):
-            found += f"; {by_scale}"
+        by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
+        found += "".join(f"; {clause}" for clause in (by_radii, by_readings) if clause)
+        if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
@@ -115,6 +119,7 @@ def judge(
         verdict,
         (
             *notes,
+            *_beyond_boards(dataset, solution),
             *click_notes(dataset, solution),
             *commanded(dataset),
             *_asked_lengths(dataset, solution, doubts),
@@ -133,6 +138,29 @@ def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
     return [
         f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
         for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
+    ]
+
+
+def _beyond_boards(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on views whose outlines leave the part of the image that boards covered."""
+    outlines, measurements = solution.outlines, dataset.measurements
+    view, along = measurements.view[outlines.row], np.linspace(0.0, 1.0, _ALONG)[:, None, None]
+    points = outlines.ends[:, 0] + along * (outlines.ends[:, 1] - outlines.ends[:, 0])
+    outside = dict[str, float]()
+    for v in np.unique(view[outlines.used]).tolist():
+        covered = measurements.views[v].camera.covered.astype(np.float32)
+        if len(covered):
+            pixels = points[:, (view == v) & outlines.used].reshape(-1, 2).tolist()
+            is_out = [cv2.pointPolygonTest(covered, pixel, False) < 0.0 for pixel in pixels]
+            outside[measurements.views[v].name] = float(np.mean(is_out))
+    far = [name for name, share in outside.items() if share > MAX_BEYOND]
+    if not far:
+        return []
+    share = 100.0 * max(outside[name] for name in far)
+    return [
+        f"Up to {share:.0f} % of the outlines of {few_views(far)} lie where the calibration of the "
+        "camera has seen no board: the lens is extrapolated there, beyond what its covariance "
+        "says; photograph the board there too, and calibrate the camera again."
     ]
 
 
@@ -203,6 +231,20 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
     return (
         f"the largest part of that is the scale of the machine ({1e3 * parts[0]:.3f} of "
         f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
+    )
+
+
+def _error_of_readings(platform: PlatformAccuracy, solution: Solution) -> str:
+    """Return a clause on what all readings may be wrong by, where that is more than the rest."""
+    predicted = (platform.workspace or platform.sigma).mean_displacement
+    parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
+    if not parts or parts[0].mean_displacement <= predicted:
+        return ""
+    witnesses = scale_witnesses(solution.posterior.problem)
+    rests = f"{witnesses[0]} alone" if len(witnesses) == 1 else few(witnesses)
+    return (
+        f"the scale rests on {rests}, and an error that all readings share, as of screws or belts, "
+        f"may add {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)} (1 sigma)"
     )
 
 

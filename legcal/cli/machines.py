@@ -88,9 +88,13 @@ def new(
     """Write a model, YAML and URDF, from a table of joints, a firmware or a few dimensions."""
     from rich.text import Text
 
-    from legcal.machine.family import Dimensions, description_of, write_template
+    from legcal.descriptions.new_model import (
+        Dimensions,
+        create_model,
+        description_of,
+        write_template,
+    )
     from legcal.machine.inspection import machine_document
-    from legcal.machine.model_builder import create_model
     from legcal.report.machine import inspect_table
     from legcal.report.render import report
 

@@ -84,8 +84,7 @@ def camera(
     from legcal.calibration.camera_calibration.calibration import calibrate_camera
     from legcal.calibration.camera_calibration.projection import compare_cameras
     from legcal.report.machine import camera_table, comparison_table
-    from legcal.vision.camera_export import convert_camera
-    from legcal.vision.camera_file import read_camera
+    from legcal.vision.camera_file import convert_camera, read_camera
 
     if compare:
         others = board, output, model, picture, to

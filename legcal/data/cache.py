@@ -30,7 +30,7 @@ from legcal.files.reading import MAX_DOCUMENT, MAX_IMAGE, read_bytes
 from legcal.files.schema import FileSchema
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.version import __version__
-from legcal.vision.board_file import board_document
+from legcal.vision.board import board_document
 
 FORMAT = 1
 _INCOMPLETE = "incomplete"  # the fingerprint while the table is being written: it matches nothing

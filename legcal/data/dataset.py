@@ -55,12 +55,10 @@ from legcal.files.schema import closest, describe
 from legcal.machine.files import shipped_folder, shipped_names
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.vision.board import FixedBoard, Link
-from legcal.vision.board_file import parse_boards
+from legcal.vision.board import FixedBoard, Link, parse_boards
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
-from legcal.vision.image_facts import ImageFacts
-from legcal.vision.image_file import Grey, decode_image, inspect_image
+from legcal.vision.image_file import Grey, ImageFacts, decode_image, inspect_image
 
 AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"

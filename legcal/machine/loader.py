@@ -35,7 +35,6 @@ from legcal.machine.cylinders import (
     with_cylinders,
     with_mesh_cylinders,
 )
-from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import (
     constraints_at,
     leg_equations,
@@ -44,6 +43,7 @@ from legcal.machine.equations import (
 from legcal.machine.files import LegcalBlock, MechanismFile
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
+from legcal.machine.inspection import mechanism_notes, proposal_notes
 from legcal.machine.leg import (
     MAX_LEGS,
     MAX_LENGTH,

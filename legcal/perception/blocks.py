@@ -12,10 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
-from legcal.perception.pixel_sums import PixelBins, PixelSums, applied
-from legcal.perception.profiles import Edge, fading, read_profiles
+from legcal.perception.profiles import (
+    Edge,
+    PixelBins,
+    PixelSums,
+    Samples,
+    applied,
+    fading,
+    read_profiles,
+    to_light,
+)
 from legcal.perception.tuning import BLOCK_SIGMAS
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey

@@ -26,7 +26,6 @@ from legcal.machine.leg import Cylinder, Leg
 from legcal.machine.model import Machine, vectors_at
 from legcal.machine.rods import joints_at, measured_readings
 from legcal.perception.candidate_pairs import CandidatePairs, Still, still_picture
-from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
     find_wrong_images,
     is_measurable,
@@ -34,8 +33,7 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
-from legcal.perception.light import reduce
-from legcal.perception.outline import Method, measure, measure_in_brief
+from legcal.perception.outline import Method, measure, measure_in_brief, measure_outlines
 from legcal.perception.placement import (
     Joined,
     Load,
@@ -50,7 +48,7 @@ from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision.camera import Camera, shared_cameras
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.image_file import Grey
+from legcal.vision.image_file import Grey, shrink
 from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
@@ -557,7 +555,7 @@ def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure,
     """Return the exposure of an image, and the reduced image if it is one of rows."""
     image = search.load(row)
     factor = search.reduction(int(search.measurements.view[row]))
-    return measure_exposure(image), reduce(image, factor) if row in rows else None
+    return measure_exposure(image), shrink(image, factor) if row in rows else None
 
 
 def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]:

@@ -32,12 +32,11 @@ from legcal.perception.candidate_pairs import (
     segments_of_reduced,
 )
 from legcal.perception.edge_maps import EdgeMaps
-from legcal.perception.light import reduce
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.perception.tuning import WINDOW_PX
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey
+from legcal.vision.image_file import Grey, shrink
 from legcal.vision.visibility import PredictedLeg, predict_legs
 
 Load = Callable[[int], Grey]  # the image of a row
@@ -83,7 +82,7 @@ class Search:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
-        return self.pairs_of_reduced(reduce(self.load(row), self.reduction(view)), view)
+        return self.pairs_of_reduced(shrink(self.load(row), self.reduction(view)), view)
 
     def reduction(self, view: int) -> int:
         """Return the factor by which the pictures of a view are reduced."""
@@ -95,7 +94,7 @@ class Search:
         views = [int(self.measurements.view[row]) for row in rows]
         factors = [self.reduction(view) for view in views]
         cameras = [self.measurements.views[view].camera for view in views]
-        small = [reduce(self.load(row), f) for row, f in zip(rows, factors, strict=True)]
+        small = [shrink(self.load(row), f) for row, f in zip(rows, factors, strict=True)]
         moving = [
             moving_pixels(picture, self.still[view]) if view in self.still else None
             for picture, view in zip(small, views, strict=True)

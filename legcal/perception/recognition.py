@@ -35,7 +35,7 @@ from legcal.perception.camera_search import (
     place_near,
     with_first,
 )
-from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture
 from legcal.perception.placement import (
     Group,

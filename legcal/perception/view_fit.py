@@ -40,8 +40,7 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import main_cylinders
-from legcal.perception.detection import measure_outlines
-from legcal.perception.outline import Method, measure
+from legcal.perception.outline import Method, measure, measure_outlines
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, NotPlaced, Placement, Search
 from legcal.perception.tuning import EVIDENCE, JOINT_ERROR, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX

@@ -58,7 +58,7 @@ from legcal.planning.poses import (
 from legcal.planning.session import Plan, PlannedView, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
-from legcal.vision.sight import Bodies, Seen, visible_parts
+from legcal.vision.visibility import Bodies, Seen, visible_parts
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images

@@ -35,8 +35,7 @@ from legcal.planning.places import (
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.planning.session import Plan
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision.board import Board
-from legcal.vision.board_file import board_document, board_of, parse_board
+from legcal.vision.board import Board, board_document, board_of, parse_board
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
 from legcal.workers import Run, Workers, worker_pool

@@ -47,10 +47,10 @@ from legcal.machine.model_writer import write_model
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, LaidBoard, Setting
 from legcal.planning.poses import HOME
 from legcal.version import __version__
-from legcal.vision.board_file import board_document
+from legcal.vision.board import board_document
 from legcal.vision.camera import Camera
-from legcal.vision.camera_export import camera_info
-from legcal.vision.sight import Seen
+from legcal.vision.camera_file import camera_info
+from legcal.vision.visibility import Seen
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
 HAND = "hand"  # the view of a hand-held camera

@@ -51,7 +51,7 @@ from legcal.simulation.session import (
 from legcal.simulation.settings import Level, SimulationSettings, joint_distance
 from legcal.simulation.truth import write_true_model
 from legcal.version import __version__
-from legcal.vision.camera_export import camera_info
+from legcal.vision.camera_file import camera_info
 from legcal.workers import Workers, is_number
 
 

@@ -51,8 +51,8 @@ from legcal.calibration.joint_fit.predicted import (
 from legcal.data.dataset import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files.schema import closest
-from legcal.machine.diagnostics import singularity_note
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.inspection import singularity_note
 from legcal.machine.leg import JointType
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine

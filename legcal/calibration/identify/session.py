@@ -60,7 +60,7 @@ from legcal.machine.ties import by_step, independent, machine_ties, on_ties
 from legcal.perception.body_edges import bodies_in_view, bodies_of, predicted_edges
 from legcal.vision.board import Board, FixedBoard, Link, facing_board
 from legcal.vision.camera import sample_camera
-from legcal.vision.sight import Bodies, visible_parts
+from legcal.vision.visibility import Bodies, visible_parts
 
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine

@@ -56,7 +56,7 @@ from legcal.machine.model import Machine
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.sight import Seen
+from legcal.vision.visibility import Seen
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths

@@ -244,7 +244,7 @@ def assemble_solution(
         gammas=gammas,
         sensitivities=(
             *sensitivities(cameras, normal, contradicted),
-            *sensitivity_to_scale(problem, state, kept),
+            *sensitivity_to_scale(problem, state, linear, kept),
         ),
         outlines=_with_rejections(outlines, fit),
         start=label,
