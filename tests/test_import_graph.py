@@ -104,6 +104,7 @@ PUBLIC: dict[str, set[str]] = {
         "agreement",
         "board_adjustment",
         "board_corners",
+        "body_edges",
         "camera_search",
         "candidate_pairs",
         "diagnostics",

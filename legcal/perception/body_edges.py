@@ -37,7 +37,6 @@ from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
 from legcal.machine.occluders import Occluder, PlacedOccluders
 from legcal.perception.blocks import BlockLine, fit_lines
-from legcal.perception.light import Samples
 from legcal.perception.photographs import Photographs
 from legcal.perception.placement import (
     Placement,
@@ -45,6 +44,7 @@ from legcal.perception.placement import (
     housings_of_legs,
     predict_legs_and_arms,
 )
+from legcal.perception.profiles import Samples
 from legcal.progress import Report
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
