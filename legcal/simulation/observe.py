@@ -135,9 +135,9 @@ def edges_of_bodies(
         return no_outlines()
     for row in range(len(images)):
         view, pose = scene.views[images.view[row]], images.pose[row]
-        ends, seen = (scene.A[pose], scene.B[pose]), [s.is_seen for s in images.shown[row]]
+        ends, every = (scene.A[pose], scene.B[pose]), np.ones(scene.A.shape[1], dtype=np.bool_)
         T = view.T_base_camera
-        for body in bodies_in_view(occluders, view.camera, T, ends, np.array(seen)):
+        for body in bodies_in_view(occluders, view.camera, T, ends, every):
             exact = predicted_edges(row, view.camera, body, 0.0)
             if not len(exact):
                 continue
