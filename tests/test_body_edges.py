@@ -8,18 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_sessions import MachineSession, body_edges, machine_session
-from simulated import PLACES, settings
+from simulated import PLACES, settings, small_camera
 
 from legcal import calibrate, load_dataset
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.motions import MotionEntry
 from legcal.machine.parameters import geometries
-from legcal.simulation.cameras import mild_lens
+from legcal.perception.body_edges import bodies_in_view, edges_of_body
+from legcal.perception.photographs import nominal_placement
+from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import Level
 from legcal.simulation.visibility import Viewpoint
 
 ROOT = Path(__file__).parents[1]
@@ -118,3 +122,27 @@ def test_a_leg_with_a_body_alone_is_identified_and_calibrated(
     assert np.linalg.norm(found.B - true.B) < 0.3 * np.linalg.norm(nominal.B - true.B)
     written = (tmp_path / "out/observations.csv").read_text()
     assert written.count("leg2_tube") == np.sum(dataset.body_edges.leg == 1)
+
+
+def test_edges_in_photographs_point_along_their_legs(with_bodies: Path, tmp_path: Path) -> None:
+    place = json.loads(PLACES.read_text())["hexapod"]["c1"]["T_base_camera"]
+    T = MotionEntry(**place).motion()
+    lens = read_lens(small_camera(tmp_path, 1000, 750))
+    seen_from = settings(level=Level.PHOTOGRAPHS, views=(Viewpoint("c1", lens, T),), poses=1)
+    made = simulate(with_bodies, tmp_path / "set", seen_from)
+    dataset, truth = load_dataset(made.folder), made.truth
+    m = dataset.measurements
+    back = truth.T_platform_Re.inv()
+    poses = [truth.T_base_Rb * T_Rb_Re * back for T_Rb_Re in nominal_poses(truth, m)[0]]
+    placement = nominal_placement(truth, m, poses)
+    grey, ends = dataset.image_reader([0])(0), (placement.A_base[0], placement.B_base[0])
+    every = np.ones(6, dtype=np.bool_)
+    found = 0
+    for body in bodies_in_view(truth.occluders, lens, T, ends, every):
+        for edge in edges_of_body(grey, lens, body):
+            rays = np.column_stack([lens.undistort(edge.ends), np.ones(2)])
+            h = np.cross(rays[0], body.B - body.A)
+            off = lens.line_offset(h[None] / np.linalg.norm(h), rays[1:, :2])
+            assert abs(float(off[0])) < 0.7
+            found += 1
+    assert found >= 6
