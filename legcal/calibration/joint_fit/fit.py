@@ -130,7 +130,7 @@ def refine(
         problem.require_determined()
         with explaining_missing_scale(problem):
             solution = _fit_from_best_start(problem, used, starts)
-        return dataclasses.replace(solution, edges=_edges_of(solution, edges))
+        return solution if edges is None else _with_edges(solution, edges)
 
     return _fit_without_wrong_arms(fitted, outlines, legs.nominal)
 
@@ -164,14 +164,24 @@ def _fit_without_wrong_arms(
                 return dataclasses.replace(solution, notes=(*notes, *solution.notes))
 
 
-def _edges_of(solution: Solution, edges: Outlines | None) -> Outlines | None:
-    """Return the edges of bodies with the rejections of a fit."""
-    if edges is None:
-        return None
+def _with_edges(solution: Solution, edges: Outlines) -> Solution:
+    """Return a solution with the edges of bodies and their rejections, and a detail on them."""
     problem = solution.posterior.problem
+    used, weight = problem.edges, np.ravel(problem.factor("edges").whitening)
     disagrees = np.zeros(len(edges), dtype=np.bool_)
-    disagrees[problem.edges.index] = np.ravel(problem.factor("edges").whitening) == 0.0
-    return edges.reject(disagrees, Reason.DISAGREES)
+    disagrees[used.index] = weight == 0.0
+    if not weight.any():
+        return dataclasses.replace(solution, edges=edges.reject(disagrees, Reason.DISAGREES))
+    sigma = float(np.median(1.0 / weight[weight > 0.0]))
+    detail = (
+        f"{np.count_nonzero(weight)} of {len(edges)} edges of bodies were used; one end of an "
+        f"edge, seen from the other, is known to {sigma:.2f} px."
+    )
+    return dataclasses.replace(
+        solution,
+        edges=edges.reject(disagrees, Reason.DISAGREES),
+        details=(*solution.details, detail),
+    )
 
 
 def _origin(start: Start) -> str:
