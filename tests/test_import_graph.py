@@ -91,7 +91,7 @@ PUBLIC: dict[str, set[str]] = {
         "readings_sheet",
         "reasons",
     },
-    "recordings": {"importing"},
+    "recordings": {"arrivals", "importing"},
     "estimation": {
         "clusters",
         "loss",
@@ -139,6 +139,7 @@ PUBLIC: dict[str, set[str]] = {
         "link_joints",
         "location.document",
         "location.locate",
+        "ordered_dataset",
         "pipeline",
         "quantities",
         "result",
@@ -147,7 +148,7 @@ PUBLIC: dict[str, set[str]] = {
         "verification",
         "workspace_errors",
     },
-    "planning": {"places", "request", "session"},
+    "planning": {"places", "request", "session", "shooting"},
     "exports": {"formats", "subject"},
     "scene": {"motions"},
     "report": {
@@ -159,7 +160,7 @@ PUBLIC: dict[str, set[str]] = {
         "render",
         "session",
     },
-    "viewer": {"address", "click_server", "source", "window"},
+    "viewer": {"address", "click_server", "local_server", "shooting", "source", "window"},
     "cli": set(),
     "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }

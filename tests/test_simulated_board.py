@@ -46,7 +46,7 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("board") / "held"
     settings = SimulationSettings(
-        level=Level.AXES, poses=3, views=1, board="aprilgrid", hand_held=True, sigma_px=0.0
+        level=Level.OUTLINES, poses=3, views=1, board="aprilgrid", hand_held=True, sigma_px=0.0
     )
     simulate(machine(), folder, settings)
     return folder

@@ -154,7 +154,6 @@ def fit_outlines(
         fitted_outlines,
         starts(fitted, fitted_outlines, placement, steps, board),
         settings,
-        axes=fitted.axes,
         board=None if board is None else board.at(fitted.rows),
         choices=choices,
         edges=fitted_edges,
@@ -166,8 +165,6 @@ def fit_outlines(
 
 def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
     """Raise NotVisible if no image shows a leg that its view should show."""
-    if fitted.axes is not None:
-        return
     unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
     if unseen:
         raise NotVisible(

@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
 from legcal.causes import Cause, by_cause
-from legcal.data.axes import LegAxes
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset
 from legcal.data.image_choice import dataset_at
@@ -70,7 +69,6 @@ class OrderedDataset:
     progress: Report
     machine: Machine  # in canonical order, as all following fields
     measurements: Measurements
-    axes: LegAxes | None
     rows: IntArray  # indices of these images among all images
     # T_base_platform estimated from images, by row among all images, if readings do not give it
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
@@ -156,6 +154,17 @@ class OrderedDataset:
         """Return T_Rb_Re of every pose by the readings and other legs, in R_b and R_e."""
         return start_from(legs, self.measurements, self.fitted_legs, (), self.T_Rb_Re, "").T_Rb_Re
 
+    def turned(self, zeros: Mapping[str, float]) -> OrderedDataset:
+        """Return the dataset with the readings of motors that stand further than they read.
+
+        *zeros* are by motor [m or rad]: with readings corrected, the nominal model holds.
+        """
+        further = np.array([zeros.get(leg.motor_label, 0.0) for leg in self.machine.legs])
+        if not further.any():
+            return self
+        corrected = replace(self.measurements, q=self.measurements.q + further)
+        return replace(self, measurements=corrected)
+
     def rows_of(self, file_rows: IntArray) -> IntArray:
         """Return the rows of images in canonical order, given their rows in the files."""
         return np.sort(inverse(self.order.rows)[file_rows])
@@ -186,7 +195,6 @@ class OrderedDataset:
         return replace(
             self,
             measurements=measurements_at(self.measurements, rows),
-            axes=None if self.axes is None else self.axes.at(rows),
             rows=self.rows[rows],
         )
 
@@ -214,7 +222,6 @@ def order_dataset(
         progress=progress,
         machine=dataset.machine.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
-        axes=None if dataset.axes is None else order.reorder(dataset.axes),
         rows=np.arange(dataset.measurements.n_rows),
     )
 

@@ -44,6 +44,7 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformErro
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
+from legcal.calibration.only import GroupEstimate
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
@@ -146,6 +147,8 @@ class Calibration(Summarised):
         What looks wrong with the session, the likeliest first; empty where nothing does.
     overlays : dict
         The overlays beside the result, relative to its folder, by row of the measurements.
+    group : GroupEstimate or None
+        The zeros, the lengths or all parts, with tolerances as priors; None where not asked for.
     """
 
     dataset: Dataset
@@ -158,6 +161,7 @@ class Calibration(Summarised):
     corners: Corners | None = None
     diagnosis: tuple[Diagnosis, ...] = ()
     overlays: Mapping[int, str] = field(default_factory=dict)
+    group: GroupEstimate | None = None
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
@@ -185,8 +189,7 @@ def _result_of(calibration: Calibration) -> Result:
     machine, measurements = dataset.machine, dataset.measurements
     names, views = machine.leg_names, measurements.views
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    o, axes = solution.outlines, dataset.axes
-    rows, corners = o.row[o.used] if axes is None else axes.row, calibration.corners
+    rows, corners = solution.outlines.row[solution.outlines.used], calibration.corners
     if corners is not None:
         rows = np.concatenate([rows, corners.row[corners.used]])
     shown = np.unique(measurements.view[rows]).tolist()
@@ -244,6 +247,8 @@ def _result_of(calibration: Calibration) -> Result:
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
+        only=None if calibration.group is None else calibration.group.group,
+        zeros=None if calibration.group is None else calibration.group.zeros,
         overlays=_overlays(calibration),
     )
 
@@ -317,10 +322,6 @@ def _staged(calibration: Calibration) -> Staged | NoSteps:
 
 def _observations(calibration: Calibration) -> Observations:
     """Return what the fit was made from."""
-    axes, n_images = calibration.dataset.axes, calibration.dataset.measurements.n_rows
-    if axes is not None:
-        n = len(axes)
-        return Observations(kind="axes", used=n, total=n, images=n_images, rejected={})
     outlines = calibration.solution.outlines
     reasons = Counter(
         str(why.reason)
@@ -331,7 +332,7 @@ def _observations(calibration: Calibration) -> Observations:
         kind="outlines",
         used=int(outlines.used.sum()),
         total=len(outlines),
-        images=n_images,
+        images=calibration.dataset.measurements.n_rows,
         rejected=dict(reasons.most_common()),
         left_out=left_out_blocks(calibration.dataset.measurements, images_left_out(outlines)),
     )

@@ -81,10 +81,6 @@ def plan_detection(
 
 def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     """Return :func:`plan_detection` for a dataset with the files in its folder."""
-    if dataset.axes is not None:  # they take the place of images
-        none = np.zeros(0, dtype=np.intp)
-        from_user = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
-        return DetectionPlan(none, no_outlines(), from_user)
     entry = _read_entry(dataset.folder / CACHE_NAME)
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     has_image = np.array(
@@ -106,7 +102,7 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
 def note_on_missing_photographs(dataset: Dataset) -> list[str]:
     """Return a note on outlines of earlier detection whose photographs are no longer there."""
     entry, table = _read_entry(dataset.folder / CACHE_NAME), dataset.observations
-    if entry is None or table is None or dataset.axes is not None:
+    if entry is None or table is None:
         return []
     m, given = dataset.measurements, set(entry.given)
     names = places(m)

@@ -102,7 +102,6 @@ class Session:
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
-    shows_arms: bool = True  # which a table of axes does not
     occluders: tuple[Occluder, ...] = ()  # solids of legs; bodies among them have edges
 
     @property
@@ -149,11 +148,7 @@ class Session:
             bodies = Bodies.at(self.fitted.nominal, self.R[pose], self.t[pose], self.mean_length)
             seen = visible_parts(view.camera, self.places[v], bodies, stated=self.seen[v])
             tables.append(predicted_outlines(seen, row, DEFAULT_NOISE))
-        outlines = join_outlines(tables)
-        if self.shows_arms:
-            return outlines
-        parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
-        return outlines.choose(np.array([not self.legs[j].is_arm(p) for j, p in parts]))
+        return join_outlines(tables)
 
     @cached_property
     def edges(self) -> Outlines:
@@ -398,8 +393,7 @@ def random_postures(machine: Machine, legs: Sequence[Leg], count: int) -> tuple[
 
 
 def recorded_session(
-    # A view is taken to show the legs that have axes in it; without a table of axes those that it
-    # names, or all, which have a visible cylinder
+    # A view is taken to show the legs that it names, or all, which have a visible cylinder
     dataset: Dataset,
     *,
     twists: bool = False,  # count twists of legs and gains of actuators among the parameters
@@ -433,10 +427,6 @@ def recorded_session(
     ]
     of_views = [[view.uses(leg.name) for leg in machine.legs] for view in views]
     seen = np.array(of_views, dtype=np.bool_) & is_visible
-    if dataset.axes is not None:
-        shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)
-        shown_legs[m.view[dataset.axes.row], dataset.axes.leg] = True
-        seen = shown_legs[used]
     A, B = ends_at_pose(legs, home)
     shown = [np.flatnonzero(row).tolist() for row in seen]
     placed = default_cameras(A, B, shown, machine.spatial, rng)
@@ -468,8 +458,7 @@ def recorded_session(
         unread=np.isnan(m.q_of_poses),
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),
-        shows_arms=dataset.axes is None,
-        occluders=() if dataset.axes is not None else solids,
+        occluders=solids,
     )
 
 
