@@ -102,6 +102,7 @@ PUBLIC: dict[str, set[str]] = {
         "agreement",
         "board_adjustment",
         "board_corners",
+        "body_edges",
         "camera_search",
         "candidate_pairs",
         "diagnostics",

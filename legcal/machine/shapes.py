@@ -600,6 +600,11 @@ class PlacedOccluders:
         R = T_base_camera[:3, :3]
         return replace(self, R=R.T @ self.R, t=(self.t - T_base_camera[:3, 3]) @ R)
 
+    def without_leg(self, leg: int) -> PlacedOccluders:
+        """Return those that a leg does not carry."""
+        kept = [i for i, occluder in enumerate(self.occluders) if occluder.leg != leg]
+        return PlacedOccluders(tuple(self.occluders[i] for i in kept), self.R[kept], self.t[kept])
+
     def __len__(self) -> int:
         return len(self.occluders)
 
