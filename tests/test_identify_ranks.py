@@ -192,6 +192,7 @@ def test_the_joint_fit_determines_all_where_counts_fail(
     assert 1e-5 < sigma.dX_m < 2e-2
 
 
+@pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(
     ("name", "views", "weak", "kinds"),
     [
