@@ -19,6 +19,7 @@ from hexapod_example import HEXAPOD, copy_of_the_example
 
 from legcal.data.dataset import load_dataset
 from legcal.errors import OutOfResources
+from legcal.files.folder import write_atomically
 from legcal.geometry.types import Array
 from legcal.planning import shooting
 from legcal.planning.shooting import GuidedSession
@@ -96,7 +97,7 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
         assert read_rows(session / "measurements.csv") == commanded
         (watched / "1.jpg").write_bytes(half)
         heard(dialogue, "1.jpg is c1 c1_k01")
-        grey = cv2.imread(str(HEXAPOD / "images" / "c1_k02.jpg"), cv2.IMREAD_GRAYSCALE)
+        grey = np.asarray(cv2.imread(str(HEXAPOD / "images" / "c1_k02.jpg"), cv2.IMREAD_GRAYSCALE))
         cv2.imwrite(str(watched / "soft.jpg"), cv2.GaussianBlur(grey, (0, 0), 5.0))
         assert "blurred by" in heard(dialogue, "soft.jpg was not taken")
         (watched / "other.jpg").write_bytes(photograph("c1_k07"))
@@ -132,7 +133,7 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
 def test_a_session_that_is_killed_between_its_files_goes_on(
     labelled: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write, guided = shooting.write_atomically, GuidedSession(labelled)
+    write, guided = write_atomically, GuidedSession(labelled)
     asked = guided.next()
     assert asked is not None
 
@@ -185,8 +186,10 @@ class Frames:
     def set(self, *_: Any) -> None:
         pass
 
+    release = set
+
     def read(self) -> tuple[bool, Array]:
-        image = cv2.imread(str(HEXAPOD / "images" / "c1_k01.jpg"))
+        image = np.asarray(cv2.imread(str(HEXAPOD / "images" / "c1_k01.jpg")))
         self.moving -= 1
         rng = np.random.default_rng(abs(self.moving))
         noisy = image + rng.normal(0.0, 3.0, image.shape) + 2.0 * (self.moving % 2)
@@ -201,12 +204,13 @@ def test_a_camera_photographs_when_two_frames_agree(monkeypatch: pytest.MonkeyPa
     assert camera.poll(wanted=False) is None
     path = camera.poll(wanted=True)
     assert path is not None
-    assert np.array_equal(cv2.imread(str(path)), frames.last)
+    assert np.array_equal(np.asarray(cv2.imread(str(path))), frames.last)
     assert frames.moving == -1  # the second frame at rest
     monkeypatch.setattr(arrivals, "PATIENCE", 0.5)
     frames.moving = 10**6
     with pytest.raises(OutOfResources, match="frames that still change"):
         camera.poll(wanted=True)
+    camera.close()
 
 
 def test_the_page_shows_what_is_asked_and_takes_words(session: Path, tmp_path: Path) -> None:

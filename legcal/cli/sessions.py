@@ -257,7 +257,7 @@ def shoot(
 
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning.shooting import GuidedSession
-    from legcal.recordings.arrivals import Arrivals, LiveCamera, WatchedFolder
+    from legcal.recordings.arrivals import LiveCamera, WatchedFolder
     from legcal.viewer.address import Address, check_address
     from legcal.viewer.local_server import HOST
     from legcal.viewer.shooting import WORDS, Dialogue, DialogueServer
@@ -271,12 +271,10 @@ def shoot(
         session,
         target=None if target is None else parse_quantity(target, LENGTH, "--target"),
     )
-    source: Arrivals
-    if watch is not None:
-        source = WatchedFolder(watch)
-    else:
-        lens = guided.dataset.measurements.views[0].camera
-        source = LiveCamera(camera or 0, lens.width, lens.height)
+    lens = guided.dataset.measurements.views[0].camera
+    source = (
+        LiveCamera(camera or 0, lens.width, lens.height) if watch is None else WatchedFolder(watch)
+    )
     dialogue = Dialogue(guided, source, typer.echo)
 
     def listen() -> None:
@@ -292,7 +290,12 @@ def shoot(
         threading.Thread(target=server.run, daemon=True).start()
         typer.echo(f"The same as a page: {server.address}")
         open_browser(str(server.address))
-    if dialogue.run():
+    try:
+        is_complete = dialogue.run()
+    finally:
+        if isinstance(source, LiveCamera):
+            source.close()
+    if is_complete:
         typer.echo(f"legcal calibrate {shlex.quote(str(session))} -o calibrated")
 
 

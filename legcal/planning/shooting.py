@@ -37,7 +37,7 @@ from legcal.data.image_tables import measurements_at
 from legcal.data.measurements import read_measurements
 from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
-from legcal.data.reading_units import ReadingUnit, reading_units
+from legcal.data.reading_units import reading_units
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, UsageError
 from legcal.files.folder import write_atomically
@@ -109,12 +109,7 @@ class GuidedSession:
         If there is neither a plan nor a target.
     """
 
-    def __init__(
-        self,
-        folder: str | Path,
-        *,
-        target: float | None = None,
-    ) -> None:
+    def __init__(self, folder: str | Path, *, target: float | None = None) -> None:
         self.dataset = load_dataset(folder, check_images=False)
         self.folder, self.target = self.dataset.folder, target
         self.machine = self.dataset.machine
@@ -124,11 +119,10 @@ class GuidedSession:
         self.facts: dict[str, ImageFacts] = {}
         self.notes: list[str] = []  # on photographs that are there
         self.skipped: set[tuple[str, str]] = set()  # views and poses of the plan to leave out
-        entry = read_dataset_file(self.dataset.yaml_path)
-        legs = self.machine.legs
-        self._units: dict[str, ReadingUnit] = reading_units(
-            self.dataset.yaml_path, legs, entry.readings
-        )
+        self._accepted: list[str] = []  # images of this run
+        yaml_path = self.dataset.yaml_path
+        stated = read_dataset_file(yaml_path).readings
+        self._units = reading_units(yaml_path, self.machine.legs, stated)
         self._read_tables()
         if not self._left and target is None:
             raise UsageError(
@@ -367,20 +361,21 @@ class GuidedSession:
             if checked.legs is not None:
                 self.found[image] = checked.legs
         self._write_tables([*self._cells, cells])
+        self._accepted.append(image)
         if photograph is not None:
             self._digests[image] = _digest(photograph)
             self._place(asked.view)
 
     def undo(self) -> str:
-        """Take the last photograph out of the dataset; return its name, "" if there is none."""
-        if not self._cells:
+        """Take the last photograph of this run out of the dataset; return its name, or ""."""
+        if not self._accepted:
             return ""
-        image = self._cells[-1]["image"]
+        image = self._accepted.pop()
         self._write_tables(self._cells[:-1])
         if self._digests.pop(image, None):
             (self.folder / image).unlink(missing_ok=True)
             self._read_tables()
-        return image
+        return image or "The last row"
 
     def parsed(self, asked: Asked, text: str) -> Array:
         """Return readings (n_legs,) from numbers in mm or deg, in the order of the settings.

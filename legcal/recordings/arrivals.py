@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,18 +29,6 @@ PATIENCE = 10.0  # longest wait for frames that agree [s]
 _PAUSE = 0.2  # between two frames [s]
 
 
-class Arrivals(Protocol):
-    """Where photographs come from."""
-
-    asks: str  # what the owner does for the next one
-
-    def poll(self, *, wanted: bool) -> Path | None:
-        """Return a new photograph if there is one; *wanted*: one is asked for now."""
-
-    def waiting(self) -> list[str]:
-        """Return the names of files that are not complete yet."""
-
-
 class WatchedFolder:
     """New photographs in a folder; those that are there already are left alone.
 
@@ -48,7 +36,7 @@ class WatchedFolder:
     waited for.
     """
 
-    asks = "photograph it"
+    asks = "photograph it"  # what the owner does for the next one
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -59,25 +47,21 @@ class WatchedFolder:
             )
         self._seen = self._files()
         self._last: dict[Path, tuple[int, int]] = {}
-        self._incomplete: set[str] = set()
+        self.incomplete: set[str] = set()  # names of new files that are not complete yet
 
     def poll(self, *, wanted: bool = True) -> Path | None:
         """Return the oldest new photograph that is complete; each once."""
         files = {
             path: state for path, state in self._files().items() if state != self._seen.get(path)
         }
-        before, self._last, self._incomplete = self._last, files, set()
+        before, self._last, self.incomplete = self._last, files, set()
         for path, state in sorted(files.items(), key=lambda entry: (entry[1][1], entry[0])):
             if before.get(path) != state or _is_cut_off(path):
-                self._incomplete.add(path.name)
+                self.incomplete.add(path.name)
                 continue
             self._seen[path] = state
             return path
         return None
-
-    def waiting(self) -> list[str]:
-        """Return the names of new files that are not complete yet."""
-        return sorted(self._incomplete)
 
     def _files(self) -> dict[Path, tuple[int, int]]:
         """Return size and time of change [ns] of the photographs in the folder."""
@@ -125,6 +109,7 @@ class LiveCamera:
             )
         self._camera.set(cv2.CAP_PROP_FRAME_WIDTH, width)
         self._camera.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+        self.incomplete: set[str] = set()  # frames are complete
         self._folder = tempfile.TemporaryDirectory()
         self._n = 0
 
@@ -153,9 +138,10 @@ class LiveCamera:
             "machine stands still, see that its light does not flicker, and press Enter again."
         )
 
-    def waiting(self) -> list[str]:
-        """Return nothing: frames are complete."""
-        return []
+    def close(self) -> None:
+        """Let go of the camera, and remove its photographs."""
+        self._camera.release()
+        self._folder.cleanup()
 
 
 def agree(first: Array, second: Array) -> bool:

@@ -13,7 +13,7 @@ from legcal.geometry.types import Array
 from legcal.pages.document import Dialogue as DialogueBlock
 from legcal.pages.document import Page, Section, page_html
 from legcal.planning.shooting import Asked, Checked, GuidedSession
-from legcal.recordings.arrivals import Arrivals
+from legcal.recordings.arrivals import LiveCamera, WatchedFolder
 from legcal.viewer.local_server import HTML, LocalServer
 
 WORDS = "keep (take the refused one), skip (leave the pose out), undo (take the last one out), quit"
@@ -29,7 +29,10 @@ class Dialogue:
     """
 
     def __init__(
-        self, session: GuidedSession, source: Arrivals, say: Callable[[str], None]
+        self,
+        session: GuidedSession,
+        source: WatchedFolder | LiveCamera,
+        say: Callable[[str], None],
     ) -> None:
         self.session, self.source = session, source
         self.words = queue.SimpleQueue[str]()
@@ -37,7 +40,7 @@ class Dialogue:
         self._say = say
         self._q: Array | None = None  # typed readings of the pose that is asked
         self._refused: tuple[Path, Checked] | None = None
-        self._before: list[str] = []  # incomplete files of the last look
+        self._before: set[str] = set()  # incomplete files of the last look
         self._told: set[str] = set()  # of these, those that were named
         self.asked: Asked | None = None
         self._shown: dict[str, Any] = {"prompt": [], "known": "", "taken": 0, "of": 1}
@@ -134,11 +137,10 @@ class Dialogue:
         self._ask()
 
     def _tell_waiting(self) -> None:
-        names = self.source.waiting()
-        if new := [name for name in names if name in self._before and name not in self._told]:
+        if new := sorted((self.source.incomplete & self._before) - self._told):
             self.say(f"  waiting for the rest of {', '.join(new)}")
         self._told.update(new)
-        self._before = names
+        self._before = set(self.source.incomplete)
 
     @property
     def known(self) -> str:
