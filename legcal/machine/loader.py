@@ -580,10 +580,10 @@ def _where(*, spatial: bool) -> str:
 def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
     """Refuse a machine of arms with parallel axes, such as a five-bar or a 3-RRR."""
     moving = [joint for joint in urdf.joints.values() if joint.moves and joint.type not in VIRTUAL]
+    if len(moving) < 2 or any(joint.type == "prismatic" for joint in moving):
+        return
     poses = reference_poses(urdf)
     axes = [poses[joint.child].rotation.apply(joint.axis) for joint in moving]
-    if len(axes) < 2 or any(joint.type == "prismatic" for joint in moving):
-        return
     if all(parallel(axes[0], axis) for axis in axes):
         raise _plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path)
 
