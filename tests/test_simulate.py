@@ -197,6 +197,8 @@ def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
     assert m.views[1].legs == ("leg2", "leg5")
     assert made.seen.tolist() == [[True] * 6] * 2 + [[False, True, False, False, True, False]] * 2
     assert m.pose.tolist() == [0, 1, 0, 1]
+    assert m.time is not None
+    assert m.time.tolist() == [0.0, 10.0, 0.0, 10.0]  # both views take a pose at once
     readings = np.array([[float(x) for x in row.split(",")] for row in rows])
     assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
 
@@ -259,7 +261,7 @@ def test_options_become_settings(tmp_path: Path) -> None:
         ({"errors": ParameterErrors(axes=0.1)}, "errors.axes"),  # type: ignore[arg-type]
         ({"appearance": "clean"}, "appearance"),
         ({"images": True}, "images"),
-        ({"level": "pictures"}, "level 'pictures', needed axes or outlines or photographs"),
+        ({"level": "pictures"}, "level 'pictures', needed outlines or photographs"),
         ({"sampling": "best"}, "sampling 'best'"),
         ({"poses": 10**9}, "poses, needed 1 to 100000"),
         ({"seed": 1.5}, "seed"),

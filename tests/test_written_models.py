@@ -313,7 +313,6 @@ def test_a_true_model_of_a_shipped_one_has_the_drawn_numbers(name: str, tmp_path
         product(["6-UPS", "3-UPU", "Tricept"], LAYOUTS),
         [
             ("6-UPS", "S as revolutes, hung from the platform"),
-            ("3-UPU", "cut before the slider"),
             ("Tricept", "cut behind the slider"),
             ("Tricept", "carried by leg 2"),
         ],

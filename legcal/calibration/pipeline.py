@@ -375,7 +375,7 @@ def _estimate(
         photographs, placement, data.progress, T_board_camera, method=measure_in_brief
     )
     seen.placement.require_one()
-    other_radii = bool(seen.placement.radii.factor)
+    other_radii = seen.photographs.machine is not photographs.machine
     if other_radii:
         data = replace(data, machine=seen.photographs.machine)
     data = data.with_poses(seen.free_poses)

@@ -147,8 +147,9 @@ def dataset_texts(
     machine: Machine,
     model: str,  # path of its YAML in the dataset
     views: Mapping[str, Any],
-    rows: Iterable[Sequence[Any]],  # view, image, pose, readings
+    rows: Iterable[Sequence[Any]],  # of *columns* and readings
     encoder_sigma: float | dict[str, float],
+    columns: Sequence[str] = ("view", "image", "pose"),
     **blocks: Any,
 ) -> dict[str, str]:
     """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
@@ -162,7 +163,7 @@ def dataset_texts(
     }
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     joints = [column.name for column in reading_columns(machine.legs)]
-    table = format_table(["view", "image", "pose", *joints], rows)
+    table = format_table([*columns, *joints], rows)
     return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}
 
 

@@ -311,15 +311,23 @@ def write_session(
         entry |= rough_view(view.T_base_camera, view.legs, machine)
         views[groups[v] if groups else view.name] = entry
     names, readings = list(groups) or [view.name for view in m.views], m.q[:, list(machine.motors)]
+    times = () if m.time is None else m.time.tolist()
     rows = (
-        [names[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row].tolist()]
+        [
+            names[v],
+            m.image[row],
+            m.pose_labels[m.pose[row]],
+            *times[row : row + 1],
+            *readings[row].tolist(),
+        ]
         for row, v in enumerate(m.view.tolist())
     )
+    columns = ["view", "image", "pose", *(["time"] if times else [])]
     blocks = {} if board is None else {"board": board}
     if lengths:
         blocks["parameters"] = {"lengths": dict(lengths)}
     sigma = dict(m.sigma_by_joint) or m.sigma_q
-    for name, text in dataset_texts(machine, model, views, rows, sigma, **blocks).items():
+    for name, text in dataset_texts(machine, model, views, rows, sigma, columns, **blocks).items():
         (folder / name).write_text(text, encoding="utf-8")
 
 

@@ -57,6 +57,7 @@ Streams = Mapping[str, np.random.Generator]
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
              "corners", "lengths")  # fmt: skip
 _MIN_SIGMA_Q = 1e-9  # [m] stated standard deviation of readings without noise
+_SECONDS_A_POSE = 10.0  # poses are taken one after the other, images of one a second apart
 _MIN_SEEN = 0.5  # minimum share of photographs of a view that show a leg named in its hint
 
 
@@ -382,6 +383,7 @@ def _recorded(
         if any(a.turns for a in truth.actuators)
         else {},
         pose_labels=tuple(labels[p] for p in visible_poses),
+        time=_SECONDS_A_POSE * images.pose + images.repeat,
     )
 
 
