@@ -170,8 +170,9 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
     ),
     "camera": (
         "the camera of {subject} moved by {size}",
-        "make the images after it a view of their own in dataset.yaml and measurements.csv, or "
-        "calibrate without those on one side of it (--leave-out {images})",
+        "look for a bumped tripod, or light that came from another side; make the images after it "
+        "a view of their own in dataset.yaml and measurements.csv, or calibrate without those on "
+        "one side of it (--leave-out {images})",
     ),
     "focal_length": (
         "the focal length of {subject} changed by {size}",
