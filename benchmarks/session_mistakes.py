@@ -9,10 +9,10 @@ come before the platform stands still, a motor has backlash, another scale or an
 commands stand for readings, a camera is bumped or refocused, its autofocus or its tripod moves in
 each image, light from another side shifts edges, a joint moves, all motors have another scale
 (``pitch``, which nothing in outlines shows). Each is calibrated; the platform error by eq (20)
-against the true machine is compared with what is stated, the error that all readings may share
-included. Printed are sessions that harm by more than three stated sigmas, how many of these are
-trusted, and how often the first doubt names their mistake; ``pitch`` is a kind apart. FILE keeps
-sessions as JSON lines; those in it are not done again. About 3 s a session.
+against the true machine is compared with what is stated, for mistakes of the scale with the error
+that all readings may share. Printed are sessions that harm by more than three stated sigmas, how
+many of these are trusted, and how often the first doubt names their mistake; ``pitch`` is a kind
+apart. FILE keeps sessions as JSON lines; those in it are not done again. About 5 s a session.
 """
 
 import argparse
@@ -223,9 +223,10 @@ def report(lines: list[dict[str, object]]) -> None:
     for kind in (HEALTHY, *KINDS):
         of_kind = [line for line in lines if line["kind"] == kind]
         judged = [line for line in of_kind if "refused" not in line]
+        of_scale = kind == PITCH or kind in OF_SCALE  # for others the sigma of the fit has to do
         harmful = [
             x for x in judged
-            if x["off_mm"] > N_SIGMAS * np.hypot.reduce([x["stated_mm"], *x["scale_mm"]])  # type: ignore[misc]
+            if x["off_mm"] > N_SIGMAS * np.hypot.reduce([x["stated_mm"], *x["scale_mm"][:of_scale]])  # type: ignore[index]
         ]  # fmt: skip
         named = 0
         for x in harmful:

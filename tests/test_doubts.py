@@ -273,7 +273,7 @@ def test_every_doubt_is_documented_with_its_light() -> None:
         is_grave = any(keyword.arg == "is_grave" for keyword in call.keywords)
         if isinstance(code, ast.Constant):
             made.setdefault(str(code.value), set()).add("red" if is_grave else "amber")
-    made |= {kind: {"amber"} for kind in (doubts.CAMERA, *get_args(Kind))}
+    made |= {kind: {"amber"} for kind in (doubts.CAMERA, doubts.TOLERANCE, *get_args(Kind))}
     assert made == _documented()
 
 
