@@ -64,7 +64,8 @@ def test_edges_make_a_machine_more_certain_and_know_their_noise() -> None:
     claimed = replace(edges, covariance=0.25 * edges.covariance)  # half of the true noise
     with_edges, rods = fitted(noisy, claimed, outlines), fitted(noisy, None, outlines)
     problem = with_edges.posterior.problem
-    scale = 1.0 / (problem.edges.sigma * np.ravel(problem.factor("edges").whitening))
+    whitening = np.asarray(problem.factor("edges").whitening)
+    scale = 1.0 / (problem.edges.sigma * whitening[:, 0, 0])
     np.testing.assert_allclose(scale, 2.0, rtol=0.15)
     names = rods.estimates.names
     assert names == with_edges.estimates.names

@@ -121,7 +121,8 @@ def new(
         written = write_template(output, dimensions, force=force)
         lines = (
             f"written: {' '.join(map(str, written))}",
-            f"Next: legcal new {shlex.quote(str(written[0]))} -o .",
+            "Next:",
+            f"  legcal new {shlex.quote(str(written[0]))} -o .",
         )
         show(
             as_json,
@@ -488,7 +489,8 @@ def example(
     copy_example(output)
     lines = (
         f"written: {output}",
-        f"Next: legcal calibrate {shlex.quote(str(output))} -o calibrated",
+        "Next:",
+        f"  legcal calibrate {shlex.quote(str(output))} -o calibrated",
     )
     show(
         as_json,

@@ -35,7 +35,7 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
-from legcal.machine.occluders import Occluder, PlacedOccluders
+from legcal.machine.shapes import Occluder, PlacedOccluders
 from legcal.perception.blocks import BlockLine, fit_lines
 from legcal.perception.photographs import Photographs
 from legcal.perception.placement import (

@@ -19,7 +19,7 @@ from legcal.data.reasons import USED
 from legcal.errors import NotVisible
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.occluders import Occluder
+from legcal.machine.shapes import Occluder
 from legcal.perception.body_edges import bodies_in_view, bodies_of, predicted_edges
 from legcal.simulation.solids import PosedMachine
 from legcal.simulation.visibility import Images, Viewpoint

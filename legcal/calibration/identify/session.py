@@ -41,7 +41,6 @@ from legcal.machine.configurations import random_poses
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, radius_name
 from legcal.machine.model import Machine
-from legcal.machine.occluders import Occluder
 from legcal.machine.parameters import (
     Parametrization,
     geometries,
@@ -56,6 +55,7 @@ from legcal.machine.rods import (
     joints_at,
     readings_of_rods,
 )
+from legcal.machine.shapes import Occluder
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
 from legcal.perception.body_edges import bodies_in_view, bodies_of, predicted_edges
 from legcal.vision.board import Board, FixedBoard, Link, facing_board

@@ -177,13 +177,26 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
     Axes keep their claimed covariances; only the robust loss guards against outliers among them.
-    *first* is the result of :func:`first_minimum`.
+    *first* is the result of :func:`first_minimum`. Readings of redundant motors that contradict
+    each other in many images bend a fit until outlines contradict it: they get rough standard
+    deviations then, so that what is wrong with them can be named.
 
     Raises
     ------
     DidNotConverge
         If a minimisation fails, most outlines or axes are outliers, or the rounds do not converge.
     """
+    try:
+        return _fit_in_rounds(problem, first)
+    except DidNotConverge:
+        if not problem.legs.is_redundant:
+            raise
+        rough = with_inflated_reading_noise(problem)
+        return _fit_in_rounds(rough, replace(first, linear=linearize(rough, first.state)))
+
+
+def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
+    """Fit with the noise of readings as it is."""
     possible = possible_biases(problem.outlines, problem.legs.names)
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]

@@ -8,7 +8,7 @@
     .replaceChildren(...lines.map((line) => Object.assign(document.createElement("li"), { textContent: line })));
   const show = (state) => {
     fill("asked", state.prompt.length ? state.prompt : ["No photograph is asked."]);
-    fill("said", state.lines.toReversed());
+    fill("said", [...state.lines].reverse());
     box.querySelector("[data-known]").textContent = state.known;
     const bar = box.querySelector("progress");
     bar.max = state.of;
