@@ -490,13 +490,6 @@ class ObservedEdges:
     def __len__(self) -> int:
         return len(self.index)
 
-    def chosen(self, which: BoolArray, scale: float = 1.0) -> ObservedEdges:
-        """Select edges, and scale their standard deviations."""
-        shared = "bodies", "on_actuators"
-        of_edge = [f.name for f in fields(self) if f.name not in shared]
-        chosen = replace(self, **{name: getattr(self, name)[which] for name in of_edge})
-        return replace(chosen, sigma=scale * chosen.sigma)
-
     def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return the offsets (n, 1) [px] of second ends with their derivatives."""
         arm = np.zeros(len(self), dtype=np.bool_)

@@ -250,11 +250,6 @@ class FitProblem(EstimationProblem[State]):
         )
         return other.with_factors(corners.factor(self.keys))
 
-    def with_edges(self, edges: ObservedEdges) -> FitProblem:
-        """Replace the edges of bodies; those left out keep their lean."""
-        other = self.changed(observed=self.observed._replace(edges=edges))
-        return other.with_factors(edges.factor(self.keys))
-
     def with_measurements(
         self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
     ) -> FitProblem:
