@@ -137,7 +137,7 @@ def main() -> None:
     rows = np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):
         start = time.perf_counter()
-        placed = place_views(search, rows, hints).recognised()
+        placed = place_views(search, rows, hints)
         print(f"recognition {words} rough camera poses: {time.perf_counter() - start:.2f} s")
     start = time.perf_counter()
     first, _ = measure_outlines(search, placed, rows.tolist())

@@ -73,7 +73,7 @@ def find(given: Given) -> Found:
     )  # fmt: skip
     begin = time.process_time()
     rows = np.arange(len(given.images))
-    found = place_views(search, rows, [None]).recognised()
+    found = place_views(search, rows, [None])
     middle = time.process_time()
     outlines, _ = measure_outlines(search, found, rows.tolist())
     groups = group_views(m, rows, [None], None)

@@ -23,16 +23,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from machine_kinds import measured_length
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from changed_rays import turned, with_rays, zoomed
+from changed_rays import turned, with_moved_joint, with_rays, zoomed
 
 from legcal import (
     LegcalError,
@@ -47,7 +45,7 @@ from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.data.dataset import Dataset
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.model import Machine
-from legcal.simulation.observe import Scene, outlines_of, shifted_outlines
+from legcal.simulation.observe import Scene, shifted_outlines
 from legcal.simulation.session import simulate_session, streams
 from legcal.simulation.settings import Level
 
@@ -115,51 +113,6 @@ def relit(dataset: Dataset, rows: BoolArray, size: float, angle: float) -> Datas
     new_h, new_ends = o.h.copy(), o.ends.copy()
     new_h[changed], new_ends[changed] = moved
     return replace(dataset, observations=replace(o, h=new_h, ends=new_ends))
-
-
-def with_moved_joint(
-    dataset: Dataset, scene: Scene, later: BoolArray, j: int, by: Array
-) -> Dataset:
-    """Return a session in which the joint at A of a leg from point to point moves by (3,) [m].
-
-    Outlines move by as much as exact ones do.
-    """
-    o = dataset.observations
-    assert o is not None
-    A, B = scene.A.copy(), scene.B.copy()
-    A[:, j] += by
-    for k in range(len(A)):
-        lengths = np.linalg.norm(scene.B[k] - scene.A[k], axis=1)
-
-        def platform(x: Array, B: Array = scene.B[k]) -> Array:
-            middle = B.mean(axis=0)
-            return np.asarray(Rotation.from_rotvec(x[:3]).apply(B - middle) + middle + x[3:])
-
-        def error(x: Array, k: int = k, lengths: Array = lengths, at: Any = platform) -> Array:
-            return np.asarray(np.linalg.norm(at(x) - A[k], axis=1) - lengths)
-
-        found = least_squares(
-            error,
-            np.zeros(6),
-            xtol=1e-14,
-            ftol=1e-14,
-            gtol=1e-14,
-        )
-        B[k] = platform(found.x)
-    before, after = outlines_of(scene), outlines_of(replace(scene, A=A, B=B))
-    at, place = (
-        [
-            (int(table.row[i]), int(table.leg[i]), table.part[i], int(table.edge[i]))
-            for i in range(len(table))
-        ]
-        for table in (o, before)
-    )
-    index = [place.index(key) for key in at]
-    moves = (later[o.row])[:, None, None]
-    ends = o.ends + np.where(moves, (after.ends - before.ends)[index], 0.0)
-    h = o.h + np.where(moves[..., 0], (after.h - before.h)[index], 0.0)
-    h /= np.linalg.norm(h, axis=1, keepdims=True)
-    return replace(dataset, observations=replace(o, h=h, ends=ends))
 
 
 def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,

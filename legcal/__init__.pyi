@@ -26,7 +26,7 @@ from .machine.kinematics import Follower as Follower
 from .machine.kinematics import forward_kinematics as forward_kinematics
 from .machine.kinematics import inverse_kinematics as inverse_kinematics
 from .machine.loader import load_mechanism as load_mechanism
-from .machine.mobility import singularity as singularity
+from .machine.closing import singularity as singularity
 from .machine.model import Machine as Machine
 from .machine.picture import plot_machine as plot_machine
 from .planning.request import plan as plan

@@ -259,6 +259,7 @@ def test_an_interrupted_run_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(
     ("shown", "named"),
     [

@@ -32,9 +32,9 @@ from legcal.errors import DatasetError, LegcalError, ModelError, OutOfClass, Usa
 from legcal.exports.formats import export, formats_of
 from legcal.exports.subject import ExportOptions, Subject, identifiers, load_subject
 from legcal.geometry.types import Array
+from legcal.machine.closing import COORDINATES, independent_coordinates
 from legcal.machine.configurations import random_poses
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.mobility import COORDINATES, independent_coordinates
 from legcal.machine.model import Machine
 from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.truth import write_true_model

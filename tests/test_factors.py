@@ -25,6 +25,7 @@ from fit_sessions import (
     SIGMA_PX,
     MachineSession,
     axes_session,
+    body_edges,
     corners_of,
     disturbed_start,
     irregular_hexapod,
@@ -64,6 +65,7 @@ from legcal.vision.camera import Camera, intrinsic_names
 from legcal.vision.cylinder import outlines_of_axis
 
 CARRIED = ("delta", "delta-round-arms", "3-prs")  # whose joints at A move
+WITH_BODIES = "hexapod", "delta", "3-rps"
 K = 0.1
 LOSS = PseudoHuber(K**-0.5)
 CHOICES = {
@@ -115,6 +117,7 @@ def _problem(name: str) -> tuple[FitProblem, State]:
         axes=axes,
         board=board,
         choices=CHOICES.get(name, Choices()),
+        edges=body_edges(session) if name in WITH_BODIES else None,
     )
     n = len(problem.outlines)
     if name == "nategh-agheli":

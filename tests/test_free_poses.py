@@ -152,6 +152,7 @@ def dense_rank(machine: Machine, n_views: int, n_images: int) -> int:
     return rank - n - 6 * (n_poses + n_views)
 
 
+@pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(
     ("kind", "n_views", "n_images"),
     thinned(

@@ -1,6 +1,7 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
 import pickle
+import re
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -14,7 +15,7 @@ from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
-from outside_machines import missing, scaled
+from outside_machines import OUTSIDE, missing, scaled
 from thinned import thinned
 
 from legcal.errors import OutOfClass, UsageError
@@ -378,3 +379,16 @@ def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(
     assert load_mechanism(path).urdf_path == path.with_suffix(".urdf")
     monkeypatch.chdir(tmp_path)  # where a folder has the name of a shipped model
     assert load_mechanism("hexapod").yaml_path == SHIPPED_YAML
+
+
+@pytest.mark.parametrize("name", ["u-off", "r-off", "s-in-two-points", "spin-RR", "turning-motor"])
+def test_a_refused_leg_says_what_was_found_and_what_is_needed(name: str, tmp_path: Path) -> None:
+    write, named = OUTSIDE[name]
+    write(tmp_path)
+    with pytest.raises(OutOfClass, match=re.escape(named[0])) as refused:
+        load_mechanism(tmp_path / "machine.yaml")
+    fact = refused.value.facts[0]
+    assert fact.found
+    assert fact.needed
+    assert fact.remedy
+    assert fact.file

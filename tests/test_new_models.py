@@ -14,11 +14,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.descriptions.new_model import Dimensions, create_model, description_of, write_template
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
+from legcal.machine.closing import singularity
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))

@@ -514,10 +514,10 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
     search = _search(_Made, made, np.array([made.posed(P) for P in spread]))
     monkeypatch.setattr(  # there are no images to measure outlines in
-        recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
+        recognition, "_decided_by_outlines", lambda search, pictures, task: task[1]
     )
     for hint in (T, turned):
-        placement = recognition.place_views(search, np.arange(4), [hint]).recognised()
+        placement = recognition.place_views(search, np.arange(4), [hint])
         placed = placement.T_base_camera[0]
         assert placed is not None
         assert lp.apart(T, placed)[1] < np.deg2rad(2.0)
@@ -530,15 +530,13 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     T, made, poses = lp.camera(rng), lp.machine(6), [lp.platform(rng) for _ in range(4)]
     _Made.made[:] = lp.pictures(made, T, poses, rng, missing=1.1)
     search = _search(_Made, made, np.array([made.posed(P) for P in poses]))
-    monkeypatch.setattr(
-        recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
-    )
+    monkeypatch.setattr(recognition, "_decided_by_outlines", lambda search, pictures, task: task[1])
     monkeypatch.setattr(recognition, "_by_edges", lambda search, task: task.by_pairs)
     view = search.measurements.views[0]
     for is_placed in (False, True):
         views = (replace(view, is_placed=is_placed),)
         search = replace(search, measurements=replace(search.measurements, views=views))
-        placement = recognition.place_views(search, np.arange(4), [T]).recognised()
+        placement = recognition.place_views(search, np.arange(4), [T])
         assert (placement.T_base_camera[0] is not None) == is_placed
         assert ("c1" in placement.unplaced) != is_placed
     placed = placement.T_base_camera[0]

@@ -26,7 +26,7 @@ from legcal.data.image_choice import image_sequences
 from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.closing import solve_poses
+from legcal.machine.closing import generic_configurations, solve_poses
 from legcal.machine.configurations import feasible_poses, random_configurations
 from legcal.machine.kinematics import (
     Follower,
@@ -35,7 +35,6 @@ from legcal.machine.kinematics import (
     platform_in_base,
 )
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import generic_configurations
 from legcal.machine.model import Machine, slider_columns
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import reading_residuals
@@ -212,9 +211,12 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
-def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(tmp_path: Path) -> None:
+@pytest.mark.parametrize("slip", [3e-4, 1e-3])
+def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(
+    slip: float, tmp_path: Path
+) -> None:
     session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=8)
-    m, slip = session.measurements, 3e-4
+    m = session.measurements
     later = m.pose >= 4
     slipped = dataclasses.replace(m, q=m.q + slip * np.outer(later, np.arange(7) == 3))
     found = refine(session.legs, slipped, session.outlines, session.start)

@@ -28,6 +28,7 @@ from legcal.data.image_tables import (
 )
 from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, few, images_in_words, row_names
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, IntArray
@@ -92,6 +93,12 @@ class OrderedDataset:
             edge_pairs=self.edge_pairs,
             clicked_poses=self._clicked_poses(),
         )
+
+    @property
+    def body_edges(self) -> Outlines | None:
+        """The edges of bodies that were measured before, in all images."""
+        edges = self.dataset.body_edges
+        return None if edges is None else self.order.reorder(edges)
 
     def _clicked_poses(self) -> dict[int, tuple[RigidTransform, ...]]:
         """Return T_base_platform from clicks, by pose, if readings do not give it."""

@@ -362,7 +362,9 @@ def _estimate(
     kept_gammas = known_gammas(data.photographs.keep, data.measurements)
     photographs = data.photographs.with_gammas(kept_gammas)
     if len(photographs.detect) == 0:  # outlines, or axes, are given
-        estimate = fit_outlines(fitted, given_outlines(photographs), placement, board, options)
+        outlines = given_outlines(photographs)
+        edges = data.body_edges
+        estimate = fit_outlines(fitted, outlines, placement, board, options, edges=edges)
         return replace(
             estimate,
             image_notes=data.plan.notes,
@@ -460,7 +462,8 @@ def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[
     if estimate.other_radii or estimate.diagnosis or len(plan.detect) == 0:
         return []
     outlines = data.order.restore(estimate.outlines)
-    note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes)
+    edges = None if estimate.edges is None else data.order.restore(estimate.edges)
+    note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes, edges)
     return [note] if note else []
 
 

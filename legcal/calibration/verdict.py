@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -67,7 +68,8 @@ def judge(
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
     Cameras that the measurements contradict count there with what they do to the platform. What
-    speaks against the result (:mod:`legcal.calibration.doubts`) keeps it from being trusted.
+    speaks against the result (:mod:`legcal.calibration.doubts`) keeps it from being trusted, and
+    refuses it where that may move the platform by more than the calibration does.
     """
     machine, measurements = dataset.machine, dataset.measurements
     q = measurements.q_of_poses.copy()
@@ -105,6 +107,10 @@ def judge(
         found = f"{group.sentence}; {found}"
         others = (doubt for doubt in doubts if doubt.code != TOLERANCE)
         doubts = (*others, *group.doubts)
+    doubts = tuple(
+        replace(doubt, is_grave=doubt.is_grave or (doubt.sigma_dX_m or 0.0) > change)
+        for doubt in doubts
+    )
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
         found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"

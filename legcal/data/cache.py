@@ -22,6 +22,7 @@ from legcal.data.outlines import (
     Outlines,
     is_edited,
     no_outlines,
+    with_body_edges,
     write_observations,
 )
 from legcal.files.folder import write_atomically
@@ -191,6 +192,7 @@ def store_outlines(
     current: str,
     from_user: BoolArray,  # (n_rows,) ``DetectionPlan.given``
     notes: Sequence[str] = (),
+    body_edges: Outlines | None = None,
 ) -> str | None:
     """Write outlines and the fingerprint of their inputs beside the dataset.
 
@@ -208,7 +210,8 @@ def store_outlines(
     path = dataset.folder / OBSERVATIONS_NAME
     try:
         _write_entry(dataset.folder, entry)
-        write_observations(path, outlines, dataset.measurements, dataset.machine.leg_names)
+        table = with_body_edges(outlines, body_edges)
+        write_observations(path, table, dataset.measurements, dataset.machine.leg_names)
         _write_entry(dataset.folder, entry | {"fingerprint": current})
     except OSError as error:
         return (

@@ -37,7 +37,7 @@ from legcal.data.measurements import (
     read_measurements,
     unread_motors,
 )
-from legcal.data.outlines import Outlines, read_observations
+from legcal.data.outlines import Outlines, are_of_bodies, read_observations
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reading_units import (
     SERVO_SIGMA,
@@ -79,8 +79,9 @@ class Dataset:
     camera_paths: tuple[Path, ...]  # the camera file of each view
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
-    observations: Outlines | None  # the rows of ``observations.csv`` if there is one
+    observations: Outlines | None  # the outlines in ``observations.csv`` if there is one
     table_notes: tuple[str, ...] = ()  # oddities that are allowed in tables and the dataset file
+    body_edges: Outlines | None = None  # the straight edges of bodies in ``observations.csv``
     overrides: tuple[Override, ...] = ()  # parameters by name, from the block ``parameters``
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
@@ -324,6 +325,7 @@ def load_dataset(
         measurements, of_clicks = place_by_landmarks(
             path, machine, measurements, landmarks, may_be_wrong=not check_clicks
         )
+    observations, body_edges = _read_observed(folder, machine, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
@@ -335,7 +337,8 @@ def load_dataset(
             spline_teeth=entry.spline_teeth or machine.spline_teeth,
         ),
         measurements=measurements,
-        observations=read_outlines(folder, machine, measurements),
+        observations=observations,
+        body_edges=body_edges,
         table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
@@ -473,11 +476,20 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
 
 def read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
     """Return the outlines beside the dataset, if there are any."""
+    return _read_observed(folder, machine, measurements)[0]
+
+
+def _read_observed(
+    folder: Path, machine: Machine, measurements: Measurements
+) -> tuple[Outlines | None, Outlines | None]:
+    """Return the outlines beside the dataset and the edges of bodies; None where there are none."""
     path = folder / OBSERVATIONS_NAME
     if not os.path.exists(path):
-        return None
+        return None, None
     is_own = (folder / CACHE_NAME).exists()
-    return read_observations(path, machine.legs, measurements, skip_stale=is_own)
+    table = read_observations(path, machine.legs, measurements, skip_stale=is_own)
+    of_bodies = are_of_bodies(table)
+    return table.choose(~of_bodies), table.choose(of_bodies) if of_bodies.any() else None
 
 
 def _unused_views(path: Path, measurements: Measurements) -> list[str]:

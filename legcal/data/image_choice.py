@@ -268,6 +268,7 @@ def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
         dataset,
         measurements=measurements_at(dataset.measurements, rows),
         observations=None if observations is None else observations.at(rows),
+        body_edges=None if dataset.body_edges is None else dataset.body_edges.at(rows),
         corners=None if corners is None else corners.at(rows),
         landmarks=None if dataset.landmarks is None else dataset.landmarks.at(rows),
     )

@@ -11,11 +11,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.files.motions import Pose
 from legcal.files.schema import Document, Number, SparseDocument, Triple
 from legcal.geometry.types import Array
-from legcal.machine.closing import project_pose
+from legcal.machine.closing import LOOSE, dimensionless, project_pose, singularity
 from legcal.machine.files import LegcalBlock, motor_entries
 from legcal.machine.home import home_reading_in_words, legs_outside
 from legcal.machine.leg import JointType, Leg, LegKind
-from legcal.machine.mobility import LOOSE, dimensionless, singularity
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.ties import ties_in_words
 from legcal.machine.topology import level_rotation

@@ -24,7 +24,6 @@ from legcal.machine.leg import (
     with_platform_points,
     with_radii,
 )
-from legcal.machine.occluders import Occluder, reordered
 from legcal.machine.rods import (
     AT_ZERO,
     actuator_index,
@@ -35,6 +34,7 @@ from legcal.machine.rods import (
     reading_legs,
     readings_of_rods,
 )
+from legcal.machine.shapes import Occluder, reordered
 from legcal.machine.tolerance import NOT_STATED, Tolerance
 from legcal.machine.urdf import Urdf
 
@@ -309,7 +309,8 @@ def readings_at_poses(machine: Machine, poses: Array) -> Array:
     q = sign (|AB| - q0); for rods on an actuator its reading at which the first rod reaches the
     platform.
     """
-    q = machine.sign * (np.linalg.norm(B_at(machine, poses) - machine.A_base, axis=2) - machine.q0)
+    lengths = np.linalg.norm(B_at(machine, poses) - machine.A_base, axis=2)
+    q = machine.sign * (lengths - machine.q0)
     if machine.actuators:
         on = np.array(actuator_index(machine.legs))
         rods = readings_of_rods(machine.legs, poses[:, :3, :3], poses[:, :3, 3])

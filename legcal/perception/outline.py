@@ -18,7 +18,7 @@ import numpy as np
 from legcal.data.outlines import Outlines, join_outlines, no_outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.occluders import PlacedOccluders
+from legcal.machine.shapes import PlacedOccluders
 from legcal.perception.part_edges import (
     WIDTH_TOLERANCE,
     EdgePair,

@@ -39,7 +39,7 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.recognition import PlacedViews, place_views
+from legcal.perception.recognition import place_views
 from legcal.perception.tuning import WINDOW_PX
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
@@ -227,8 +227,7 @@ def place_and_measure(
         defects |= doubtful
         usable = np.setdiff1d(usable, list(doubtful))
     search = photographs.search(nominal, pairs, rough)
-    views = _placed(photographs, search, usable, hints, report, joined)
-    placement = views.recognised(photographs.run)
+    placement = _placed(photographs, search, usable, hints, report, joined)
     outlines, blur = _measured(photographs, search, placement, report, method=method)
     if not free_poses:  # which would follow wrong radii, and these wrong poses
         photographs, search, outlines, notes = _with_other_radii(
@@ -326,14 +325,6 @@ def _radius_notes(
     ]
 
 
-def recognise_and_place(photographs: Photographs, nominal: Placement, report: Report) -> Placement:
-    """Recognise the legs in the images, and place the cameras by them."""
-    nominal, _ = _with_free_poses(photographs, nominal, {}, photographs.detect, report)
-    search, hints = photographs.search(nominal), nominal.T_base_camera
-    views = _placed(photographs, search, photographs.detect, hints, report, None)
-    return views.recognised(photographs.run)
-
-
 def _with_free_poses(
     photographs: Photographs,
     nominal: Placement,
@@ -401,8 +392,7 @@ def _decided_by_outlines(
     hints = nominal.T_base_camera
     for _ in range(CHOICE_ROUNDS):
         search = photographs.search(nominal)
-        views = _placed(photographs, search, rows, hints, report, joined)
-        placement = views.recognised(photographs.run)
+        placement = _placed(photographs, search, rows, hints, report, joined)
         most = dict.fromkeys(choices, -1)
         chosen = dict[int, int]()
         for n in range(max(map(len, choices.values()))):
@@ -493,7 +483,7 @@ def _placed(
     hints: Sequence[RigidTransform | None],
     report: Report,
     joined: Joined,
-) -> PlacedViews:
+) -> Placement:
     """Return the placement of views by the legs in some images."""
     progress = _counted(report, "Recognising legs", len(rows))
     return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)

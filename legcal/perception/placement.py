@@ -21,8 +21,8 @@ from legcal.data.measurements import Measurements, few_views, image_notes
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
-from legcal.machine.occluders import LegHalf, Occluder
 from legcal.machine.rods import arms_at
+from legcal.machine.shapes import LegHalf, Occluder
 from legcal.perception.candidate_pairs import (
     CandidatePairs,
     Still,

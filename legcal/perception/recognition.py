@@ -75,8 +75,10 @@ def place_views(
     *,
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
-) -> PlacedViews:
-    """Return the poses at which the images of rows show most legs.
+) -> Placement:
+    """Return the cameras of views where the images of rows show most legs, and these legs.
+
+    Where pairs are ambiguous, outlines decide.
 
     ``hints`` are rough T_base_camera of views; those of views without images are kept. ``joined``
     are T_board_camera of views that know how they stand to each other by a board: they are placed
@@ -105,65 +107,43 @@ def place_views(
     of_left = [_ByEdges(groups[k], pictures, found[k]) for k in left]
     for k, one in zip(left, run(partial(_by_edges, search), of_left), strict=True):
         found[k] = one
-    placed = [one for one in found if one is not None]
-    return PlacedViews(search, hints, groups, pictures, placed)
+    candidates = [one for one in found if one is not None]
+    decide = partial(_decided_by_outlines, search, pictures)
+    placed = list(run(decide, list(zip(groups, candidates, strict=True))))
+    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
+        if group.is_placed and group.hint is not None and not one.is_convincing:
+            seen = group.pictures(pictures, [r for r in group.rows if r in pictures])
+            placed[g] = place_at(seen, group.hint, n_legs)
+    return _gathered(search, hints, groups, pictures, placed, run)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedViews:
-    """Views, what their images show, and the poses at which these show most legs.
-
-    It travels to worker processes.
-    """
-
-    search: Search
-    hints: Sequence[RigidTransform | None]  # T_base_camera of all views
-    groups: Sequence[Group]  # of views that are placed together
-    pictures: Mapping[int, Picture]  # by row
-    placed: Sequence[PoseCandidates]  # of each group
-
-    def recognised(self, run: Run = in_turn) -> Placement:
-        """Return the cameras of all views and the legs in their images.
-
-        Where pairs are ambiguous, outlines decide.
-        """
-        placed = list(run(self.decided_by_outlines, range(len(self.groups))))
-        for g, (group, one) in enumerate(zip(self.groups, placed, strict=True)):
-            if group.is_placed and group.hint is not None and not one.is_convincing:
-                seen = self.of_group(g, [r for r in group.rows if r in self.pictures])
-                placed[g] = place_at(seen, group.hint, self.search.n_legs)
-        return _gathered(replace(self, placed=placed), run)
-
-    def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
-        """Return the images of a group, all of them or of some rows."""
-        group = self.groups[g]
-        return group.pictures(self.pictures, group.rows if rows is None else rows)
-
-    def decided_by_outlines(self, g: int) -> PoseCandidates:
-        """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
-        group, candidates = self.groups[g], self.placed[g]
-        near = candidates.hinted and candidates.is_convincing
-        n = len(candidates.poses)
-        if n == 0 or near or candidates.is_clear:
-            return candidates
-        search, few = self.search, replace(group, rows=group.some)
-        trials = [_measure_at(search, few, candidates, 0)]
-        if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
-            trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
-            if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
-                by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
-                for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
-                    one = trials[i]
-                    if one.fit is not None:
-                        again = refine_views(search, [few], one.placement, one.outlines)
-                        trials[i] = _Trial(again[0], again[1], again[2][0])
-        best = _best(trials)
-        fit = trials[best].fit
-        if fit is None or not _is_decided(trials, candidates, few):
-            return replace(candidates, by_outlines=False)
-        pose = CameraPoses.one(fit.T_base_group, fit.shift)
-        of_group = self.of_group(g, [r for r in group.rows if r in self.pictures])
-        return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
+def _decided_by_outlines(
+    search: Search, pictures: Mapping[int, Picture], task: tuple[Group, PoseCandidates]
+) -> PoseCandidates:
+    """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
+    group, candidates = task
+    near = candidates.hinted and candidates.is_convincing
+    n = len(candidates.poses)
+    if n == 0 or near or candidates.is_clear:
+        return candidates
+    few = replace(group, rows=group.some)
+    trials = [_measure_at(search, few, candidates, 0)]
+    if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
+        trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
+        if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
+            by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
+            for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
+                one = trials[i]
+                if one.fit is not None:
+                    again = refine_views(search, [few], one.placement, one.outlines)
+                    trials[i] = _Trial(again[0], again[1], again[2][0])
+    best = _best(trials)
+    fit = trials[best].fit
+    if fit is None or not _is_decided(trials, candidates, few):
+        return replace(candidates, by_outlines=False)
+    pose = CameraPoses.one(fit.T_base_group, fit.shift)
+    of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
+    return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
 def _pictures(
@@ -301,23 +281,30 @@ def _gap(one: Array, other: Array) -> float:
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))
 
 
-def _gathered(found: PlacedViews, run: Run) -> Placement:
+def _gathered(
+    search: Search,
+    hints: Sequence[RigidTransform | None],
+    groups: Sequence[Group],
+    pictures: Mapping[int, Picture],
+    placed: Sequence[PoseCandidates],
+    run: Run,
+) -> Placement:
     """Assemble the placement of all views, with the causes of unplaced ones."""
-    search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
-    T, unplaced = list(found.hints), dict[str, NotPlaced]()
+    T, unplaced = list(hints), dict[str, NotPlaced]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
     error: Array = np.full((len(views), search.n_legs), JOINT_ERROR)
     unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
     flipped = []
     for g in unclear:  # those pictures by which it was placed, with left and right exchanged
         few = placed[g].hinted and placed[g].support.shape[1] == len(groups[g].some)
-        flipped.append(mirrored(found.of_group(g, groups[g].some if few else None)))
+        rows = groups[g].some if few else groups[g].rows
+        flipped.append(mirrored(groups[g].pictures(pictures, rows)))
     mirrors = _anywhere(flipped, search.n_legs, MIRRORED_STARTS, run)
     exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(placed[g], m)}
     # Pairs say little of views that are placed by other edges.
     doubted = [g for g in sorted(exchanged) if placed[g].along_edges and placed[g].is_convincing]
-    others = [_ByEdges(groups[g], found.pictures, None, is_mirrored=True) for g in doubted]
+    others = [_ByEdges(groups[g], pictures, None, is_mirrored=True) for g in doubted]
     for g, other in zip(doubted, run(partial(_by_edges, search), others), strict=True):
         if other.along_edges < MIRRORED_EDGES * placed[g].along_edges:
             exchanged.remove(g)

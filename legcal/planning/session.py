@@ -126,7 +126,9 @@ def _dataset(plan: Plan, model: str) -> dict[str, str]:
         [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
         for name, image, label, v, k in images_of(plan)
     ]
-    board = {} if plan.board is None else {"board": board_document(plan.board.board)}
+    board: dict[str, Any] = (
+        {} if plan.board is None else {"board": board_document(plan.board.board)}
+    )
     return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), **board)
 
 

@@ -17,7 +17,7 @@ from legcal.brief import brief
 from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, PLAN_NAME
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import write_observations
+from legcal.data.outlines import join_outlines, write_observations
 from legcal.data.reading_units import sigma_too_large
 from legcal.errors import UsageError
 from legcal.files.folder import (
@@ -37,7 +37,12 @@ from legcal.machine.model_writer import write_model
 from legcal.planning.session import dataset_texts, rough_view
 from legcal.progress import Progress, Report, shown_progress
 from legcal.simulation.board import documents
-from legcal.simulation.observe import EVERY_PIXEL, corners_in_images, outlines_of
+from legcal.simulation.observe import (
+    EVERY_PIXEL,
+    corners_in_images,
+    edges_of_bodies,
+    outlines_of,
+)
 from legcal.simulation.poses import are_extreme
 from legcal.simulation.session import (
     SimulatedSession,
@@ -159,6 +164,8 @@ def simulate(
         if has_tables:
             noise = replace(EVERY_PIXEL, sigma_px=settings.sigma_px)
             outlines = outlines_of(session.scene, noise, rngs["observations"])
+            edges = edges_of_bodies(session.scene, truth.occluders, noise, rngs["observations"])
+            outlines = join_outlines([outlines, edges])
             write_observations(folder / OBSERVATIONS_NAME, outlines, m, legs)
         if session.boards:
             of_boards = session.scene, session.posed_machines

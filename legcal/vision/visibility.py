@@ -24,8 +24,8 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.lines import moment
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm, main_cylinders
-from legcal.machine.occluders import Occluder, PlacedOccluders
 from legcal.machine.rods import arms_at, ends_in_base, readings_of_rods
+from legcal.machine.shapes import Occluder, PlacedOccluders
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 

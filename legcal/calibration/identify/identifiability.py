@@ -64,6 +64,7 @@ from legcal.paper.conditions import (
     three_legs_at_once,
     two_directions,
 )
+from legcal.perception.body_edges import bodies_of
 
 MOST_VIEWS = 50
 MOST_IMAGES = 2000  # of a session; more add nothing and take minutes
@@ -331,7 +332,8 @@ def _rough_notes(analysis: Analysis) -> list[str]:
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    hidden = [j for j, leg in enumerate(machine.legs) if not leg.cylinders]
+    bodies = bodies_of(machine.occluders, len(machine.legs))
+    hidden = [j for j, leg in enumerate(machine.legs) if not (leg.cylinders or bodies[j])]
     notes = []
     if hidden:
         which = legs_in_words(hidden, machine.leg_names)
@@ -436,7 +438,12 @@ def read_views(
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
     """Describe why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
-    unseen = [leg.name for leg in dataset.machine.legs if not leg.cylinders]
+    bodies = bodies_of(dataset.machine.occluders, len(dataset.machine.legs))
+    unseen = [
+        leg.name
+        for leg, of_leg in zip(dataset.machine.legs, bodies, strict=True)
+        if not (leg.cylinders or of_leg)
+    ]
     if unseen:
         names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
         remedies.insert(0, f"add a <visual> cylinder along {names}: without it, no image shows it")
