@@ -21,12 +21,12 @@ from .descriptions.new_model import new as new
 from .errors import LegcalError as LegcalError
 from .exports.formats import export as export
 from .exports.subject import ExportOptions as ExportOptions
+from .machine.closing import singularity as singularity
 from .machine.configurations import random_configurations as random_configurations
 from .machine.kinematics import Follower as Follower
 from .machine.kinematics import forward_kinematics as forward_kinematics
 from .machine.kinematics import inverse_kinematics as inverse_kinematics
 from .machine.loader import load_mechanism as load_mechanism
-from .machine.closing import singularity as singularity
 from .machine.model import Machine as Machine
 from .machine.picture import plot_machine as plot_machine
 from .planning.request import plan as plan
