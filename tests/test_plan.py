@@ -47,6 +47,7 @@ from legcal.planning.session import Plan, write_session
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 from legcal.vision.camera import sample_camera
+from legcal.vision.camera_file import camera_info
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -177,8 +178,10 @@ def test_the_command_writes_what_python_plans(
     """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
-    session = tmp_path / "session"
-    assert run(monkeypatch, *WORDS, "--json", "-o", session) == 0
+    session, lens = tmp_path / "session", tmp_path / "lens.yaml"
+    lens.write_text(f"# calibrated\n{camera_info(planned.camera, 'lens')}")
+    assert run(monkeypatch, *WORDS, "--camera", lens, "--json", "-o", session) == 0
+    assert (session / "camera_info.yaml").read_bytes() == lens.read_bytes()
     printed = json.loads(capsys.readouterr().out)
     assert printed == planned.document() == json.loads((session / "plan.json").read_text())
     header = (session / "dataset.yaml").read_text().partition("\n")[0]

@@ -154,6 +154,14 @@ def plan(
         ),
     ] = None,
     noise: NoiseOption = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The camera file, which the session gets; by default that of --given, else a "
+            "camera of 1024 x 768 px, 43 deg wide.",
+        ),
+    ] = None,
     bounds: Annotated[
         str | None,
         typer.Option(
@@ -185,7 +193,7 @@ def plan(
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning import request
     from legcal.planning.places import parse_bounds
-    from legcal.planning.session import check_session, write_session
+    from legcal.planning.session import CAMERA, check_session, write_session
     from legcal.report.plan import plan_files, plan_table
     from legcal.signals import held_back_signals, is_waiting
 
@@ -197,6 +205,7 @@ def plan(
             images_per_view=images_per_view,
             cameras=cameras,
             target=None if target is None else parse_quantity(target, LENGTH, "--target"),
+            camera=camera,
             noise=DEFAULT_NOISE if noise is None else noise,
             bounds=None if bounds is None else parse_bounds(bounds),
             given=given,
@@ -207,8 +216,10 @@ def plan(
             progress=not quiet,
             stop=is_waiting,
         )
-        pictures = plan_files(session, _previews(session), command_line())
-        write_session(session, output, pictures=pictures)
+        files = plan_files(session, _previews(session), command_line())
+        if camera is not None:  # with the covariance and the record of its calibration
+            files = {**files, CAMERA: camera.read_bytes()}
+        write_session(session, output, pictures=files)
         if is_waiting() and sys.stderr is not None:
             text = f"The session was written to {output}, with the best plan found before the stop."
             sys.stderr.write(f"legcal: {printable(text)}\n")

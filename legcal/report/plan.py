@@ -152,9 +152,11 @@ def camera_distances(plan: Plan) -> dict[str, list[float]]:
 def checklist(plan: Plan) -> list[str]:
     """Return the checklist for taking the photographs."""
     hand_held = plan.hand_held
-    first = f"Put the file of the calibrated camera in place of camera_info.yaml: it was planned \
-with {plan.camera.width} x {plan.camera.height} px and a focal length of \
-{plan.camera.K[0, 0]:.0f} px."
+    first = (
+        f"The plan is for the camera of camera_info.yaml, {plan.camera.width} x "
+        f"{plan.camera.height} px with a focal length of {plan.camera.K[0, 0]:.0f} px: if yours is "
+        "another, plan again with --camera."
+    )
     cm, deg = 1e2 * plan.setting.shift, np.degrees(plan.setting.turn)
     place = (
         "Take each image from about the position in poses.csv; the whole board must be in it."
