@@ -17,8 +17,8 @@ import numpy as np
 
 from legcal.calibration.documents import MotorZero
 from legcal.calibration.doubts import MOST_MOVED, TOLERANCE, Doubt
+from legcal.calibration.joint_fit.parameter_choices import Group
 from legcal.calibration.joint_fit.part_errors import (
-    Group,
     Kind,
     PartErrors,
     part_errors,
@@ -27,7 +27,6 @@ from legcal.calibration.joint_fit.part_errors import (
 from legcal.calibration.joint_fit.platform import platform_by_parameters, workspace_poses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import fitted_legs
-from legcal.errors import UsageError
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array, BoolArray
@@ -39,7 +38,7 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.machine.tolerance import NOT_STATED, Tolerance
+from legcal.machine.tolerance import Tolerance
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
 _WELL = 1e-3  # of the largest singular value: motions of the platform by a group that count
@@ -142,23 +141,6 @@ class GroupEstimate:
             )
             found.append(Doubt(TOLERANCE, what, remedy))
         return found
-
-
-def built_of(machine: Machine) -> Tolerance:
-    """Return the complete tolerances of a machine.
-
-    Raises
-    ------
-    UsageError
-        If neither the model nor the dataset states any.
-    """
-    if machine.tolerance == NOT_STATED:
-        raise UsageError(
-            "--only could not be used: found no tolerance, needed how well the machine is built; "
-            "state machine_kind: printed, machined or bought, or tolerance, in dataset.yaml or in "
-            "the block legcal of the model."
-        )
-    return machine.tolerance.completed(machine.size)
 
 
 def likely_teeth(

@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.quantities import mm_deg
@@ -278,6 +279,7 @@ class Plan:
     n_given: int = 0  # number of its photographs
     notes: tuple[str, ...] = ()
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
+    parts: tuple[PartSigma, ...] = ()  # what is expected of parts, with tolerances as priors
 
     @property
     def n_images(self) -> int:
@@ -356,6 +358,7 @@ class Plan:
             growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
             limits=self.limits,
             notes=list(self.notes),
+            parts=list(self.parts),
         ).document()
 
 
@@ -436,6 +439,7 @@ class PlanDocument(Document):
     growth: list[Growth]
     limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
+    parts: list[PartSigma] = Field(default_factory=list)  # asked for with --only
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:
