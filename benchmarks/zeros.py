@@ -116,6 +116,9 @@ def session(seed: int, options: argparse.Namespace, folder: Path) -> tuple[dict[
         view = f"c{k + 1}"
         made = yaml.safe_load((one / "dataset.yaml").read_text())["views"]["c1"]
         views[view] = {**made, "camera": "camera_info.yaml"}
+        if options.level == "photographs":
+            view, views = f"phone-{k + 1}", {"phone": {**made, "camera": "camera_info.yaml"}}
+            views["phone"]["hand_held"] = True
         image = ""
         if options.level == "photographs":
             file = next((one / "images").iterdir())
@@ -129,7 +132,7 @@ def session(seed: int, options: argparse.Namespace, folder: Path) -> tuple[dict[
                     elif i > 0:
                         outlines.append([view, f"p{p + 1}", *row[2:]])
         shutil.rmtree(one)
-        rows.append((view, image, f"p{p + 1}"))
+        rows.append((view.partition("-")[0], image, f"p{p + 1}"))
     sigma = READINGS.size
     read = [q - zeros + sigma * rng.normal(size=len(q)) for q in poses]
     with (folder / "measurements.csv").open("w") as table:
