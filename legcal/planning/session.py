@@ -37,7 +37,7 @@ from legcal.files.folder import (
 from legcal.files.motions import Pose, motion_to_xyz_quat
 from legcal.files.published import with_schema
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.schema import Document, Number, Version
+from legcal.files.schema import Document, Number, SparseDocument, Version
 from legcal.files.table import format_table
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array, BoolArray
@@ -358,7 +358,7 @@ class Plan:
             growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
             limits=self.limits,
             notes=list(self.notes),
-            parts=list(self.parts),
+            parts=list(self.parts) or None,
         ).document()
 
 
@@ -417,7 +417,7 @@ class Growth(Document):
     value: Number
 
 
-class PlanDocument(Document):
+class PlanDocument(SparseDocument):
     """What ``plan.json`` holds and ``legcal plan --json`` prints."""
 
     legcal_plan: Version
@@ -439,7 +439,7 @@ class PlanDocument(Document):
     growth: list[Growth]
     limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
-    parts: list[PartSigma] = Field(default_factory=list)  # asked for with --only
+    parts: list[PartSigma] | None = None  # left out where not asked for (--only)
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:
