@@ -71,7 +71,7 @@ COMMANDS = (
         "simulate 3-rpr -o out --level outlines --poses 2",
         replaces=False,
     ),
-    Command("study", "study paper --runs 2 --workers 1 -o out", kept=("out/runs.jsonl",)),
+    Command("study", "study paper --runs 2 --workers 1 -o out"),
     Command(
         "detect",
         "detect in -o out --workers 1",
@@ -95,11 +95,7 @@ COMMANDS = (
         "simulate 3-rpr -o out --poses 1",
         replaces=False,
     ),
-    Command(
-        "study, two processes",
-        "study paper --runs 4 --workers 2 -o out",
-        kept=("out/runs.jsonl",),
-    ),
+    Command("study, two processes", "study paper --runs 4 --workers 2 -o out"),
 )
 
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.machine.closing import singularity
 from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
 
 MODELS = Path(__file__).parents[1] / "models"

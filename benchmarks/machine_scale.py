@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from scaled import scaled_dataset
 
 from legcal.data.dataset import load_dataset
-from legcal.machine.mobility import leg_scale
+from legcal.machine.closing import leg_scale
 
 LEGS = (0.012, 0.04, 0.4, 4.0, 19.0)  # mean leg lengths [m]
 OUTLINES, SIGMA, TIME = 0.05, 0.1, 0.5  # how far they may be from those at scale 1, as a part

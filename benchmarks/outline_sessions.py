@@ -27,17 +27,17 @@ from legcal.calibration.joint_fit.variables import (
 from legcal.data.axes import axes_from_outlines
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
+from legcal.descriptions.new_model import create_model
+from legcal.descriptions.table import described_machine
 from legcal.errors import DidNotConverge
 from legcal.files.schema import read_yaml
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.closing import solve_poses
-from legcal.machine.description_table import described_machine
 from legcal.machine.kinematics import platform_in_base, pose_differences
 from legcal.machine.leg import Leg, LegKind, radius_name
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 from legcal.machine.parameters import Parametrization, geometries, moved_legs, parametrize
 from legcal.machine.rods import (
     actuator_index,

@@ -191,7 +191,7 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=processors())
     parser.add_argument("--cluster", help="address of a Dask scheduler, in place of processes")
-    parser.add_argument("-o", "--output", type=Path, help="folder; a study goes on from there")
+    parser.add_argument("-o", "--output", type=Path, help="folder for figures and document")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     try:

@@ -31,6 +31,7 @@ from legcal.data.outlines import no_outlines
 from legcal.errors import LegcalError
 from legcal.geometry.types import Array
 from legcal.machine.parameters import geometries, moved_legs
+from legcal.simulation.observe import corners_in_images
 from legcal.simulation.session import SimulatedSession, simulate_session, streams
 from legcal.simulation.settings import Level, SimulationSettings
 
@@ -48,7 +49,6 @@ def session_of_boards(*, alone: bool, seed: int = 0) -> SimulatedSession:
         poses=15,
         board=None if alone else "charuco",
         platform_board="charuco",
-        sigma_px=0.0,
         seed=seed,
     )
     return simulate_session(machine, machine, settings, streams(seed))
@@ -62,8 +62,8 @@ def fit_corners(session: SimulatedSession, seed: int) -> tuple[float, int]:
     free = np.array([not name.endswith(".twist") for name in p.names])
     nominal = moved_legs(true, p.place, np.where(free, WRONG_M * rng.choice([-1, 1], len(free)), 0))
     legs = replace(legs, nominal=nominal)
-    m, exact = session.measurements, session.corners
-    assert exact is not None
+    m = session.measurements
+    exact = corners_in_images(session.scene, session.posed_machines, 0.0)
     q = session.poses.readings[np.unique(session.scene.images.pose)][m.pose]
     error = m.sigma_q * rng.standard_normal((m.n_poses, q.shape[1]))
     m = replace(m, q=q + error[m.pose])

@@ -24,7 +24,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics
 from legcal.machine.model import Machine
-from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognition import place_views
 from legcal.vision.cylinder import EPSILON
@@ -137,7 +137,7 @@ def main() -> None:
     rows = np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):
         start = time.perf_counter()
-        placed = place_views(search, rows, hints).recognised()
+        placed = place_views(search, rows, hints)
         print(f"recognition {words} rough camera poses: {time.perf_counter() - start:.2f} s")
     start = time.perf_counter()
     first, _ = measure_outlines(search, placed, rows.tolist())

@@ -36,7 +36,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.perception.camera_search import place_camera, refined, scores
 from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
-from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import TWO_POSES, place_views
@@ -73,7 +73,7 @@ def find(given: Given) -> Found:
     )  # fmt: skip
     begin = time.process_time()
     rows = np.arange(len(given.images))
-    found = place_views(search, rows, [None]).recognised()
+    found = place_views(search, rows, [None])
     middle = time.process_time()
     outlines, _ = measure_outlines(search, found, rows.tolist())
     groups = group_views(m, rows, [None], None)

@@ -39,11 +39,11 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.machine.kinematics import forward_kinematics
-from legcal.perception.detection import measure_outlines
 from legcal.perception.image_quality import measure_exposure
-from legcal.perception.outline import measure_in_brief
-from legcal.perception.photographs import Photographs, measure_photographs, recognise_and_place
+from legcal.perception.outline import measure_in_brief, measure_outlines
+from legcal.perception.photographs import Photographs, measure_photographs
 from legcal.perception.placement import Placement, group_views
+from legcal.perception.recognition import place_views
 from legcal.perception.view_fit import refine_views
 from legcal.progress import no_progress
 from legcal.workers import in_turn
@@ -52,6 +52,12 @@ DATASET = Path(__file__).resolve().parents[1] / "examples" / "hexapod"
 N_MEMORY = 15
 
 T = TypeVar("T")
+
+
+def recognised(photographs: Photographs, scene: Placement) -> Placement:
+    """Return the cameras and the legs that the images show."""
+    search = photographs.search(scene)
+    return place_views(search, photographs.detect, scene.T_base_camera, run=photographs.run)
 
 
 def sample() -> tuple[Photographs, Placement]:
@@ -105,12 +111,10 @@ def measure_speed() -> None:
         replace(photographs, detect=begin), scene, no_progress
     )  # what is computed only once
     exposures = watch("exposure and blur", lambda: [measure_exposure(image) for image in decoded])
-    near = watch(
-        "recognition near poses", lambda: recognise_and_place(photographs, scene, no_progress)
-    )
+    near = watch("recognition near poses", lambda: recognised(photographs, scene))
     watch(
         "recognition without",
-        lambda: recognise_and_place(photographs, without_poses(scene), no_progress),
+        lambda: recognised(photographs, without_poses(scene)),
     )
     rough = {row: exposure.blur for row, exposure in zip(rows, exposures, strict=True)}
     search = photographs.search(scene, blur=rough)
@@ -164,9 +168,7 @@ def peak_memory(n: int) -> float:
     scene = replace(scene, A_base=scene.A_base[rows], B_base=scene.B_base[rows])
     for row in range(n):
         measure_exposure(photographs.load(row))
-    measure_photographs(
-        photographs, recognise_and_place(photographs, scene, no_progress), no_progress
-    )
+    measure_photographs(photographs, recognised(photographs, scene), no_progress)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 

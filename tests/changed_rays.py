@@ -1,13 +1,16 @@
-"""Outlines of some images as a camera that was turned or refocused shows them."""
+"""Outlines of some images after a camera was turned or refocused, or a joint moved."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from legcal.data.dataset import Dataset
 from legcal.geometry.types import Array, BoolArray
+from legcal.simulation.observe import Scene, outlines_of
 
 
 def turned(angle: float) -> Callable[[Array], Array]:
@@ -34,4 +37,43 @@ def with_rays(dataset: Dataset, rows: BoolArray, change: Callable[[Array], Array
     h, ends = o.h.copy(), o.ends.copy()
     h[changed] = normal * np.sign(np.sum(normal * h[changed], axis=1))[:, None]
     ends[changed] = camera.project(rays).reshape(-1, 2, 2)
+    return replace(dataset, observations=replace(o, h=h, ends=ends))
+
+
+def with_moved_joint(
+    dataset: Dataset, scene: Scene, later: BoolArray, j: int, by: Array
+) -> Dataset:
+    """Return a session in which the joint at A of a leg from point to point moves by (3,) [m].
+
+    Outlines move by as much as exact ones do.
+    """
+    o = dataset.observations
+    assert o is not None
+    A, B = scene.A.copy(), scene.B.copy()
+    A[:, j] += by
+    for k in range(len(A)):
+        lengths = np.linalg.norm(scene.B[k] - scene.A[k], axis=1)
+
+        def platform(x: Array, B: Array = scene.B[k]) -> Array:
+            middle = B.mean(axis=0)
+            return np.asarray(Rotation.from_rotvec(x[:3]).apply(B - middle) + middle + x[3:])
+
+        def error(x: Array, k: int = k, lengths: Array = lengths, at: Any = platform) -> Array:
+            return np.asarray(np.linalg.norm(at(x) - A[k], axis=1) - lengths)
+
+        found = least_squares(error, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        B[k] = platform(found.x)
+    before, after = outlines_of(scene), outlines_of(replace(scene, A=A, B=B))
+    at, place = (
+        [
+            (int(table.row[i]), int(table.leg[i]), table.part[i], int(table.edge[i]))
+            for i in range(len(table))
+        ]
+        for table in (o, before)
+    )
+    index = [place.index(key) for key in at]
+    moves = (later[o.row])[:, None, None]
+    ends = o.ends + np.where(moves, (after.ends - before.ends)[index], 0.0)
+    h = o.h + np.where(moves[..., 0], (after.h - before.h)[index], 0.0)
+    h /= np.linalg.norm(h, axis=1, keepdims=True)
     return replace(dataset, observations=replace(o, h=h, ends=ends))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import pickle
 import signal
 import tempfile
 from collections.abc import Generator, Iterator
@@ -84,10 +85,10 @@ def answered_signals() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _commands_and_models_are_read_once() -> Iterator[None]:
-    """Read the signatures of commands, and each model or copy of one, once a process."""
+    """Read signatures of commands, and models and their workspaces, once a process."""
     import typer.main
 
-    from legcal.machine import loader
+    from legcal.machine import configurations, loader
     from legcal.machine.files import find_model
     from legcal.machine.formats import read_source as read
 
@@ -127,8 +128,20 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
         urdf = replace(found.urdf, path=source.urdf.path)
         return replace(found, yaml_path=source.path, urdf_path=urdf.path, urdf=urdf)
 
+    draw = configurations.random_poses
+    workspaces: dict[bytes, tuple[Any, Any]] = {}
+
+    def draw_once(machine: Machine, n: int, seed: int) -> tuple[Any, Any]:
+        """Return the sample of the workspace of a machine with these legs, the same every time."""
+        key = pickle.dumps((machine.urdf.content, machine.legs, machine.home.as_matrix(), n, seed))
+        if key not in workspaces:
+            workspaces[key] = draw(machine, n, seed)
+        readings, poses = workspaces[key]
+        return readings.copy(), list(poses)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
+        patch.setattr(configurations, "random_poses", draw_once)
         patch.setattr(loader, "read_source", read_once)
         patch.setattr(loader, "_load", load_once)
         yield

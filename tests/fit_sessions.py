@@ -26,7 +26,8 @@ from legcal.calibration.joint_fit.variables import (
 from legcal.data.axes import LegAxes, axes_of_table
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, unmeasured
+from legcal.data.reasons import USED
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
@@ -600,3 +601,44 @@ def with_camera(
     h /= np.linalg.norm(h, axis=1, keepdims=True)
     h *= np.sign(np.sum(h * outlines.h, axis=1, keepdims=True))
     return replace(measurements, views=views), replace(outlines, h=h)
+
+
+def body_edges(session: MachineSession, sigma_px: float = 0.1, seed: int | None = None) -> Outlines:
+    """Return edges of prismatic bodies on all legs of a session, which have turned as they like.
+
+    Two in each image, 25 mm from the axis; with noise at their ends if a seed is given.
+    """
+    m, truth, rng = session.measurements, session.truth, np.random.default_rng(7)
+    rows = [(row, j) for row in range(m.n_rows) for j in range(len(truth.legs)) for _ in range(2)]
+    ends = []
+    for row, j in rows:
+        T, camera = truth.T_camera_Rb[m.view[row]], m.views[m.view[row]].camera
+        pose = m.pose[row]
+        R, t = components([truth.T_Rb_Re[pose]])
+        q = measured_readings(truth.legs, R, t, m.q_of_poses[[pose]])
+        A_Rb, B_Rb = ends_at_poses(truth.legs, R, t, q)
+        A, B = T.apply(A_Rb[0, j]), T.apply(B_Rb[0, j])
+        u = (B - A) / np.linalg.norm(B - A)
+        away = np.cross(u, rng.standard_normal(3))
+        away *= 0.025 / np.linalg.norm(away)
+        ends.append(camera.project(np.stack([A + 0.3 * (B - A), A + 0.8 * (B - A)]) + away))
+    n, pixels = len(rows), np.array(ends)
+    if seed is not None:
+        along = pixels[:, 1] - pixels[:, 0]
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        noise = np.random.default_rng(seed).standard_normal((n, 2, 1))
+        pixels = pixels + sigma_px * noise * normal[:, None]
+    return Outlines(
+        row=np.array([row for row, _ in rows]),
+        leg=np.array([j for _, j in rows]),
+        part=tuple(f"{session.legs.names[j]}_body" for _, j in rows),
+        edge=np.tile([3, 4], n // 2),
+        h=np.full((n, 3), np.nan),
+        ends=pixels,
+        covariance=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)),
+        used=np.ones(n, dtype=np.bool_),
+        reason=(USED,) * n,
+        source=("detected",) * n,
+        **unmeasured(n),
+    )

@@ -22,10 +22,10 @@ from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.location.document import LocationFile
 from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
+from legcal.descriptions.table import TableFile
 from legcal.exports.formats import ExportDocument
 from legcal.files.published import write_schemas
 from legcal.files.schema import Document, SparseDocument
-from legcal.machine.description_table import TableFile
 from legcal.machine.files import MechanismFile
 from legcal.machine.inspection import Inspection
 from legcal.planning.session import PlanDocument
@@ -33,7 +33,7 @@ from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
 from legcal.simulation.paper import PaperDocument
 from legcal.simulation.study import StudyHeading
-from legcal.vision.board_file import AprilgridEntry, CharucoEntry, ChessboardEntry
+from legcal.vision.board import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
 
 ROOT = Path(__file__).parents[1]

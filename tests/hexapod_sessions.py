@@ -148,7 +148,7 @@ def paper_session(
     """Return a session; its axes have the noise of Table 1, or come from outlines."""
     rng = np.random.default_rng(seed)
     settings = SimulationSettings(
-        level=Level.AXES,
+        level=Level.OUTLINES,
         poses=n_poses,
         images=n_images,
         shared_poses=share_poses,

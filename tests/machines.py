@@ -10,12 +10,11 @@ from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
+from legcal.descriptions.new_model import Created, Dimensions, create_model, description_of
+from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
-from legcal.machine.description_table import described_machine
-from legcal.machine.family import Dimensions, description_of
 from legcal.machine.leg import LegKind, main_cylinders
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import Created, create_model
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

@@ -22,7 +22,7 @@ from simulated import simulated
 from legcal.machine.loader import load_mechanism
 
 ROOT = Path(__file__).resolve().parents[1]
-SIMULATED = ("3-rpr-axes", "3-rpr-outlines", "hexapod-axes")  # by machine and level
+SIMULATED = ("3-rpr-outlines", "hexapod-outlines")  # by machine and level
 JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
 SIZE = (64, 48)  # of pictures that nobody looks at
 
@@ -120,7 +120,7 @@ def _tables(folder: Path) -> None:
 
 def _tool_poses(folder: Path) -> None:
     """Measure a tool at the poses of a simulated hexapod, with known noise."""
-    source = made_input("hexapod-axes")
+    source = made_input("hexapod-outlines")
     shutil.copytree(source / "truth", folder / "hexapod")
     truth = json.loads((source / "truth/truth.json").read_text())
     rows = _measured(list(truth["poses"].values()), np.random.default_rng(1))

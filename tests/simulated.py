@@ -12,7 +12,7 @@ from legcal.simulation.dataset import SimulatedDataset, simulate
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera
-from legcal.vision.camera_export import camera_info
+from legcal.vision.camera_file import camera_info
 
 PLACES = Path(__file__).parent / "data/camera_places.json"  # by machine and view
 SMALL = SimulationSettings(level=Level.OUTLINES, poses=3, views=2, seed=5)
@@ -31,18 +31,22 @@ def settings(**changes: object) -> SimulationSettings:
     return replace(SMALL, **changes)  # type: ignore[arg-type]
 
 
+def standing(model: str, views: int = 2, camera: Path | None = None) -> tuple[Viewpoint, ...]:
+    """Return cameras at known places before a shipped machine."""
+    lens = mild_lens() if camera is None else read_lens(camera)
+    places = json.loads(PLACES.read_text())[model]
+    return tuple(
+        Viewpoint(name, lens, MotionEntry(**places[name]["T_base_camera"]).motion())
+        for name in [f"c{v}" for v in range(1, views + 1)]
+    )
+
+
 def simulated(
     folder: Path, model: str, *, views: int = 2, camera: Path | None = None, **changes: object
 ) -> SimulatedDataset:
     """Simulate a shipped machine before cameras at known places: a search is half of the time."""
-    lens = mild_lens() if camera is None else read_lens(camera)
-    places = json.loads(PLACES.read_text())[model]
-    names = [f"c{v}" for v in range(1, views + 1)]
-    standing = tuple(
-        Viewpoint(name, lens, MotionEntry(**places[name]["T_base_camera"]).motion())
-        for name in names
-    )
-    seen_from = views if changes.get("board") else standing  # cameras are placed to see a board
+    # cameras are placed to see a board
+    seen_from = views if changes.get("board") else standing(model, views, camera)
     return simulate(model, folder, settings(views=seen_from, **changes))
 
 

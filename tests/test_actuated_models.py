@@ -13,20 +13,19 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.pipeline import calibrate
 from legcal.data.dataset import load_dataset
+from legcal.descriptions.new_model import Dimensions, create_model, description_of
+from legcal.descriptions.table import described_machine
 from legcal.errors import LegcalError, ModelError, NotIdentifiable
 from legcal.exports.formats import export
 from legcal.exports.subject import Subject
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_configurations
-from legcal.machine.description_table import described_machine
-from legcal.machine.family import Dimensions, description_of
 from legcal.machine.home import home_of_legs
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import ARMS as ARM_KINDS
 from legcal.machine.leg import ParameterId
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
 from legcal.machine.parameters import (
     geometries,

@@ -19,7 +19,6 @@ from cad_exports import (
 
 from legcal import load_mechanism, plan
 from legcal.errors import ModelError
-from legcal.machine.cylinders import cylinder_about_z
 from legcal.machine.home import home_of_legs
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.model_writer import write_calibrated_yaml, write_model, write_urdf
@@ -30,6 +29,7 @@ from legcal.machine.parameters import (
     reframed,
     vector_of,
 )
+from legcal.machine.shapes import cylinder_about_z
 from legcal.machine.topology import level_rotation
 
 

@@ -36,7 +36,6 @@ from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import SimulatedDataset
-from legcal.simulation.settings import Level
 from legcal.vision.board import Board, FixedBoard
 
 Row = dict[str, str]
@@ -90,9 +89,9 @@ def hexapod(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def axes(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedDataset, Path, Calibration]:
-    """A table of axes of a hexapod, its result folder and calibration."""
-    made = _simulated(tmp_path_factory.mktemp("axes"), "hexapod", views=3, level=Level.AXES)
+def stepped(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedDataset, Path, Calibration]:
+    """A hexapod, its result folder and calibration."""
+    made = _simulated(tmp_path_factory.mktemp("stepped"), "hexapod", views=3)
     output = made.folder.parent / "result"
     output.mkdir()
     (output / "result.json").write_text('{"legcal_result": 1}')
@@ -190,7 +189,7 @@ def test_a_model_is_trusted_if_its_change_exceeds_two_sigma(
         assert judged(scaled).verdict.trustworthy is trusted
 
 
-# Recovery from outlines and axes.
+# Recovery from outlines.
 
 
 def test_fit_and_steps_come_nearer_to_the_truth(planar: tuple[Path, Calibration]) -> None:
@@ -225,9 +224,9 @@ def test_fit_and_steps_come_nearer_to_the_truth(planar: tuple[Path, Calibration]
 
 
 def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
-    axes: tuple[SimulatedDataset, Path, Calibration], tmp_path: Path
+    stepped: tuple[SimulatedDataset, Path, Calibration], tmp_path: Path
 ) -> None:
-    _, earlier, found = axes
+    _, earlier, found = stepped
     assert found.steps.legs is not None
     on_one_point = tuple(replace(leg, A=np.zeros(3)) for leg in found.steps.legs)
     for k, (steps, said) in enumerate(
@@ -240,22 +239,9 @@ def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
         written = write_result(replace(found, steps=steps), out)
         assert said in written.summary()
         assert k or "that loads and closes" in " ".join(written.summary().split())
-        assert sorted(files_of(out)) == ["calibrated.urdf", "calibrated.yaml", "result.json"]
+        models = ["calibrated.urdf", "calibrated.yaml"]
+        assert sorted(files_of(out)) == [*models, "observations.csv", "result.json"]
         assert load_result(out).result.notes == written.result.notes
-
-
-def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Calibration]) -> None:
-    made, output, calibration = axes
-    solution = calibration.solution
-    assert calibration.steps.legs is not None
-    assert 0.4 < np.mean(_pulls(calibration, made.truth_path) ** 2) < 1.9
-    assert solution.quality.chi2 / solution.quality.dof == pytest.approx(1.0, abs=0.35)
-    assert solution.quality.rms_axes == pytest.approx(1.0, abs=0.3)
-    assert solution.quality.rms_px is None
-    models = [f"{name}.{kind}" for name in ("calibrated", "staged") for kind in ("urdf", "yaml")]
-    assert sorted(files_of(output)) == sorted([*models, "result.json"])
-    assert not (made.folder / "observations.csv").exists()
-    assert not [name for name in solution.estimates.values if "radius" in name]
 
 
 # Files, refusals and notes.
@@ -273,6 +259,7 @@ def test_an_interrupted_run_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(
     ("shown", "named"),
     [

@@ -23,8 +23,7 @@ from legcal.vision.camera import (
     undistort_with_derivatives,
     with_intrinsics,
 )
-from legcal.vision.camera_export import camera_info, convert_camera
-from legcal.vision.camera_file import read_camera
+from legcal.vision.camera_file import camera_info, convert_camera, read_camera
 from legcal.vision.cylinder import EPSILON, axis_of_outlines, outlines_of_axis
 from legcal.vision.distortion import CameraProgram, DistortionModel
 

@@ -25,12 +25,12 @@ from legcal.calibration.change_detection import (
 )
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at
+from legcal.descriptions.new_model import create_model
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Line
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model_builder import create_model
 from legcal.machine.parameters import (
     geometries,
     moved_legs,

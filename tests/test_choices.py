@@ -35,8 +35,8 @@ VIEWS = (
 Priors = Mapping[str, object] | Sequence[str]
 
 
-def known(model: str = "hexapod", *, axes_given: bool = False) -> KnownParameters:
-    return known_parameters(load_mechanism(model), VIEWS, axes_given=axes_given)
+def known(model: str = "hexapod") -> KnownParameters:
+    return known_parameters(load_mechanism(model), VIEWS)
 
 
 HEXAPOD = known()

@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -25,7 +25,7 @@ from toy_studies import Draws
 
 from legcal import workers
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.simulation.study import CHECKPOINT_NAME, run_study
+from legcal.simulation.study import run_study
 from legcal.workers import Workers, worker_pool
 
 
@@ -158,35 +158,21 @@ def test_a_calibration_on_a_cluster_is_that_of_this_process_byte_for_byte(
 
 @pytest.mark.system
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_study_outlives_a_worker_and_keeps_its_runs_when_the_scheduler_stops(
-    tmp_path: Path,
-) -> None:
-    def after(n_lines: int, action: Any) -> Thread:
-        def watch() -> None:
-            path, end = tmp_path / "out" / CHECKPOINT_NAME, time.monotonic() + 60.0
-            while time.monotonic() < end:
-                if path.exists() and path.read_bytes().count(b"\n") >= n_lines:
-                    break
-                time.sleep(0.02)
-            action()
-
-        thread = Thread(target=watch)
-        thread.start()
-        return thread
-
-    study, out = Draws(seconds=0.05), tmp_path / "out"
+def test_a_study_outlives_a_worker_and_says_that_the_scheduler_stopped(tmp_path: Path) -> None:
+    study = Draws(seconds=0.05)
     with local_cluster(tmp_path / "cluster", 2) as local:
-        acting = after(40, local.workers[0].kill)
-        found = run_study(study, 100, workers=local.address, output=out)
-        acting.join()
+
+        def ended_at(n_runs: int, process: Any) -> Callable[[str, int, int], None]:
+            return lambda stage, done, total: process.kill() if done == n_runs else None
+
+        reports = ended_at(40, local.workers[0])
+        found = run_study(study, 100, workers=local.address, progress=reports)
         assert found.document() == run_study(Draws(), 100).document()
-        stopping = after(120, local.scheduler.kill)
+        reports, out = ended_at(20, local.scheduler), tmp_path / "out"
         with pytest.raises(OutOfResources, match="does not answer any more") as told:
-            run_study(study, 400, workers=local.address, output=out)
-        stopping.join()
+            run_study(study, 400, workers=local.address, output=out, progress=reports)
         assert len(told.value.problems) == 1
-    whole = run_study(Draws(), 400)
-    assert run_study(Draws(), 400, output=out).document() == whole.document()
+        assert not out.exists()
 
 
 @pytest.mark.system

@@ -16,7 +16,7 @@ def test_the_example_is_copied_and_loads(
 ) -> None:
     copy = tmp_path / "here" / "example"
     assert run(monkeypatch, "example", "-o", str(copy)) == 0
-    assert "Next: legcal calibrate" in capsys.readouterr().out
+    assert "Next:\n  legcal calibrate" in capsys.readouterr().out
     copied = {path.relative_to(copy) for path in copy.rglob("*") if path.is_file()}
     own = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
     assert own - copied <= {Path("observations.csv"), Path(".legcal-cache.json")}

@@ -10,16 +10,15 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.pipeline import calibrate
+from legcal.descriptions.controllers import firmware_table, read_delta
+from legcal.descriptions.new_model import Dimensions, create_model, description_of
+from legcal.descriptions.table import described_machine
 from legcal.errors import LegcalError
 from legcal.exports.formats import export
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_poses
-from legcal.machine.description_table import described_machine
-from legcal.machine.family import Dimensions, description_of
-from legcal.machine.firmware_files import firmware_table, read_delta
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
 

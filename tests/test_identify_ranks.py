@@ -183,7 +183,7 @@ def test_the_joint_fit_determines_as_much_as_rows_are_more_than_unknowns() -> No
 def test_the_joint_fit_determines_all_where_counts_fail(
     name: str, views: Sequence[Sequence[int]], holds: bool, full: int
 ) -> None:
-    found = report(name, views)
+    found = report(name, views, 6)
     assert (found.conditions_hold, found.full.rank) == (holds, full)
     assert found.identifiable
     assert not found.remedies
@@ -192,6 +192,7 @@ def test_the_joint_fit_determines_all_where_counts_fail(
     assert 1e-5 < sigma.dX_m < 2e-2
 
 
+@pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(
     ("name", "views", "weak", "kinds"),
     [
@@ -202,7 +203,7 @@ def test_the_joint_fit_determines_all_where_counts_fail(
 def test_what_does_not_move_the_platform_is_harmless(
     name: str, views: Sequence[Sequence[int]], weak: int, kinds: set[str] | None
 ) -> None:
-    found = report(name, views)
+    found = report(name, views, 6)
     assert (len(found.full.weak), found.full.rank) == (weak, found.full.of - weak)
     assert all(d.harmless for d in found.full.weak)
     assert all(d.dX_m == pytest.approx(0.0, abs=1e-9) for d in found.full.weak if kinds is None)

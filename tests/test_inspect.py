@@ -18,14 +18,13 @@ from simulated import simulated
 
 from legcal import evaluate, load_mechanism
 from legcal.calibration.evaluation import Evaluation
+from legcal.descriptions.new_model import create_model
 from legcal.errors import DidNotConverge, ModelError
 from legcal.machine.inspection import machine_document
-from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import geometries
 from legcal.report.calibration import accuracy_table
 from legcal.report.machine import inspect_table
-from legcal.simulation.settings import Level
 
 
 def _printed(what: object) -> str:
@@ -118,14 +117,14 @@ def test_the_mobility_is_that_of_other_poses_where_home_is_singular(tmp_path: Pa
 
 
 def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path: Path) -> None:
-    made = simulated(tmp_path / "set", "3-rpr", level=Level.AXES, poses=6, shared_poses=True)
+    made = simulated(tmp_path / "set", "3-rpr", poses=6, shared_poses=True)
     truth = load_mechanism(made.truth_path)
     leg, *others = geometries(truth)  # of a machine that is near a singularity at home
     write_urdf(truth, [replace(leg, q0=leg.q0 - 0.05), *others], tmp_path / "other.urdf")
     other = tmp_path / "other.yaml"
     write_calibrated_yaml(truth, other, "other.urdf")
 
-    (made.folder / "axes.csv").unlink()
+    (made.folder / "observations.csv").unlink()
     table = made.folder / "measurements.csv"
     rows = read_rows(table)
     for k, row in enumerate(rows):

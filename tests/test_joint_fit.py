@@ -15,7 +15,6 @@ from fit_sessions import (
     LENS,
     PINHOLE,
     SHIPPED,
-    AxesSession,
     HexapodSession,
     MachineSession,
     axes_session,
@@ -48,7 +47,6 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
 )
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames, linearize
@@ -59,7 +57,7 @@ from legcal.machine.parameters import moved_legs, parametrize
 from legcal.simulation.observe import moved_outlines
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
-LIKE_OTHERS = ("hexapod-strut", "nategh-agheli", "6-sps", "3-upu-tilted")  # in their legs
+LIKE_OTHERS = ("hexapod-strut", "nategh-agheli", "6-sps", "3-upu-tilted", "3-spr")  # in their legs
 SCALE = 2.5
 
 
@@ -129,7 +127,7 @@ def starts_far_away(session: MachineSession) -> bool:
     ("name", "known_radii"),
     thinned(
         [*((name, False) for name in SHIPPED), ("3-upu", True), ("delta-round-arms", True)],
-        lambda name, _: name not in LIKE_OTHERS,
+        lambda name, _: name not in (*LIKE_OTHERS, "3-upu"),  # it has a test of its own
     ),
 )
 def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
@@ -547,11 +545,7 @@ def larger(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     return tuple(replace(leg, A=SCALE * leg.A, B=SCALE * leg.B, q0=SCALE * leg.q0) for leg in legs)
 
 
-def fitted_axes(session: AxesSession, measurements: Measurements, axes: LegAxes) -> Solution:
-    return refine(session.legs, measurements, no_outlines(), session.start(), axes=axes)
-
-
-@pytest.mark.parametrize("coplanar", [False, True])
+@pytest.mark.parametrize("coplanar", thinned([False, True], [True]))
 def test_exact_axes_give_the_truth(coplanar: bool) -> None:
     session, joints = axes_session(coplanar=coplanar), 0.005
     start = session.start(joints=joints)
@@ -561,33 +555,6 @@ def test_exact_axes_give_the_truth(coplanar: bool) -> None:
     assert found.quality.rms_px is None
     assert found.quality.rms_axes == pytest.approx(0.0, abs=1e-5)
     assert found.radii == {}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("coplanar", [False, True])
-def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> None:
-    session, n = axes_session(coplanar=coplanar), 40
-    problem = build_fit(session.legs, session.measurements, no_outlines(), axes=session.axes)
-    least = bound(problem, session.truth)
-    solutions = [fitted_axes(session, *session.noisy(seed)) for seed in range(n)]
-    errors = np.array([session.errors(found.parameters) for found in solutions])
-    sigmas = np.array([found.estimates.sigma for found in solutions])
-    claimed = [
-        error @ np.linalg.solve(found.estimates.covariance, error) / 30
-        for error, found in zip(errors, solutions, strict=True)
-    ]
-    to_bound = np.einsum("na,ab,nb->n", errors, np.linalg.inv(least), errors) / 30
-    # The mean of 40 chi-squares of 30 degrees, over 30: 1 with a standard deviation of 0.041.
-    assert np.mean(to_bound) == pytest.approx(1.0, abs=0.12)
-    assert np.mean(claimed) == pytest.approx(1.0, abs=0.12)
-    # Parameters share few large errors, so that their own mean squares spread more.
-    assert np.mean((errors / sigmas) ** 2) == pytest.approx(1.0, abs=0.3)
-    quality = [found.quality for found in solutions]
-    assert np.mean([one.chi2 / one.dof for one in quality]) == pytest.approx(1.0, abs=0.02)
-    assert np.mean([one.rms_axes or 0.0 for one in quality]) < 1.0
-    # What the robust loss does not keep, and no more.
-    assert np.all(sigmas.mean(axis=0) > np.sqrt(np.diag(least)))
-    assert sigmas.mean() < 1.02 * np.sqrt(np.diag(least)).mean()
 
 
 def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:

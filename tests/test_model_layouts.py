@@ -1,6 +1,7 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
 import pickle
+import re
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -14,7 +15,7 @@ from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
-from outside_machines import missing, scaled
+from outside_machines import OUTSIDE, missing, scaled
 from thinned import thinned
 
 from legcal.errors import OutOfClass, UsageError
@@ -164,7 +165,7 @@ def _plain(description: str, folder: Path) -> Machine:
 def _usual(description: str, name: str) -> bool:
     """Say whether a machine is tried in a layout: all layouts, one or two machines each."""
     if name == "every leg otherwise":
-        return True
+        return description in (*OF_EACH_KIND, "hexapod with a strut")
     return description in OF_EACH_KIND and (
         (OF_EACH_KIND.index(description) + list(LAYOUTS).index(name)) % len(OF_EACH_KIND) == 0
     )
@@ -309,8 +310,10 @@ def _without(path: Path, *keys: str) -> Path:
     ("machine", "layout"),
     thinned(
         product(["6-UPS", "3-RPR", "Tricept", "hexapod with a rod"], UNNAMED),
-        [("6-UPS", "hung from the base"), ("3-RPR", "hung from the base")]
-        + [("Tricept", layout) for layout in UNNAMED],
+        [
+            *(("6-UPS", "hung from the base"), ("3-RPR", "welded")),
+            *(("Tricept", "hung from the platform"), ("Tricept", "carried")),
+        ],
     ),
 )
 def test_base_platform_and_legs_are_taken_from_the_bodies(
@@ -376,3 +379,16 @@ def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(
     assert load_mechanism(path).urdf_path == path.with_suffix(".urdf")
     monkeypatch.chdir(tmp_path)  # where a folder has the name of a shipped model
     assert load_mechanism("hexapod").yaml_path == SHIPPED_YAML
+
+
+@pytest.mark.parametrize("name", ["u-off", "r-off", "s-in-two-points", "spin-RR", "turning-motor"])
+def test_a_refused_leg_says_what_was_found_and_what_is_needed(name: str, tmp_path: Path) -> None:
+    write, named = OUTSIDE[name]
+    write(tmp_path)
+    with pytest.raises(OutOfClass, match=re.escape(named[0])) as refused:
+        load_mechanism(tmp_path / "machine.yaml")
+    fact = refused.value.facts[0]
+    assert fact.found
+    assert fact.needed
+    assert fact.remedy
+    assert fact.file

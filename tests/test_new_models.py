@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, TRIPOD, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.descriptions.new_model import Dimensions, create_model, description_of, write_template
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, Problem, UsageError
-from legcal.machine.family import Dimensions, description_of, write_template
+from legcal.machine.closing import singularity
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine
-from legcal.machine.model_builder import create_model
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
@@ -289,6 +288,15 @@ def test_an_unknown_column_of_a_table_of_joints_is_refused(tmp_path: Path) -> No
     path.write_text("point,x,y,zz\nB1,1,2,3\nP1,4,5,6\n")
     with pytest.raises(ModelError, match=r"the unknown column 'zz'.*did you mean 'z'"):
         read_table(path, "mm")
+
+
+def test_cells_of_a_table_of_joints_are_refused_on_their_own_lines(tmp_path: Path) -> None:
+    path = tmp_path / "joints.csv"
+    path.write_text("point,x,y\nB1,1,2\nB2,a,2\nP1,4\nB1,4,5\nQQ,4,5\n")
+    with pytest.raises(ModelError) as refused:
+        read_table(path, "mm")
+    facts = [(problem.line, problem.found) for problem in refused.value.facts]
+    assert facts == [(3, "'a'"), (4, "2 cells"), (5, "'B1' twice"), (6, "'QQ'")]
 
 
 def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from legcal.perception.blocks import (
     fit_blocks,
     fit_lines,
 )
-from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
     MATTE_DIRECTIONS,
     N_AMPLITUDES,
@@ -25,10 +24,19 @@ from legcal.perception.limb import (
     profile_functions,
     simple_functions,
 )
-from legcal.perception.limb_search import limb_shifts
-from legcal.perception.pixel_sums import PixelBins, PixelSums, even_weights, noise_ratios
 from legcal.perception.pooled_fit import fit_pooled
-from legcal.perception.profiles import Edge, Profiles, read_profiles
+from legcal.perception.profiles import (
+    Edge,
+    PixelBins,
+    PixelSums,
+    Profiles,
+    Samples,
+    even_weights,
+    noise_ratios,
+    read_profiles,
+    to_light,
+)
+from legcal.perception.subpixel_edges import limb_shifts
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import Band
 

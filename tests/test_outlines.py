@@ -13,10 +13,9 @@ from legcal.data.outlines import Outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
-from legcal.machine.occluders import Carrier, Occluder
+from legcal.machine.shapes import Carrier, Occluder
 from legcal.perception.blocks import BlockLine
-from legcal.perception.detection import measure_outlines
-from legcal.perception.outline import NARROW_BIAS, PartVerdict, verdict
+from legcal.perception.outline import NARROW_BIAS, PartVerdict, measure_outlines, verdict
 from legcal.perception.part_edges import LONE_SCORE, EdgePair, _alone
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import LostEdge, MeasuredEdge

@@ -20,8 +20,15 @@ from legcal.data.photograph_notes import compression_notes
 from legcal.errors import DatasetError, NotVisible, Place
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
-from legcal.vision.image_facts import ImageFacts, read_facts
-from legcal.vision.image_file import BadImage, decode_image, image_size, inspect_image, read_image
+from legcal.vision.image_file import (
+    BadImage,
+    ImageFacts,
+    decode_image,
+    image_size,
+    inspect_image,
+    read_facts,
+    read_image,
+)
 
 __all__ = ["folder"]
 

@@ -28,7 +28,7 @@ from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
 from legcal.simulation.dataset import SimulatedDataset
 from legcal.simulation.settings import Level
-from legcal.vision.board_file import parse_boards
+from legcal.vision.board import parse_boards
 
 PATH = Path("dataset.yaml")
 CHARUCO: dict[str, Any] = {

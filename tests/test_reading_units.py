@@ -18,9 +18,9 @@ from photograph_files import jpeg
 import legcal
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.reading_units import sigmas_of
+from legcal.descriptions.new_model import create_model
 from legcal.errors import LegcalError, ModelError, UsageError
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model_builder import create_model
 from legcal.machine.model_writer import write_model
 from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 

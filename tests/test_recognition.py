@@ -30,6 +30,7 @@ from legcal.perception.camera_search import (
     place_by_edges,
     place_camera,
     place_near,
+    pose_hypotheses,
 )
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.edge_maps import EdgeMaps
@@ -46,8 +47,6 @@ from legcal.perception.pair_matching import (
     segment_equations,
 )
 from legcal.perception.placement import Group, Search, group_views
-from legcal.perception.pose_hypotheses import pose_hypotheses
-from legcal.perception.radii import MIN_CHANGE, RadiusFactors, estimate_radii
 from legcal.perception.view_fit import (
     ViewFit,
     fit_view,
@@ -259,43 +258,6 @@ def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
     assert np.median(distances(own, _pose(T), matches)[0, 0, good]) < 2e-4
     off = distances(own, _pose(away), matches)[0, 0, good]
     assert 2e-3 < off.max() < 6e-3
-
-
-@pytest.mark.parametrize(("factor", "legs"), [(1.25, [1]), (0.8, [1]), (1.25, [0, 1, 2, 3, 4, 5])])
-def test_radii_that_pictures_contradict_are_estimated(factor: float, legs: list[int]) -> None:
-    pictures, T = _scene(2, n=8)
-    stated = []  # the model has the radii of some legs wrong
-    for p in pictures:
-        wrong = np.where(np.isin(p.targets.leg, legs), 1.0 / factor, 1.0)
-        stated.append(replace(p, targets=replace(p.targets, radius=wrong * p.targets.radius)))
-    radii = estimate_radii([(0, stated, _pose(T))])
-    assert radii.factor
-    assert {leg for leg, _ in radii.factor} <= set(legs)
-    assert list(radii.factor.values()) == pytest.approx([factor] * len(radii.factor), rel=0.03)
-    assert (radii.common > 0.0) == (len(legs) == 6)
-    assert not estimate_radii([(0, pictures, _pose(T))]).factor
-
-
-@pytest.mark.parametrize(("factor", "legs"), [(0.9, [0, 1, 2, 3, 4, 5]), (0.98, [1])])
-def test_a_leg_that_is_as_thin_as_all_or_hardly_thinner_keeps_its_radius(
-    factor: float, legs: list[int]
-) -> None:
-    """Light and optics make the edges of thin legs thinner: that is no radius of one of them."""
-    pictures, T = _scene(2, n=8)
-    stated = []
-    for p in pictures:
-        wrong = np.where(np.isin(p.targets.leg, legs), 1.0 / factor, 1.0)
-        stated.append(replace(p, targets=replace(p.targets, radius=wrong * p.targets.radius)))
-    radii = estimate_radii([(0, stated, _pose(T))])
-    assert (radii.common > 0.0) == (len(legs) == 6)
-    suspects = {part for part in radii.factor if part[0] == 1}
-    assert not radii.only(suspects).factor
-
-
-def test_corrections_that_lead_back_to_the_model_leave_its_radius() -> None:
-    first, back = RadiusFactors({(5, 3e-3): 0.9}), RadiusFactors({(5, 2.7e-3): 1.09})
-    assert not first.then(back).beyond(MIN_CHANGE).factor
-    assert first.beyond(MIN_CHANGE).factor == first.factor
 
 
 # The camera of a view.
@@ -552,10 +514,10 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
     search = _search(_Made, made, np.array([made.posed(P) for P in spread]))
     monkeypatch.setattr(  # there are no images to measure outlines in
-        recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
+        recognition, "_decided_by_outlines", lambda search, pictures, task: task[1]
     )
     for hint in (T, turned):
-        placement = recognition.place_views(search, np.arange(4), [hint]).recognised()
+        placement = recognition.place_views(search, np.arange(4), [hint])
         placed = placement.T_base_camera[0]
         assert placed is not None
         assert lp.apart(T, placed)[1] < np.deg2rad(2.0)
@@ -568,15 +530,13 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     T, made, poses = lp.camera(rng), lp.machine(6), [lp.platform(rng) for _ in range(4)]
     _Made.made[:] = lp.pictures(made, T, poses, rng, missing=1.1)
     search = _search(_Made, made, np.array([made.posed(P) for P in poses]))
-    monkeypatch.setattr(
-        recognition.PlacedViews, "decided_by_outlines", lambda views, g: views.placed[g]
-    )
+    monkeypatch.setattr(recognition, "_decided_by_outlines", lambda search, pictures, task: task[1])
     monkeypatch.setattr(recognition, "_by_edges", lambda search, task: task.by_pairs)
     view = search.measurements.views[0]
     for is_placed in (False, True):
         views = (replace(view, is_placed=is_placed),)
         search = replace(search, measurements=replace(search.measurements, views=views))
-        placement = recognition.place_views(search, np.arange(4), [T]).recognised()
+        placement = recognition.place_views(search, np.arange(4), [T])
         assert (placement.T_base_camera[0] is not None) == is_placed
         assert ("c1" in placement.unplaced) != is_placed
     placed = placement.T_base_camera[0]

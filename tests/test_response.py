@@ -9,8 +9,7 @@ from scipy.special import ndtr
 
 from legcal.data.dataset import load_dataset
 from legcal.perception.blocks import fit_blocks
-from legcal.perception.light import to_light
-from legcal.perception.pixel_sums import PixelBins
+from legcal.perception.profiles import PixelBins, to_light
 
 __all__ = ["folder"]
 BLUR, HALF_WIDTH, WHITE = 0.6, 14.0, 255.0

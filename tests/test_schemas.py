@@ -17,12 +17,11 @@ from simulated import simulated
 
 from legcal.cli.app import app
 from legcal.data.dataset_file import read_dataset_file
+from legcal.descriptions.table import read_description
 from legcal.errors import LegcalError
 from legcal.files.published import schema_names
 from legcal.files.schema import read_yaml
-from legcal.machine.description_table import read_description
 from legcal.machine.files import read_mechanism_file
-from legcal.simulation.settings import Level
 from legcal.vision.camera_file import read_camera
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema (extra test) is not installed")
@@ -70,7 +69,7 @@ def test_every_shipped_file_fits_the_schema_that_it_names() -> None:
 def test_what_is_written_names_a_schema_beside_it_that_it_fits(
     example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulated(tmp_path / "set", "3-rpr", level=Level.AXES, views=3, poses=6)
+    simulated(tmp_path / "set", "3-rpr", views=3, poses=6)
     assert run(monkeypatch, "new", "--template", "-o", tmp_path) == 0
     assert run(monkeypatch, "new", tmp_path / "my-hexapod.yaml", "-o", tmp_path) == 0
     assert run(monkeypatch, "inspect", "3-rps", "--write", tmp_path) == 0

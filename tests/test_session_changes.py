@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from changed_rays import turned, with_rays, zoomed
+from changed_rays import turned, with_moved_joint, with_rays, zoomed
 from csv_rows import read_rows, write_rows
-from simulated import simulated
+from scipy.spatial.transform import Rotation
+from simulated import settings, simulated, standing
 
 from legcal import calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.fit import refine
@@ -24,6 +25,7 @@ from legcal.data.image_choice import chosen_images, dataset_at, image_sequences,
 from legcal.errors import UsageError
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
+from legcal.simulation.session import simulate_session, streams
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -112,6 +114,20 @@ def _with_later_rays(change: Callable[[Array], Array]) -> Callable[[Dataset], Da
     return lambda dataset: with_rays(dataset, _later(dataset.measurements.n_rows), change)
 
 
+def _with_each_rays(
+    change: Callable[[np.random.Generator], Callable[[Array], Array]],
+) -> Callable[[Dataset], Dataset]:
+    """Change the rays of each image of the second view by a draw of its own."""
+
+    def changed(dataset: Dataset) -> Dataset:
+        n, rng = dataset.measurements.n_rows, np.random.default_rng(1)
+        for row in range(12, n):
+            dataset = with_rays(dataset, np.arange(n) == row, change(rng))
+        return dataset
+
+    return changed
+
+
 CASES: dict[str, tuple[Callable[[Dataset], Dataset], str, float]] = {
     "encoder": (_with_readings(_slipped), "leg2", SLIP),
     "lag": (_with_readings(lambda q: q + LAG * _moves(q)), "", LAG),
@@ -127,6 +143,19 @@ CASES: dict[str, tuple[Callable[[Dataset], Dataset], str, float]] = {
     ),
     "drift": (_with_readings(_drifting), "leg6", DRIFT),
     "reading_noise": (_with_readings(_commanded), "all motors", SCATTER),
+    "eccentricity": (
+        _with_readings(
+            lambda q: q + SCATTER * np.sin(1.0 + np.pi * q / 2.5e-3) * (np.arange(6) == 1)
+        ),
+        "leg2",
+        SCATTER,
+    ),
+    "autofocus": (_with_each_rays(lambda rng: zoomed(ZOOM * rng.normal())), "c2", ZOOM),
+    "vibration": (
+        _with_each_rays(lambda rng: Rotation.from_rotvec(TURN * rng.normal(size=3)).apply),
+        "c2",
+        TURN,
+    ),
     "camera": (_with_later_rays(turned(TURN)), "c2", TURN),
     "focal_length": (_with_later_rays(zoomed(ZOOM)), "c2", ZOOM),
 }
@@ -148,6 +177,19 @@ def test_the_first_finding_is_what_was_done_with_its_amount(
         assert finding.between is not None
         labels = healthy.measurements.pose_labels
         assert finding.between == (labels[11 + CHANGED_AT], labels[12 + CHANGED_AT])
+
+
+def test_a_joint_that_moved_is_named_and_not_the_encoder_of_its_leg(
+    healthy: Dataset, start: Start
+) -> None:
+    truth = load_mechanism(next((healthy.folder / "truth/models").glob("*.yaml")))
+    nominal, given = load_mechanism("hexapod"), settings(views=standing("hexapod"), poses=12)
+    scene = simulate_session(truth, nominal, given, streams(given.seed)).scene
+    by = np.array([0.0, 3e-4, -4e-4])
+    later = np.arange(24) >= 12 + CHANGED_AT  # of readings and outlines in the second view alone
+    finding = _findings(with_moved_joint(healthy, scene, later, 3, by), start)[0]
+    assert (finding.kind, finding.subject) == ("joint", "leg4.base")
+    assert abs(finding.amount - 5e-4) < 4.0 * finding.sigma < 3e-4
 
 
 def test_a_slip_between_two_views_is_not_a_drift(healthy: Dataset, start: Start) -> None:

@@ -25,7 +25,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.report.session import simulation_table
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset, simulate, summary_document
-from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.settings import (
     Distribution,
     Level,
@@ -118,10 +118,10 @@ def test_the_seed_and_nothing_else_decides_what_is_drawn(tmp_path: Path) -> None
     one, again, other = files("a", seed=7), files("b", seed=7), files("c", seed=8)
     assert one == again
     assert one["measurements.csv"] != other["measurements.csv"]
-    axes = files("d", seed=7, level=Level.AXES)
+    exact = files("d", seed=7, sigma_px=0.0)
     for name in ("measurements.csv", "truth/urdf/hexapod.urdf", "truth/outlines.csv"):
-        assert one[name] == axes[name]
-    assert "observations.csv" not in axes
+        assert one[name] == exact[name]
+    assert one["observations.csv"] != exact["observations.csv"]
 
 
 def test_photographs_are_those_of_the_kind_of_camera_and_its_file(tmp_path: Path) -> None:
@@ -162,8 +162,8 @@ def test_repeated_photographs_differ_and_what_to_do_with_them_is_said(tmp_path: 
     document = summary_document(one)
     console.print(simulation_table(document))
     printed = console.export_text()
-    assert f"calibrate with: legcal calibrate {one.folder} -o OUT\n" in printed
-    assert f"judge with: legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
+    assert f"\n  legcal calibrate {one.folder} -o OUT\n" in printed
+    assert f"  legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
     document["views"]["c1"]["legs"]["leg2"] = 0
     console.print(simulation_table(document))
     assert "Few of the 2 images show these legs: leg2 in 0." in console.export_text()
@@ -184,7 +184,7 @@ def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
     header = ",".join(f"leg{j}_prismatic" for j in range(1, 7))
     (tmp_path / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
     given = settings(
-        views=views, poses=tmp_path / "poses.csv", readings=Spread(), level=Level.AXES,
+        views=views, poses=tmp_path / "poses.csv", readings=Spread(), level=Level.OUTLINES,
         occlusion=False,
     )  # fmt: skip
     made = simulate("hexapod", tmp_path / "set", given)
@@ -197,6 +197,8 @@ def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
     assert m.views[1].legs == ("leg2", "leg5")
     assert made.seen.tolist() == [[True] * 6] * 2 + [[False, True, False, False, True, False]] * 2
     assert m.pose.tolist() == [0, 1, 0, 1]
+    assert m.time is not None
+    assert m.time.tolist() == [0.0, 10.0, 0.0, 10.0]  # both views take a pose at once
     readings = np.array([[float(x) for x in row.split(",")] for row in rows])
     assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
 
@@ -257,12 +259,9 @@ def test_options_become_settings(tmp_path: Path) -> None:
         ({"readings": 2e-6}, "readings, needed a Spread"),
         ({"errors": None}, "errors, needed a ParameterErrors"),
         ({"errors": ParameterErrors(axes=0.1)}, "errors.axes"),  # type: ignore[arg-type]
-        ({"table": TableNoise(psi="0.05")}, "table.psi"),  # type: ignore[arg-type]
-        ({"table": TableNoise(psi=-1.0)}, "-1 as the noise of psi, .* rad"),
-        ({"table": TableNoise(x=0.0)}, "noise of x, .* m"),
         ({"appearance": "clean"}, "appearance"),
         ({"images": True}, "images"),
-        ({"level": "pictures"}, "level 'pictures', needed axes or outlines or photographs"),
+        ({"level": "pictures"}, "level 'pictures', needed outlines or photographs"),
         ({"sampling": "best"}, "sampling 'best'"),
         ({"poses": 10**9}, "poses, needed 1 to 100000"),
         ({"seed": 1.5}, "seed"),

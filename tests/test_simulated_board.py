@@ -16,11 +16,11 @@ from legcal.errors import NotVisible
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
+from legcal.perception.board_adjustment import camera_poses_by_board
 from legcal.perception.board_corners import find_corners
-from legcal.perception.board_poses import camera_poses_by_board
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level, SimulationSettings
-from legcal.vision.board_file import parse_board
+from legcal.vision.board import parse_board
 
 
 @cache
@@ -46,7 +46,7 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("board") / "held"
     settings = SimulationSettings(
-        level=Level.AXES, poses=3, views=1, board="aprilgrid", hand_held=True, sigma_px=0.0
+        level=Level.OUTLINES, poses=3, views=1, board="aprilgrid", hand_held=True, sigma_px=0.0
     )
     simulate(machine(), folder, settings)
     return folder

@@ -12,9 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
+from legcal.machine.closing import singularity
 from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
 from legcal.machine.loader import load_mechanism
-from legcal.machine.mobility import singularity
 from legcal.machine.model import Machine, vectors_A_to_B
 
 machine_of = cache(load_mechanism)

@@ -1,19 +1,16 @@
-"""Small studies for the tests of the runner, and a program that runs one of them."""
+"""Small studies for the tests of the runner."""
 
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from legcal.errors import DidNotConverge
-from legcal.signals import stopped_by_signals
-from legcal.simulation.study import Record, run_study
+from legcal.simulation.study import Record
 
 
 @dataclass(frozen=True)
@@ -74,9 +71,3 @@ class Deadly(Draws):
     def one_run(self, seed: np.random.SeedSequence) -> Record:
         os.kill(os.getpid(), signal.SIGKILL)
         return {}
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests may run with it ignored
-    with stopped_by_signals():
-        run_study(Draws(seconds=0.05), 400, workers=2, output=Path(sys.argv[1]))

@@ -26,8 +26,8 @@ from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
+from legcal.perception.board_adjustment import board_poses_in_images, camera_poses_by_board
 from legcal.perception.board_corners import detect_corners, require_board
-from legcal.perception.board_poses import board_poses_in_images, camera_poses_by_board
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
 from legcal.perception.photographs import nominal_placement
 from legcal.perception.placement import Placement

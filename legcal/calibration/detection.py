@@ -180,11 +180,10 @@ def rows_with_image(dataset: Dataset) -> IntArray:
 def require_images(dataset: Dataset) -> IntArray:
     """Return the rows that have an image file; refuse a dataset without any."""
     rows = rows_with_image(dataset)
-    if dataset.axes is not None or not len(rows):
-        content = "a table of axes" if dataset.axes is not None else "no image"
+    if not len(rows):
         raise DatasetError(
-            f"{dataset.table_path}: the images could not be searched: found {content}, needed "
-            "images of the legs; name them in the table of measurements."
+            f"{dataset.table_path}: the images could not be searched: found no image, "
+            "needed images of the legs; name them in the table of measurements."
         )
     return rows
 

@@ -39,7 +39,7 @@ from legcal.calibration.joint_fit.scale import (
 )
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.session_changes import OF_MOTORS, Finding, SessionTests
+from legcal.calibration.session_changes import OF_MOTORS, OF_SCATTER, Finding, SessionTests
 from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
@@ -56,7 +56,6 @@ from legcal.perception.diagnostics import far_from_hints, images_left_out, is_me
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
 TOLERANCE = "tolerance"  # code of the doubt in parameters that moved far
-READING_NOISE = "reading_noise"  # code of the doubt in readings that scatter
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
 MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
@@ -112,7 +111,7 @@ def model_error(doubts: Sequence[Doubt]) -> tuple[float, float]:
     )
 
 
-OF_SCATTER = frozenset(("noise", CAMERA, "left_out"))  # codes of what a change leaves behind
+OF_CHANGES = frozenset(("noise", CAMERA, "left_out"))  # codes of what a change leaves behind
 
 
 def doubts_of(
@@ -142,7 +141,8 @@ def doubts_of(
     causes = [*scale, *(doubt for doubt in course if not (scale and doubt.code == "pitch"))]
     codes = {doubt.code for doubt in course}
     motors = {one.subject for one in session.findings if one.kind in codes}
-    explained = {leg.name for leg in dataset.machine.legs if leg.motor_label in motors}
+    motors |= {subject.partition(".")[0] for subject in motors}  # legs of joints
+    explained = {leg.name for leg in dataset.machine.legs if motors & {leg.motor_label, leg.name}}
     symptoms = (
         []
         if causes
@@ -154,12 +154,12 @@ def doubts_of(
             *noise,
         ]
     )
-    if session.findings and any(one.code in OF_SCATTER for one in symptoms):
+    if session.findings and any(one.code in OF_CHANGES for one in symptoms):
         # Certain changes, too small to count by themselves, are what makes outlines scatter
         causes = [Doubt(one.kind, one.what, one.remedy) for one in session.findings]
-        symptoms = [one for one in symptoms if one.code not in OF_SCATTER]
-    if {one.code for one in causes} == {READING_NOISE}:
-        # A model that was led away scatters readings as well
+        symptoms = [one for one in symptoms if one.code not in OF_CHANGES]
+    if causes and {one.code for one in causes} <= OF_SCATTER:
+        # A model that was led away scatters readings and cameras as well
         symptoms = of.left_out()
     readings = solution.quality.redundant_readings
     contradicted = () if readings is None or codes & OF_MOTORS else readings.doubts
@@ -468,10 +468,10 @@ class _Evidence:
             if self.platform is None or effect is None:
                 doubts.append(Doubt(finding.kind, finding.what, finding.remedy))
             elif effect[0] > self.platform.sigma.mean_displacement or (
-                scatters and finding.kind == READING_NOISE
+                scatters and finding.kind in OF_SCATTER
             ):
                 doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
-        return [doubt for doubt in doubts if doubt.code != READING_NOISE] or doubts
+        return [doubt for doubt in doubts if doubt.code not in OF_SCATTER] or doubts
 
     def _effect_of(self, finding: Finding) -> tuple[float, float]:
         """Return the mean displacement [m] and rotation [rad] by a number that the fit lacks.
@@ -481,6 +481,8 @@ class _Evidence:
         machine, solution = self.dataset.machine, self.solution
         error = self.moved_in_fit(finding.steps)
         before = error.mean_displacement, error.mean_rotation
+        if finding.kind == "joint":  # the platform follows, by about as much
+            return max(before[0], finding.amount), max(before[1], finding.amount / machine.size)
         if finding.kind != "encoder":
             return before
         q = self.dataset.measurements.q_of_poses

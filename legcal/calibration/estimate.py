@@ -41,6 +41,7 @@ from legcal.data.measurements import Measurements, few, few_views, image_notes
 from legcal.data.outlines import (
     Outlines,
     along_legs,
+    join_outlines,
     no_outlines,
     polished_parts,
     reject_unused_legs,
@@ -55,6 +56,7 @@ from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
+from legcal.perception.body_edges import has_bodies, measure_body_edges
 from legcal.perception.diagnostics import is_visible, reject_images
 from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
@@ -86,6 +88,7 @@ class Estimate:
     fit_notes: tuple[str, ...] = ()  # notes on the images, by the fit
     other_radii: bool = False  # whether the images show other radii than the model has
     diagnosis: tuple[Diagnosis, ...] = ()  # suspected mistakes if many images were left out
+    edges: Outlines | None = None  # of bodies, in all images
 
     @cached_property
     def outliers(self) -> dict[int, Cause]:
@@ -99,6 +102,7 @@ class Estimate:
         return replace(
             self,
             outlines=restore(self.outlines),
+            edges=None if self.edges is None else restore(self.edges),
             steps=self.steps.in_file_order(order),
             solution=in_file_order(self.solution, order, dataset),
             corners=None if self.corners is None else restore(self.corners),
@@ -114,10 +118,12 @@ def fit_outlines(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     steps: Steps | None = None,
+    edges: Outlines | None = None,
 ) -> Estimate:
     """Run the four steps, then the joint fit, with the outlines of all images.
 
     ``steps`` is the result of the four steps from an earlier measurement; it is not recomputed.
+    ``edges`` are those of bodies.
 
     Raises
     ------
@@ -134,6 +140,10 @@ def fit_outlines(
         _refuse_unseen_legs(fitted, fitted_outlines)
     if steps is None:
         steps = four_steps(fitted, fitted_outlines, board, options)
+    fitted_edges = None if edges is None else edges.at(fitted.rows)
+    if fitted_edges is not None:
+        names = fitted.machine.leg_names
+        fitted_edges = reject_unused_legs(fitted_edges, fitted.measurements, names)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in fitted_outlines.source:
@@ -144,19 +154,17 @@ def fit_outlines(
         fitted_outlines,
         starts(fitted, fitted_outlines, placement, steps, board),
         settings,
-        axes=fitted.axes,
         board=None if board is None else board.at(fitted.rows),
         choices=choices,
+        edges=fitted_edges,
     )
     fitted.progress("Joint fit", 1, 1)
     corners = None if board is None else board.reject_outliers(solution, fitted)
-    return Estimate(fitted, outlines, steps, solution, corners)
+    return Estimate(fitted, outlines, steps, solution, corners, edges=edges)
 
 
 def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
     """Raise NotVisible if no image shows a leg that its view should show."""
-    if fitted.axes is not None:
-        return
     unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
     if unseen:
         raise NotVisible(
@@ -296,8 +304,18 @@ class _SearchNearFit:
         outlines = self.photographs.with_found(outlines)
         if like is not None:
             outlines = used_as_before(outlines, like)
+        edges = near.edges
+        if like is None and has_bodies(photographs.machine):
+            stage = "Measuring edges of bodies near the fit"
+            edges = measure_body_edges(photographs, placement, progress, stage)
+            if (given := self.data.body_edges) is not None:
+                edges = join_outlines(
+                    [edges, given.choose(~np.isin(given.row, photographs.detect))]
+                )
         here = near.fitted.with_fitted_poses(near.solution.T_Rb_Re)
-        return fit_outlines(here, outlines, placement, self.board, self.options, steps=near.steps)
+        return fit_outlines(
+            here, outlines, placement, self.board, self.options, steps=near.steps, edges=edges
+        )
 
 
 def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:

@@ -54,13 +54,12 @@ def four_steps(
     if options.criteria is None:
         return Steps(None, None, "They were left out.")
     data.progress("Four steps", 0, 1)
-    axes, measurements = data.axes, data.measurements
+    measurements = data.measurements
     try:
         nominal = nominal_machine(data.machine)
-        if axes is None:
-            legs = data.machine.legs
-            radii = {part: r for leg in legs for part, r in leg.radius_along.items()}
-            axes = axes_from_outlines(along_legs(outlines, legs), measurements, radii)
+        legs = data.machine.legs
+        radii = {part: r for leg in legs for part, r in leg.radius_along.items()}
+        axes = axes_from_outlines(along_legs(outlines, legs), measurements, radii)
         joined = board is not None and any(T is not None for T in board.T_board_camera)
         if board is not None and joined:
             axes, measurements, T_first_camera, new_view = in_one_camera(
@@ -141,8 +140,7 @@ def _start_cameras(
 ) -> list[RigidTransform]:
     """Return a camera pose for every view, from *first* if it has one, else from *second*."""
     cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
-    shown = outlines.row[outlines.used] if data.axes is None else data.axes.row
-    needed = set(data.measurements.view[shown].tolist())
+    needed = set(data.measurements.view[outlines.row[outlines.used]].tolist())
     if board is not None:
         on_platform = [row in board.T_camera_board for row in data.rows.tolist()]
         needed |= set(data.measurements.view[on_platform].tolist())

@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
 from legcal.causes import Cause, by_cause
-from legcal.data.axes import LegAxes
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset
 from legcal.data.image_choice import dataset_at
@@ -29,6 +28,7 @@ from legcal.data.image_tables import (
 )
 from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, few, images_in_words, row_names
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, IntArray
@@ -69,7 +69,6 @@ class OrderedDataset:
     progress: Report
     machine: Machine  # in canonical order, as all following fields
     measurements: Measurements
-    axes: LegAxes | None
     rows: IntArray  # indices of these images among all images
     # T_base_platform estimated from images, by row among all images, if readings do not give it
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
@@ -94,6 +93,12 @@ class OrderedDataset:
             edge_pairs=self.edge_pairs,
             clicked_poses=self._clicked_poses(),
         )
+
+    @property
+    def body_edges(self) -> Outlines | None:
+        """The edges of bodies that were measured before, in all images."""
+        edges = self.dataset.body_edges
+        return None if edges is None else self.order.reorder(edges)
 
     def _clicked_poses(self) -> dict[int, tuple[RigidTransform, ...]]:
         """Return T_base_platform from clicks, by pose, if readings do not give it."""
@@ -190,7 +195,6 @@ class OrderedDataset:
         return replace(
             self,
             measurements=measurements_at(self.measurements, rows),
-            axes=None if self.axes is None else self.axes.at(rows),
             rows=self.rows[rows],
         )
 
@@ -218,7 +222,6 @@ def order_dataset(
         progress=progress,
         machine=dataset.machine.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
-        axes=None if dataset.axes is None else order.reorder(dataset.axes),
         rows=np.arange(dataset.measurements.n_rows),
     )
 

@@ -11,8 +11,7 @@
    to four times.
 6. Judge what the platform gains, and write the result.
 
-Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
-are searched like the others, and not fitted. Phases 2 to 5 work in canonical order;
+Held-out images are searched like the others, and not fitted. Phases 2 to 5 work in canonical order;
 :meth:`.estimate.Estimate.in_file_order` restores the order of the files.
 """
 
@@ -368,7 +367,9 @@ def _estimate(
     kept_gammas = known_gammas(data.photographs.keep, data.measurements)
     photographs = data.photographs.with_gammas(kept_gammas)
     if len(photographs.detect) == 0:  # outlines, or axes, are given
-        estimate = fit_outlines(fitted, given_outlines(photographs), placement, board, options)
+        outlines = given_outlines(photographs)
+        edges = data.body_edges
+        estimate = fit_outlines(fitted, outlines, placement, board, options, edges=edges)
         return replace(
             estimate,
             image_notes=data.plan.notes,
@@ -381,7 +382,7 @@ def _estimate(
         photographs, placement, data.progress, T_board_camera, method=measure_in_brief
     )
     seen.placement.require_one()
-    other_radii = bool(seen.placement.radii.factor)
+    other_radii = seen.photographs.machine is not photographs.machine
     if other_radii:
         data = replace(data, machine=seen.photographs.machine)
     data = data.with_poses(seen.free_poses)
@@ -466,7 +467,8 @@ def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[
     if estimate.other_radii or estimate.diagnosis or len(plan.detect) == 0:
         return []
     outlines = data.order.restore(estimate.outlines)
-    note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes)
+    edges = None if estimate.edges is None else data.order.restore(estimate.edges)
+    note = store_outlines(data.dataset, outlines, key, plan.given, estimate.image_notes, edges)
     return [note] if note else []
 
 
@@ -479,7 +481,6 @@ def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choice
     known = known_parameters(
         dataset.machine,
         dataset.measurements.views,
-        axes_given=dataset.axes is not None,
         boards=dataset.boards,
     )
     choices = resolve([*dataset.overrides, *overrides], known)
@@ -503,11 +504,6 @@ def _fitted_and_held_out(
         return rows[fitted], rows[held_out]
     if holdout is None:
         return rows, rows[:0]
-    if dataset.axes is not None:
-        raise UsageError(
-            f"{dataset.folder}: --holdout needs images or outlines, and this dataset has a table "
-            "of axes; leave it out."
-        )
     if not dataset.machine.is_determined:
         raise UsageError(
             f"{dataset.folder}: --holdout needs readings that determine the pose of an image, but "
@@ -546,8 +542,6 @@ def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     """Return a note on cameras taken as exact because no covariance is stated."""
-    if dataset.axes is not None:
-        return []
     views = dataset.measurements.views
     names, cameras = [view.name for view in views], [view.camera for view in views]
     stated = (*choices.free, *choices.priors, *choices.fixed)

@@ -189,8 +189,7 @@ def _result_of(calibration: Calibration) -> Result:
     machine, measurements = dataset.machine, dataset.measurements
     names, views = machine.leg_names, measurements.views
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    o, axes = solution.outlines, dataset.axes
-    rows, corners = o.row[o.used] if axes is None else axes.row, calibration.corners
+    rows, corners = solution.outlines.row[solution.outlines.used], calibration.corners
     if corners is not None:
         rows = np.concatenate([rows, corners.row[corners.used]])
     shown = np.unique(measurements.view[rows]).tolist()
@@ -323,10 +322,6 @@ def _staged(calibration: Calibration) -> Staged | NoSteps:
 
 def _observations(calibration: Calibration) -> Observations:
     """Return what the fit was made from."""
-    axes, n_images = calibration.dataset.axes, calibration.dataset.measurements.n_rows
-    if axes is not None:
-        n = len(axes)
-        return Observations(kind="axes", used=n, total=n, images=n_images, rejected={})
     outlines = calibration.solution.outlines
     reasons = Counter(
         str(why.reason)
@@ -337,7 +332,7 @@ def _observations(calibration: Calibration) -> Observations:
         kind="outlines",
         used=int(outlines.used.sum()),
         total=len(outlines),
-        images=n_images,
+        images=calibration.dataset.measurements.n_rows,
         rejected=dict(reasons.most_common()),
         left_out=left_out_blocks(calibration.dataset.measurements, images_left_out(outlines)),
     )

@@ -31,7 +31,7 @@ from legcal.calibration.result import Calibration
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset
-from legcal.data.outlines import write_observations
+from legcal.data.outlines import with_body_edges, write_observations
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
@@ -129,9 +129,9 @@ def write_result(
                 shutil.rmtree(folder / OVERLAYS, ignore_errors=True)
         document = json.dumps(calibration.result.document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
-        if dataset.axes is None:
-            table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
-            write_observations(table, solution.outlines, measurements, machine.leg_names)
+        table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
+        outlines = with_body_edges(solution.outlines, solution.edges)
+        write_observations(table, outlines, measurements, machine.leg_names)
         if calibration.corners is not None:
             write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
         if beside is not None:

@@ -8,8 +8,10 @@ view have an order, over both sides for each other view. The most certain findin
 others are tested given those before, so that one cause is named once.
 
 Errors that images share make scores scatter more than the covariances of outlines say; a score
-counts in units of its scatter from image to image. The squares of the scores of single readings
-say how much readings scatter: a variance component by motor, tested after all other numbers.
+counts in units of its scatter from image to image. The squares of the scores of single images say
+how much readings scatter, the focal length and the direction of a camera: variance components,
+tested after all other numbers. Where something was found, joints that moved and errors once a turn
+of a screw are tried as better explanations.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from legcal.calibration.joint_fit.factors import ObservedOutlines
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
-from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.joint_fit.variables import LegConstraints, State
 from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.image_choice import images_in_words
 from legcal.data.measurements import Measurements, few_views, row_names
@@ -42,6 +44,7 @@ from legcal.estimation.uncertainty import (
 )
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import LegColumns
 
 MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
@@ -51,6 +54,10 @@ _HUBER = 3.0  # standard deviations from which on outlines count less
 ALL_MOTORS = "all motors"
 
 _GOOD_PART = 0.2  # of a turn, beyond which errors once a turn are looked for
+_LEADS = (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32, 40)  # of screws, belts [mm]
+_COARSE = 15  # groups of images whose scores say how much those of errors once a turn scatter
+_BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
+_STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
@@ -64,11 +71,15 @@ Kind = Literal[
     "gain",
     "pitch",
     "eccentricity",
+    "joint",
     "reading_noise",
+    "autofocus",
+    "vibration",
 ]
 OF_MOTORS: frozenset[Kind] = frozenset(
     ("encoder", "drift", "lag", "backlash", "gain", "pitch", "eccentricity", "reading_noise")
 )
+OF_SCATTER: frozenset[Kind] = frozenset(("reading_noise", "autofocus", "vibration"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +91,7 @@ class Finding:
     kind : str
         What changed, or how readings follow motors.
     subject : str
-        The motor or the view; "" where it is all motors.
+        The motor, the view or the joint; "" where it is all motors.
     unit : str
         ``m``, ``rad`` or ``1``.
     amount, sigma : float
@@ -144,7 +155,9 @@ _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative 
     "gain": ("too large", "too small"),
     "pitch": ("larger", "smaller"),
 }
-_WITHOUT_SIGN: tuple[Kind, ...] = ("camera", "backlash", "eccentricity", *_BY_SIGN)
+_WITHOUT_SIGN: tuple[Kind, ...] = (
+    "camera", "backlash", "eccentricity", "joint", "autofocus", "vibration", *_BY_SIGN
+)  # fmt: skip
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
@@ -185,7 +198,21 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
     ),
     "eccentricity": (
         "readings of {subject} are wrong by up to {size} once a turn",
-        "look for an eccentric or tilted disc of that encoder",
+        "look for an eccentric or tilted disc of that encoder, and for a bent screw",
+    ),
+    "joint": (
+        "the joint {subject} moved by {size}",
+        "look for a loose joint or bracket there and take the images again, or calibrate without "
+        "those on one side of it (--leave-out {images})",
+    ),
+    "autofocus": (
+        "the focal length of {subject} differs from image to image by {size}",
+        "switch off autofocus and stabilisation, and take the images of that view again",
+    ),
+    "vibration": (
+        "the camera of {subject} turns from image to image by {size}",
+        "look for a tripod that shakes, rolling shutter and stabilisation, and take the images of "
+        "that view again",
     ),
     "reading_noise": (
         "readings of {subject} scatter by {size}, as commands in place of readings would",
@@ -280,7 +307,13 @@ def session_tests(
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(hypothesis.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, tests, solved, len(tests))
-    noise = _reading_noise(hypotheses, left)
+    noise = _scatter(hypotheses, left)
+    if lacking or noise:
+        least = max((solved.explains for _, solved in lacking), default=0.0)
+        by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
+        better = _better(problem, state, linear, normal, course, least, by_scatter)
+        if better is not None:
+            hypotheses, noise, lacking = [better[0]], None, [better[1]]
     if noise is not None:
         scores, tests_left = scores.with_noise(noise), [test for test, _ in lacking]
         lacking, _ = _forward_selection(
@@ -313,15 +346,15 @@ def session_tests(
                 normal,
                 hypotheses[i],
                 np.diag(noise.further * sigma),
-                np.ones((1, len(sigma))),
+                np.eye(len(scores.column[i]))[:, [row]] * np.ones(len(sigma)),
             )
-            for i, sigma in zip(noise.group, noise.sigma, strict=True)
+            for (i, row), sigma in zip(noise.group, noise.sigma, strict=True)
         ]
         findings.append(
             Finding(
-                "reading_noise",
+                noise.kind,
                 noise.subject,
-                hypotheses[noise.group[0]].unit,
+                "rad" if noise.kind == "vibration" else hypotheses[noise.group[0][0]].unit,
                 noise.ratio * noise.stated,
                 noise.sigma_of_ratio * noise.stated,
                 None,
@@ -361,6 +394,8 @@ def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, 
         return ""
     if hypothesis.kind == "encoder":
         images, by = list(course.rows_in_order), course.reading_row
+    elif hypothesis.kind == "joint":
+        images, by = list(course.rows_in_order), np.arange(measurements.n_rows)
     else:
         names = [view.name for view in measurements.views]
         of_view = measurements.view == names.index(hypothesis.subject)
@@ -520,9 +555,8 @@ class _Course:
         span = (
             ("the first image", "the last") if whole else ("the first image of a view", "its last")
         )
-        yield _Test(
-            number, np.ones(self.n_blocks, dtype=np.bool_), span if drifts else None, drifts
-        )
+        n_blocks = next(iter(hypothesis.share.values())).shape[1]
+        yield _Test(number, np.ones(n_blocks, dtype=np.bool_), span if drifts else None, drifts)
 
     def changes(self, among: BoolArray) -> Iterator[tuple[BoolArray, tuple[str, str]]]:
         """Yield the blocks after each possible change, among some blocks, and what is beside it.
@@ -643,6 +677,90 @@ def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
     yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
 
 
+def _better(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    normal: NormalEquations,
+    course: _Course,
+    least: float,
+    by_scatter: float,
+) -> tuple[_Hypothesis, tuple[_Test, _Solved]] | None:
+    """Return a joint that moved or an error once a turn that explains more than what was found.
+
+    In squares: *least* in units of the scatter that a number leaves behind, *by_scatter* in those
+    of the covariances of outlines.
+    """
+    best: tuple[_Hypothesis, tuple[_Test, _Solved]] | None = None
+    groups = [*_of_joints(problem, state, linear, course), *_of_screws(problem, course)]
+    asked = 0
+    for hypotheses in groups:
+        scores = _Scores.of(problem, linear, normal, hypotheses)
+        for i, hypothesis in enumerate(hypotheses):
+            for test in course.tests(0, hypothesis):
+                solved = scores.solved(test._replace(hypothesis=i))
+                asked += 1
+                if solved.explains > least and solved.explains * solved.scatter > by_scatter:
+                    least, best = solved.explains, (hypothesis, (test, solved))
+    return best if best and best[1][1].p_value * asked <= DOUBT_BY_CHANCE else None
+
+
+def _of_joints(
+    problem: FitProblem, state: State, linear: Linearization, course: _Course
+) -> Iterator[list[_Hypothesis]]:
+    """Yield joints that may have moved, by leg."""
+    constraints, legs = LegConstraints(problem.parameters), problem.legs
+    readings, outlines = problem.readings, problem.outlines
+    share = {
+        "readings": course.of_poses(readings.pose),
+        "outlines": course.of_images(outlines.view, outlines.pose),
+    }
+    for j, name in enumerate(legs.names):
+        joints = []
+        for side, columns in (("base", LegColumns.A), ("platform", LegColumns.B)):
+            moved = []
+            for column in range(columns.start, columns.stop):
+                error = np.zeros((len(legs.names), LegColumns.COUNT))
+                error[j, column] = 1.0
+                change = residual_changes(problem, linear, "legs", error)
+                motion = constraints.following(state, j, column)
+                moved.append(
+                    {
+                        of: change[of]
+                        + np.einsum(
+                            "nqk,nk->nq",
+                            linear[of].J_element,
+                            motion[problem.factor(of).element],
+                        )
+                        for of in share
+                    }
+                )
+            by = {of: np.stack([one[of] for one in moved], axis=-1) for of in share}
+            joints.append(_Hypothesis("joint", f"{name}.{side}", "m", by, share, True))
+        yield joints
+
+
+def _of_screws(problem: FitProblem, course: _Course) -> Iterator[list[_Hypothesis]]:
+    """Yield errors once a turn of the screws of each motor that slides, of usual leads."""
+    readings, reading = problem.readings, problem.readings.reading
+    whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
+    group = np.arange(course.n_blocks) * min(_COARSE, course.n_blocks) // max(course.n_blocks, 1)
+    coarse = np.equal(group[:, None], np.unique(group)).astype(np.float64)
+    share = {"readings": course.of_poses(readings.pose) @ coarse}
+    for j in np.unique(readings.leg).tolist():
+        leg = problem.legs.nominal[j]
+        if leg.reads_angle:
+            continue
+        by_error = -readings.sign * whitening * (readings.leg == j)
+        turns = [math.tau * reading / (1e-3 * lead) for lead in _LEADS]
+        yield [
+            _Hypothesis("eccentricity", leg.motor_label, "m",
+                        {"readings": by_error[:, None, None]
+                         * np.column_stack([np.cos(turn), np.sin(turn)])[:, None]}, share, False)
+            for turn in turns
+        ]  # fmt: skip
+
+
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
     """Return how far readings are from those of the pose before, zero for first poses."""
     keys = zip(leg.tolist(), row.tolist(), strict=True)
@@ -723,14 +841,16 @@ class _Scores:
         """Return the scores given a number that the fit lacks."""
         return replace(self, scores=self.scores.given(number.estimated))
 
-    def of_readings(self, group: Sequence[int], sigma: Sequence[Array]) -> tuple[IntArray, Array]:
-        """Return the columns (c,) of the readings of some motors, and what is given of each."""
-        columns = np.concatenate([self.column[i][0] for i in group])
+    def of_single(
+        self, group: Sequence[tuple[int, int]], sigma: Sequence[Array]
+    ) -> tuple[IntArray, Array]:
+        """Return the columns (c,) of some numbers in single blocks, and what is given of each."""
+        columns = np.concatenate([self.column[i][row] for i, row in group])
         return columns[columns >= 0], np.concatenate(sigma)[columns >= 0]
 
     def with_noise(self, noise: _Scatter) -> _Scores:
-        """Return the scores where readings scatter as much as they were found to."""
-        columns, sigma = self.of_readings(noise.group, noise.sigma)
+        """Return the scores where numbers scatter as much as they were found to."""
+        columns, sigma = self.of_single(noise.group, noise.sigma)
         scores = self.scores
         toward = scores.information[:, columns]
         precision = np.diag((noise.further * sigma) ** -2.0) + toward[columns]
@@ -775,6 +895,11 @@ class _Solved(NamedTuple):
         return float(chdtrc(float(self.rank), self.square)) if self.rank else 1.0
 
     @property
+    def explains(self) -> float:
+        """What the number explains, in squares, less what its parts would by chance."""
+        return self.square - _BETTER * self.rank
+
+    @property
     def amount(self) -> Array:
         """The number, (d,)."""
         return self.estimated.amount
@@ -785,17 +910,25 @@ class _Solved(NamedTuple):
         return self.estimated.covariance * self.scatter
 
 
-def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
-    """Return the scatter of readings beyond that stated: of a motor, or of all in a unit."""
+def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
+    """Return what scatters from image to image: readings beyond what is stated, or a camera."""
     encoders = [i for i, h in enumerate(hypotheses) if h.kind == "encoder"]
-    groups = {hypotheses[i].subject: [i] for i in encoders}
+    groups: list[tuple[Kind, str, list[tuple[int, int]]]] = [
+        ("reading_noise", hypotheses[i].subject, [(i, 0)]) for i in encoders
+    ]
     for unit in ("m", "rad"):
-        alike = [i for i in encoders if hypotheses[i].unit == unit]
+        alike = [(i, 0) for i in encoders if hypotheses[i].unit == unit]
         if len(alike) > 1:
-            groups[ALL_MOTORS if len(alike) == len(encoders) else f"all motors [{unit}]"] = alike
+            subject = ALL_MOTORS if len(alike) == len(encoders) else f"all motors [{unit}]"
+            groups.append(("reading_noise", subject, alike))
+    for i, hypothesis in enumerate(hypotheses):
+        if hypothesis.kind == "focal_length":
+            groups.append(("autofocus", hypothesis.subject, [(i, 0)]))
+        if hypothesis.kind == "camera":
+            groups.append(("vibration", hypothesis.subject, [(i, row) for row in range(3)]))
     tests = [
-        _Scatter.of(subject, group, hypotheses, scores, len(groups))
-        for subject, group in groups.items()
+        _Scatter.of(kind, subject, group, hypotheses, scores, len(groups))
+        for kind, subject, group in groups
     ]
     best = max(tests, key=lambda test: test.gain, default=None)
     if best is None or best.p_value > DOUBT_BY_CHANCE or best.ratio < MOST_SCATTER:
@@ -805,21 +938,22 @@ def _reading_noise(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatt
 
 @dataclass(frozen=True, eq=False)
 class _Scatter:
-    """How much the readings of some motors scatter, by the squares of their scores.
+    """How much readings of some motors, or a camera, scatter, by the squares of their scores.
 
-    With scores z of the errors of single readings and their covariance K under the stated scatter,
+    With scores z of the errors in single images and their covariance K under the stated scatter,
     a further variance adds its multiple of K^2 to that of z; the likeliest one is taken. Blocks
     have the mean of their images.
     """
 
+    kind: Kind
     subject: str
-    group: Sequence[int]  # hypotheses of the zeros of encoders
+    group: Sequence[tuple[int, int]]  # hypotheses and their numbers that scatter alike
     p_value: float  # times the number of tests
     gain: float  # of the logarithm of the likelihood
     further: float  # standard deviation beside the stated one, over that
     spread: float  # standard deviation of the logarithm of its square
-    sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block, by motor [m or rad]
-    stated: float  # of a reading, in the median of motors
+    sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block [m, rad or 1]
+    stated: float  # of a reading, in the median of motors, or of a camera that stands still
 
     @property
     def ratio(self) -> float:
@@ -834,21 +968,27 @@ class _Scatter:
     @classmethod
     def of(
         cls,
+        kind: Kind,
         subject: str,
-        group: Sequence[int],
+        group: Sequence[tuple[int, int]],
         hypotheses: Sequence[_Hypothesis],
         scores: _Scores,
         n_tests: int,
     ) -> _Scatter:
-        """Test the readings of some motors."""
+        """Test what scatters."""
         sigmas, stated = list[Array](), list[float]()
-        for i in group:
-            ((name, wrong),) = hypotheses[i].columns.items()
-            read = wrong[:, 0, 0] != 0.0
-            stated.append(1.0 / float(np.abs(wrong[read, 0, 0]).max()))
-            n = hypotheses[i].share[name][read].sum(axis=0)
+        for i, row in group:
+            hypothesis = hypotheses[i]
+            if steady := _STEADY.get(hypothesis.kind):
+                stated.append(steady)
+                sigmas.append(np.full(scores.column[i].shape[1], steady))
+                continue
+            ((name, wrong),) = hypothesis.columns.items()
+            read = wrong[:, 0, row] != 0.0
+            stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
+            n = hypothesis.share[name][read].sum(axis=0)
             sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
-        columns, sigma = scores.of_readings(group, sigmas)
+        columns, sigma = scores.of_single(group, sigmas)
         z = sigma * scores.scores.score[columns]
         K = sigma[:, None] * scores.scores.information[np.ix_(columns, columns)] * sigma
         own, vector = np.linalg.eigh(K)
@@ -863,12 +1003,13 @@ class _Scatter:
             return 0.5 * float(np.sum(np.log1p(more) - squares / own_or_one * more / (1.0 + more)))
 
         own_or_one = np.where(own > 0.0, own, 1.0)
-        from scipy.optimize import minimize_scalar  # only where readings scatter
+        from scipy.optimize import minimize_scalar  # only where something scatters
 
         likeliest = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
         more = math.exp(likeliest.x) * own
         spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
         return cls(
+            kind,
             subject,
             group,
             p_value,

@@ -345,11 +345,6 @@ def _observation_lines(result: Result) -> list[str]:
     seen = result.observations
     if seen is None:
         return []
-    if seen.kind == "axes":
-        return [
-            f"Axes: {seen.used} in {seen.images} images, taken with the standard deviations that "
-            "their table gives."
-        ]
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
     rejected = ", ".join(f"{count} {reason_in_words(reason)}" for reason, count in most)
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from legcal.calibration.clicks import click_notes
@@ -24,7 +26,7 @@ from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
-from legcal.calibration.joint_fit.scale import SCALE
+from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.only import GroupEstimate
 from legcal.calibration.quantities import mm_deg
@@ -33,7 +35,7 @@ from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session
 from legcal.data.corners import Corners
 from legcal.data.dataset import PLAN_NAME, POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
-from legcal.data.measurements import few
+from legcal.data.measurements import few, few_views
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
@@ -43,6 +45,8 @@ from legcal.geometry.types import IntArray
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
+MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
+_ALONG = 9  # points along an outline
 _ROUNDED = 0.51e-4  # [mm or deg] of the commands there
 AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
@@ -64,7 +68,8 @@ def judge(
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
     Cameras that the measurements contradict count there with what they do to the platform. What
-    speaks against the result (:mod:`legcal.calibration.doubts`) keeps it from being trusted.
+    speaks against the result (:mod:`legcal.calibration.doubts`) keeps it from being trusted, and
+    refuses it where that may move the platform by more than the calibration does.
     """
     machine, measurements = dataset.machine, dataset.measurements
     q = measurements.q_of_poses.copy()
@@ -91,8 +96,9 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, reported)
     else:
         change, sigma, found = _change_of_platform(platform)
-        if by_scale := _share_of_scale(platform):
-            found += f"; {by_scale}"
+        by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
+        found += "".join(f"; {clause}" for clause in (by_radii, by_readings) if clause)
+        if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
@@ -101,6 +107,10 @@ def judge(
         found = f"{group.sentence}; {found}"
         others = (doubt for doubt in doubts if doubt.code != TOLERANCE)
         doubts = (*others, *group.doubts)
+    doubts = tuple(
+        replace(doubt, is_grave=doubt.is_grave or (doubt.sigma_dX_m or 0.0) > change)
+        for doubt in doubts
+    )
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
         found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"
@@ -123,6 +133,7 @@ def judge(
         verdict,
         (
             *notes,
+            *_beyond_boards(dataset, solution),
             *click_notes(dataset, solution),
             *commanded(dataset),
             *_asked_lengths(dataset, solution, doubts),
@@ -145,6 +156,29 @@ def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
     ]
 
 
+def _beyond_boards(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on views whose outlines leave the part of the image that boards covered."""
+    outlines, measurements = solution.outlines, dataset.measurements
+    view, along = measurements.view[outlines.row], np.linspace(0.0, 1.0, _ALONG)[:, None, None]
+    points = outlines.ends[:, 0] + along * (outlines.ends[:, 1] - outlines.ends[:, 0])
+    outside = dict[str, float]()
+    for v in np.unique(view[outlines.used]).tolist():
+        covered = measurements.views[v].camera.covered.astype(np.float32)
+        if len(covered):
+            pixels = points[:, (view == v) & outlines.used].reshape(-1, 2).tolist()
+            is_out = [cv2.pointPolygonTest(covered, pixel, False) < 0.0 for pixel in pixels]
+            outside[measurements.views[v].name] = float(np.mean(is_out))
+    far = [name for name, share in outside.items() if share > MAX_BEYOND]
+    if not far:
+        return []
+    share = 100.0 * max(outside[name] for name in far)
+    return [
+        f"Up to {share:.0f} % of the outlines of {few_views(far)} lie where the calibration of the "
+        "camera has seen no board: the lens is extrapolated there, beyond what its covariance "
+        "says; photograph the board there too, and calibrate the camera again."
+    ]
+
+
 def _asked_lengths(dataset: Dataset, solution: Solution, doubts: Sequence[Doubt]) -> list[str]:
     """Return a note on stated lengths that are the nominal ones, where no doubt asks for them."""
     stated = nominal_lengths(dataset, solution)
@@ -164,7 +198,7 @@ def _untested(
 ) -> list[str]:
     """Return notes on changes in the course of a session that would not show."""
     m = dataset.measurements
-    if dataset.axes is not None or m.n_rows < 2 * MIN_IMAGES or session.findings:
+    if m.n_rows < 2 * MIN_IMAGES or session.findings:
         return []
     if not sequences:
         return [
@@ -212,6 +246,20 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
     return (
         f"the largest part of that is the scale of the machine ({1e3 * parts[0]:.3f} of "
         f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
+    )
+
+
+def _error_of_readings(platform: PlatformAccuracy, solution: Solution) -> str:
+    """Return a clause on what all readings may be wrong by, where that is more than the rest."""
+    predicted = (platform.workspace or platform.sigma).mean_displacement
+    parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
+    if not parts or parts[0].mean_displacement <= predicted:
+        return ""
+    witnesses = scale_witnesses(solution.posterior.problem)
+    rests = f"{witnesses[0]} alone" if len(witnesses) == 1 else few(witnesses)
+    return (
+        f"the scale rests on {rests}, and an error that all readings share, as of screws or belts, "
+        f"may add {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)} (1 sigma)"
     )
 
 

@@ -177,7 +177,7 @@ def check(
         data = order_dataset(dataset, pool, report, fingerprint=outline_key(dataset, choices))
         all_rows = np.arange(dataset.measurements.n_rows)
         estimate = estimate_parameters(data, all_rows, Options(choices, every_leg=False))
-    if dataset.axes is None and not estimate.outlines.used.any():
+    if not estimate.outlines.used.any():
         refusal = (
             f"{dataset.folder}: the earlier result could not be tested: found no used outline in "
             "any image, needed some; take images that show the legs."

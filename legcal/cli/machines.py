@@ -89,9 +89,13 @@ def new(
     """Write a model, YAML and URDF, from a table of joints, a firmware or a few dimensions."""
     from rich.text import Text
 
-    from legcal.machine.family import Dimensions, description_of, write_template
+    from legcal.descriptions.new_model import (
+        Dimensions,
+        create_model,
+        description_of,
+        write_template,
+    )
     from legcal.machine.inspection import machine_document
-    from legcal.machine.model_builder import create_model
     from legcal.report.machine import inspect_table
     from legcal.report.render import report
 
@@ -118,7 +122,8 @@ def new(
         written = write_template(output, dimensions, force=force)
         lines = (
             f"written: {' '.join(map(str, written))}",
-            f"Next: legcal new {shlex.quote(str(written[0]))} -o .",
+            "Next:",
+            f"  legcal new {shlex.quote(str(written[0]))} -o .",
         )
         show(
             as_json,
@@ -487,7 +492,8 @@ def example(
     copy_example(output)
     lines = (
         f"written: {output}",
-        f"Next: legcal calibrate {shlex.quote(str(output))} -o calibrated",
+        "Next:",
+        f"  legcal calibrate {shlex.quote(str(output))} -o calibrated",
     )
     show(
         as_json,

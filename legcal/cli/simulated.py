@@ -151,8 +151,7 @@ def paper(
             "--output",
             "-o",
             metavar="OUT",
-            help="Folder for the runs, the document and the figures. A study that was stopped "
-            "is continued.",
+            help="Folder for the document and the figures.",
         ),
     ] = None,
     radians: Annotated[
@@ -190,4 +189,4 @@ def paper(
     document = result.document()
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
-        print_table(f"\nRuns, document and figures: {output}")
+        print_table(f"\nDocument and figures: {output}")

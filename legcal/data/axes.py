@@ -1,76 +1,21 @@
-"""The table ``axes.csv``: axes of legs as in the paper, instead of images and outlines.
-
-One row an axis: view, image and leg, named as in ``observations.csv``; the Euler angles
-psi and theta (:mod:`legcal.vision.cylinder`) and the point M_LS = (x, 0, z) in the camera; their
-standard deviations, which are taken as true. Angles in radians, lengths in metres.
-"""
+"""Axes of legs in camera frames: from pairs of outlines, or as Table 1 of the paper states them."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
-from legcal.data.measurements import (
-    Measurements,
-    find_legs,
-    find_rows,
-    places,
-)
+from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
-from legcal.files.folder import write_atomically
-from legcal.files.table import Column, format_table, read_table
 from legcal.geometry.lines import cross, nearest_point_to_line, normal_basis
 from legcal.geometry.types import Array, IntArray
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import axis_of_outlines, direction_derivative, direction_of_angles
-
-VALUES = ("psi", "theta", "x", "z")
-SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
-MAX_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
-ANGLE_ROUNDING = 1e-3  # [rad] rounding of limits, such as 3.142
-MAX_DISTANCE = 1000.0  # [m] from M_LS to the camera centre
-SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m] plausible standard deviations of an axis
-MIN_UPRIGHT = 1e-4  # minimum component along the image y axis: below it M_LS is undetermined
-COLUMNS = (
-    *(Column(name, "text") for name in ("view", "image", "leg")),
-    *(
-        Column(
-            name,
-            least=-most - ANGLE_ROUNDING,
-            most=most + ANGLE_ROUNDING,
-            needed=f"an angle from {-most:.4f} to {most:.4f} rad",
-            remedy="write radians, not degrees, less whole turns, or remove the row",
-        )
-        for name, most in MAX_ANGLE.items()
-    ),
-    *(
-        Column(
-            name,
-            least=-MAX_DISTANCE,
-            most=MAX_DISTANCE,
-            needed=f"a coordinate from {-MAX_DISTANCE:g} to {MAX_DISTANCE:g} m",
-            remedy="correct it, write metres, or remove the row",
-        )
-        for name in ("x", "z")
-    ),
-    *(
-        Column(
-            name,
-            least=SIGMA_RANGE[0],
-            most=SIGMA_RANGE[1],
-            needed=f"a standard deviation from {SIGMA_RANGE[0]:g} to {SIGMA_RANGE[1]:g} {unit}",
-            remedy=f"give it in {unit}, or remove the row",
-        )
-        for name, unit in zip(SIGMAS, ("rad", "rad", "m", "m"), strict=True)
-    ),
-)
 
 _FLOOR_PX = 1e-3  # minimum standard deviation of an outline: keeps weights finite for any file
 
@@ -264,7 +209,10 @@ def axes_of_table(
     values: Array,  # (n, 4) psi, theta [rad] and x, z [m] in the camera frame
     sigmas: Array,  # (n, 4) their standard deviations; their errors are independent
 ) -> LegAxes:
-    """Return axes from their angles and their points M_LS."""
+    """Return axes from their Euler angles psi, theta and their points M_LS = (x, 0, z).
+
+    See :mod:`legcal.vision.cylinder` for the angles.
+    """
     psi, theta, x, z = values.T
     u = direction_of_angles(psi, theta)
     M = np.stack([x, np.zeros_like(x), z], axis=-1)
@@ -279,54 +227,3 @@ def _table_derivative(basis: Array, psi: Array, theta: Array) -> Array:
     derivative[:, :2, :2] = basis @ direction_derivative(psi, theta)
     derivative[:, 2:, 2:] = basis[:, :, [0, 2]]
     return derivative
-
-
-def write_axis_table(
-    path: Path,
-    row: IntArray,
-    leg: IntArray,
-    values: Array,  # (n, 4) psi, theta, x, z [rad, rad, m, m]
-    sigmas: Array,  # (n, 4) of them
-    measurements: Measurements,
-    leg_names: Sequence[str],
-) -> None:
-    """Write axes in the columns of the table, the file complete or not at all."""
-    names = places(measurements)
-    numbers = np.hstack([values, sigmas]).tolist()
-    rows = (
-        [*names[r], leg_names[j], *cells]
-        for r, j, cells in zip(row.tolist(), leg.tolist(), numbers, strict=True)
-    )
-    text = format_table([column.name for column in COLUMNS], rows)
-    write_atomically(path, text.encode())
-
-
-def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) -> LegAxes:
-    """Return the table ``axes.csv`` in the order of the file.
-
-    Raises DatasetError with one sentence for each problem.
-    """
-    table = read_table(
-        path,
-        "table of axes",
-        "axis",
-        COLUMNS,
-        needed="the axes of the legs in every image; add them, or delete the file to have images "
-        "searched",
-    )
-    row, leg = find_rows(table, measurements), find_legs(table, leg_names)
-    values, sigmas = table.numbers(VALUES), table.numbers(SIGMAS)
-    upright = np.cos(values[:, 0]) * np.cos(values[:, 1])
-    for i in np.flatnonzero(np.abs(upright) < MIN_UPRIGHT).tolist():
-        table.refuse(
-            i,
-            "an axis parallel to the plane of the camera's x and z axes",
-            "one that crosses it: the point (x, 0, z) does not exist",
-            "psi",
-            "theta",
-            remedy="remove the row, or give outlines instead",
-        )
-    keys = zip(row.tolist(), leg.tolist(), strict=True)
-    table.once([None if -1 in key else key for key in keys], "the same image and leg")
-    table.check()
-    return axes_of_table(row, leg, values, sigmas)

@@ -22,6 +22,7 @@ from legcal.data.outlines import (
     Outlines,
     is_edited,
     no_outlines,
+    with_body_edges,
     write_observations,
 )
 from legcal.files.folder import write_atomically
@@ -29,7 +30,7 @@ from legcal.files.reading import MAX_DOCUMENT, MAX_IMAGE, read_bytes
 from legcal.files.schema import FileSchema
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.version import __version__
-from legcal.vision.board_file import board_document
+from legcal.vision.board import board_document
 
 FORMAT = 1
 _INCOMPLETE = "incomplete"  # the fingerprint while the table is being written: it matches nothing
@@ -80,10 +81,6 @@ def plan_detection(
 
 def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     """Return :func:`plan_detection` for a dataset with the files in its folder."""
-    if dataset.axes is not None:  # they take the place of images
-        none = np.zeros(0, dtype=np.intp)
-        from_user = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
-        return DetectionPlan(none, no_outlines(), from_user)
     entry = _read_entry(dataset.folder / CACHE_NAME)
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     has_image = np.array(
@@ -105,7 +102,7 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
 def note_on_missing_photographs(dataset: Dataset) -> list[str]:
     """Return a note on outlines of earlier detection whose photographs are no longer there."""
     entry, table = _read_entry(dataset.folder / CACHE_NAME), dataset.observations
-    if entry is None or table is None or dataset.axes is not None:
+    if entry is None or table is None:
         return []
     m, given = dataset.measurements, set(entry.given)
     names = places(m)
@@ -195,6 +192,7 @@ def store_outlines(
     current: str,
     from_user: BoolArray,  # (n_rows,) ``DetectionPlan.given``
     notes: Sequence[str] = (),
+    body_edges: Outlines | None = None,
 ) -> str | None:
     """Write outlines and the fingerprint of their inputs beside the dataset.
 
@@ -212,7 +210,8 @@ def store_outlines(
     path = dataset.folder / OBSERVATIONS_NAME
     try:
         _write_entry(dataset.folder, entry)
-        write_observations(path, outlines, dataset.measurements, dataset.machine.leg_names)
+        table = with_body_edges(outlines, body_edges)
+        write_observations(path, table, dataset.measurements, dataset.machine.leg_names)
         _write_entry(dataset.folder, entry | {"fingerprint": current})
     except OSError as error:
         return (

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.brief import brief
-from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.dataset_file import (
     ENCODER_SIGMAS,
@@ -38,7 +37,7 @@ from legcal.data.measurements import (
     read_measurements,
     unread_motors,
 )
-from legcal.data.outlines import Outlines, read_observations
+from legcal.data.outlines import Outlines, are_of_bodies, read_observations
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reading_units import (
     SERVO_SIGMA,
@@ -55,14 +54,11 @@ from legcal.files.schema import closest, describe
 from legcal.machine.files import shipped_folder, shipped_names
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.vision.board import FixedBoard, Link
-from legcal.vision.board_file import parse_boards
+from legcal.vision.board import FixedBoard, Link, parse_boards
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
-from legcal.vision.image_facts import ImageFacts
-from legcal.vision.image_file import Grey, decode_image, inspect_image
+from legcal.vision.image_file import Grey, ImageFacts, decode_image, inspect_image
 
-AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
 PLAN_NAME = "plan.json"  # plan in the folder of a planned session
@@ -83,9 +79,9 @@ class Dataset:
     camera_paths: tuple[Path, ...]  # the camera file of each view
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
-    observations: Outlines | None  # the rows of ``observations.csv`` if there is one
+    observations: Outlines | None  # the outlines in ``observations.csv`` if there is one
     table_notes: tuple[str, ...] = ()  # oddities that are allowed in tables and the dataset file
-    axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
+    body_edges: Outlines | None = None  # the straight edges of bodies in ``observations.csv``
     overrides: tuple[Override, ...] = ()  # parameters by name, from the block ``parameters``
     boards: tuple[FixedBoard, ...] = ()  # the calibration boards, that on the base first
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
@@ -321,7 +317,6 @@ def load_dataset(
     measurements, origin, taken = expand_hand_held(yaml_path, rows, entry.views)
     if taken:
         raise DatasetError(taken)
-    _refuse_two_tables(folder)
     landmarks = None
     of_clicks: list[str] = []
     if os.path.exists(folder / LANDMARKS_NAME):
@@ -330,7 +325,7 @@ def load_dataset(
         measurements, of_clicks = place_by_landmarks(
             path, machine, measurements, landmarks, may_be_wrong=not check_clicks
         )
-    axes, left_out = read_given_axes(folder / AXES_NAME, machine.leg_names, measurements)
+    observations, body_edges = _read_observed(folder, machine, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
@@ -342,9 +337,9 @@ def load_dataset(
             spline_teeth=entry.spline_teeth or machine.spline_teeth,
         ),
         measurements=measurements,
-        observations=read_outlines(folder, machine, measurements),
-        table_notes=(*notes, *of_clicks, *left_out, *_unused_views(yaml_path, rows)),
-        axes=axes,
+        observations=observations,
+        body_edges=body_edges,
+        table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
@@ -403,13 +398,12 @@ def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]
 
 
 def _invisible(dataset: Dataset) -> list[str]:
-    """Return the problems of legs without a visible cylinder, unless tables give their axes.
+    """Return the problems of legs without a visible cylinder, unless a table has outlines.
 
     The model must have a cylinder along some leg of every view, and along one of the rods on every
     motor that carries rods.
     """
-    has_tables = dataset.observations is not None or dataset.axes is not None
-    if has_tables or dataset.board_on("platform") is not None:
+    if dataset.observations is not None or dataset.board_on("platform") is not None:
         return []
     machine = dataset.machine
     add = "add <visual> cylinders along them, with their radii, to the URDF"
@@ -431,15 +425,6 @@ def _invisible(dataset: Dataset) -> list[str]:
         for joint, names in rods.items()
         if not shown.intersection(names)
     ]
-
-
-def _refuse_two_tables(folder: Path) -> None:
-    """Refuse a dataset with axes and outlines."""
-    if os.path.exists(folder / AXES_NAME) and os.path.exists(folder / OBSERVATIONS_NAME):
-        raise DatasetError(
-            f"{folder}: the observations could not be read: found {AXES_NAME} and "
-            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
-        )
 
 
 def _read_cameras(paths: tuple[Path, ...], problems: list[str | Problem]) -> dict[Path, Camera]:
@@ -491,11 +476,20 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
 
 def read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
     """Return the outlines beside the dataset, if there are any."""
+    return _read_observed(folder, machine, measurements)[0]
+
+
+def _read_observed(
+    folder: Path, machine: Machine, measurements: Measurements
+) -> tuple[Outlines | None, Outlines | None]:
+    """Return the outlines beside the dataset and the edges of bodies; None where there are none."""
     path = folder / OBSERVATIONS_NAME
     if not os.path.exists(path):
-        return None
+        return None, None
     is_own = (folder / CACHE_NAME).exists()
-    return read_observations(path, machine.legs, measurements, skip_stale=is_own)
+    table = read_observations(path, machine.legs, measurements, skip_stale=is_own)
+    of_bodies = are_of_bodies(table)
+    return table.choose(~of_bodies), table.choose(of_bodies) if of_bodies.any() else None
 
 
 def _unused_views(path: Path, measurements: Measurements) -> list[str]:
@@ -505,27 +499,6 @@ def _unused_views(path: Path, measurements: Measurements) -> list[str]:
         for v, view in enumerate(measurements.views)
         if not np.any(measurements.view == v)
     ]
-
-
-def read_given_axes(
-    path: Path, leg_names: Sequence[str], measurements: Measurements
-) -> tuple[LegAxes | None, list[str]]:
-    """Return the axes of the legs that the views use, and a note about others."""
-    if not os.path.exists(path):
-        return None, []
-    axes = read_axes(path, leg_names, measurements)
-    views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
-    names = [leg_names[leg] for leg in axes.leg.tolist()]
-    is_used = [view.uses(name) for view, name in zip(views, names, strict=True)]
-    used = np.flatnonzero(is_used)
-    if len(used) == 0:
-        raise DatasetError(
-            f"{path}: the axes could not be used: found only legs that their views leave out, "
-            "needed legs that dataset.yaml names for the views; correct these or the table."
-        )
-    left_out = len(axes) - len(used)
-    note = f"{path}: {left_out} axes of legs that their views leave out are not used."
-    return axes.choose(used), [note] if left_out else []
 
 
 def read_given_corners(
@@ -547,7 +520,7 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
 
     There is one problem for each row that neither an image nor tables make usable.
     """
-    measurements, corners, axes = dataset.measurements, dataset.corners, dataset.axes
+    measurements, corners = dataset.measurements, dataset.corners
     facts, problems = dict[str, ImageFacts](), list[tuple[int, Problem]]()
 
     def refuse(row: int, what: str, found: str, needed: str, remedy: str, *columns: str) -> None:
@@ -574,11 +547,6 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
             )
             refuse(row, no_place, found, f"the board in {of_held}", remedy, "image")
     no_use, remedy = "the row could not be used", "name an image or remove the row"
-    if axes is not None:
-        for row in np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist():
-            found, needed = f"no axis of it in {AXES_NAME}", "one of a leg that its view uses"
-            refuse(row, no_use, found, needed, "add one or remove the row")
-        return {}, problems
     outlines = dataset.observations
     in_tables = set() if outlines is None else set(outlines.row.tolist())
     tables = f"outlines of it in {OBSERVATIONS_NAME}"

@@ -263,12 +263,12 @@ def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]
 
 def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
     """Return a dataset with some of its images only."""
-    observations, axes, corners = dataset.observations, dataset.axes, dataset.corners
+    observations, corners = dataset.observations, dataset.corners
     return replace(
         dataset,
         measurements=measurements_at(dataset.measurements, rows),
         observations=None if observations is None else observations.at(rows),
-        axes=None if axes is None else axes.at(rows),
+        body_edges=None if dataset.body_edges is None else dataset.body_edges.at(rows),
         corners=None if corners is None else corners.at(rows),
         landmarks=None if dataset.landmarks is None else dataset.landmarks.at(rows),
     )
@@ -287,23 +287,11 @@ def _shown(dataset: Dataset) -> BoolArray:
     measurements, names = dataset.measurements, dataset.machine.leg_names
     shown = np.zeros((measurements.n_rows, len(measurements.views), len(names)), dtype=np.bool_)
     has_observations = np.zeros(measurements.n_rows, dtype=np.bool_)
-    for table, used in _tables(dataset):
-        row, leg = table[used].T
-        shown[row, measurements.view[row], leg] = True
-        has_observations[row] = True
+    if (outlines := dataset.observations) is not None:
+        used = outlines.row[outlines.used]
+        shown[used, measurements.view[used], outlines.leg[outlines.used]] = True
+        has_observations[used] = True
     for row in np.flatnonzero(~has_observations).tolist():
         view = int(measurements.view[row])
         shown[row, view] = [measurements.views[view].uses(name) for name in names]
     return shown.reshape(measurements.n_rows, -1)
-
-
-def _tables(dataset: Dataset) -> list[tuple[IntArray, BoolArray]]:
-    """Return for each table the image row and leg (n, 2) of its entries, and the mask of use."""
-    tables = []
-    if dataset.axes is not None:
-        axes = dataset.axes
-        tables.append((np.column_stack([axes.row, axes.leg]), np.ones(len(axes), dtype=np.bool_)))
-    if dataset.observations is not None:
-        outlines = dataset.observations
-        tables.append((np.column_stack([outlines.row, outlines.leg]), outlines.used))
-    return tables

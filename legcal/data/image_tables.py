@@ -1,6 +1,6 @@
 """Tables of observations in images: select, join and reorder rows, and map them to other images.
 
-A table (outlines, axes, corners) has one entry a row in each of its fields; ``row`` is the index of
+A table (outlines, corners, axes) has one entry a row in each of its fields; ``row`` is the index of
 the image in the measurements. Jobs put datasets into canonical order before they begin, so that
 results do not depend on the order of files.
 """

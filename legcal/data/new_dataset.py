@@ -42,10 +42,15 @@ from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
-from legcal.vision.camera_export import rough_camera_info
-from legcal.vision.camera_file import read_camera
-from legcal.vision.image_facts import FOCAL_SIGMA, camera_of_photographs, read_facts
-from legcal.vision.image_file import BadImage, image_size, inspect_image
+from legcal.vision.camera_file import read_camera, rough_camera_info
+from legcal.vision.image_file import (
+    FOCAL_SIGMA,
+    BadImage,
+    camera_of_photographs,
+    image_size,
+    inspect_image,
+    read_facts,
+)
 
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
 _EXAMPLE = "examples/hexapod"

@@ -38,6 +38,7 @@ NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 VERDICTS = ("used", "rejected")
 SOURCES = ("detected", "edited")
 
+FIRST_EDGE = 3  # number of the first straight edge of a body; 1 and 2 are limbs of cylinders
 MAX_POLISH = 4.0  # maximum log likelihood ratio of one outline for or against polish
 UNIT_EXACT = 1e-12  # tolerance of |h| = 1 up to which h is kept as it is
 UNIT_TOLERANCE = 1e-3  # tolerance of |h| = 1 written with few digits; h is normalised
@@ -55,7 +56,8 @@ UNLESS_REJECTED = "correct it or set the verdict to rejected with an empty cell"
 _LEAVE = "correct it or leave it empty"
 OUTLINE_COLUMNS = (
     *(Column(name, "text") for name in ("view", "image", "leg", "part")),
-    Column("edge", "text", choices=("1", "2"), remedy="correct it"),
+    Column("edge", "whole", least=1.0, most=999.0, remedy="correct it",
+           needed="1 or 2 of a cylinder, or a number from 3 on of a body"),
     *(Column(name, blank=True, remedy=UNLESS_REJECTED) for name in NUMBERS),
     *VERDICT_COLUMNS,
     *(
@@ -181,6 +183,16 @@ def join_outlines(tables: Sequence[Outlines]) -> Outlines:
     return no_outlines().join(tables).sort()
 
 
+def are_of_bodies(outlines: Outlines) -> BoolArray:
+    """Return a mask (n,) of the straight edges of bodies, which are not limbs of cylinders."""
+    return np.asarray(outlines.edge >= FIRST_EDGE)
+
+
+def with_body_edges(outlines: Outlines, edges: Outlines | None) -> Outlines:
+    """Return outlines and edges of bodies in one table, as files have them."""
+    return outlines if edges is None else join_outlines([outlines, edges])
+
+
 def is_edited(outlines: Outlines) -> BoolArray:
     """Return a mask (n,) of the outlines that were corrected by hand."""
     return np.array([source == "edited" for source in outlines.source], dtype=np.bool_)
@@ -288,12 +300,13 @@ def read_observations(
             [j >= 0 and part in parts[j] for j, part in zip(leg, table.text("part"), strict=True)],
             dtype=np.bool_,
         )
+        exists |= (leg >= 0) & (table.number("edge") >= FIRST_EDGE)
         detected = np.array([source == "detected" for source in table.text("source")], dtype=bool)
         table.keep((exists & (row >= 0)) | ~detected)
     row, leg = find_rows(table, measurements), find_legs(table, leg_names)
-    part = table.text("part")
+    part, of_body = table.text("part"), table.number("edge") >= FIRST_EDGE
     for i in np.flatnonzero(leg >= 0).tolist():
-        if part[i] not in parts[leg[i]]:
+        if part[i] not in parts[leg[i]] and not of_body[i]:
             unknown_part = f"the unknown part {describe(part[i])}"
             needed = f"a link with a cylinder of {leg_names[leg[i]]}"
             table.refuse(i, unknown_part, needed, "part", remedy=closest(part[i], parts[leg[i]]))

@@ -21,8 +21,14 @@ from legcal.data.measurements import few
 from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
-from legcal.vision.image_facts import HEIC_SUFFIXES, read_facts
-from legcal.vision.image_file import CONVERT, CONVERT_HEIC, FOREIGN_SUFFIXES, image_suffixes
+from legcal.vision.image_file import (
+    CONVERT,
+    CONVERT_HEIC,
+    FOREIGN_SUFFIXES,
+    HEIC_SUFFIXES,
+    image_suffixes,
+    read_facts,
+)
 
 MAX_PHOTOGRAPHS = 50_000
 MAX_VIEWS = 12  # maximum number of views guessed from names of photographs

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from legcal.data.measurements import Measurements, few, few_views
-from legcal.vision.image_facts import ImageFacts, Size, size_change
+from legcal.vision.image_file import ImageFacts, size_change
 
 GOOD_QUALITY = 95  # JPEG quality from which the loss is far below the noise of a camera
 _TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned by 90 deg",
@@ -33,7 +33,7 @@ class Fact:
     words: str  # of images with a value
     differ: Callable[[Any, Any, ImageFacts], bool]  # value, another value, the image of the first
 
-    def described(self, value: Any, size: Size) -> str:
+    def described(self, value: Any, size: tuple[int, int]) -> str:
         """Return in words images of a size with a value."""
         if self.name != "taken_size":
             return self.words.format(value)
@@ -110,7 +110,7 @@ class Difference(NamedTuple):
 
 def differences(
     named: Sequence[tuple[str, ImageFacts]],
-    size: Size,  # of all of them [px]
+    size: tuple[int, int],  # of all of them [px]
     record: Mapping[str, Sequence[Any]],  # of the photographs of the calibration, see recorded
 ) -> list[Difference]:
     """Return the differences among photographs, or of them from those of the calibration."""

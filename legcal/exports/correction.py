@@ -20,15 +20,15 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import OutOfClass, UsageError
 from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.configurations import workspace
-from legcal.machine.kinematics import equations_of_readings
-from legcal.machine.mobility import (
+from legcal.machine.closing import (
     COORDINATES,
     coordinates_of,
     independent_coordinates,
     poses_at_coordinates,
     turned_back,
 )
+from legcal.machine.configurations import workspace
+from legcal.machine.kinematics import equations_of_readings
 from legcal.machine.model import Machine, readings_at_poses
 from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__

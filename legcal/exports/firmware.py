@@ -1,10 +1,10 @@
 """Controllers: LinuxCNC, FlyPT, and the nearest Delta that a firmware can express.
 
-A firmware knows upright towers and two parallel rods as one (:mod:`legcal.machine.firmware`). Its
-numbers are those with which it puts the nozzle, the origin of the platform link, nearest to where
-the machine has it at the same steps from the endstops: least squares over the workspace, in a frame
-that the firmware may choose, because photographs see no bed. What is stated is computed with the
-numbers that are read back from the written lines.
+A firmware knows upright towers and two parallel rods as one (:mod:`legcal.descriptions.firmware`).
+Its numbers are those with which it puts the nozzle, the origin of the platform link, nearest to
+where the machine has it at the same steps from the endstops: least squares over the workspace, in a
+frame that the firmware may choose, because photographs see no bed. What is stated is computed with
+the numbers that are read back from the written lines.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from legcal.descriptions.controllers import SIDES, STRUTS, Rig, read_delta, rig_in
+from legcal.descriptions.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
 from legcal.exports.correction import poses_at_readings, stacked
 from legcal.exports.subject import (
     ExportedFile,
@@ -32,9 +34,6 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import random_poses, workspace
-from legcal.machine.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
-from legcal.machine.firmware_files import read_delta
-from legcal.machine.hexapod_files import SIDES, STRUTS, Rig, rig_in
 from legcal.machine.leg import LegKind
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
@@ -502,7 +501,7 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
 
 # FlyPT Mover: the regular hexapod nearest to a machine, as the numbers of its rig. The rig has two
 # sides each of platform and base, one length for all actuators, and the place of the centre of
-# rotation (:class:`legcal.machine.hexapod_files.Rig`). FlyPT Mover is taken to be off by the
+# rotation (:class:`legcal.descriptions.controllers.Rig`). FlyPT Mover is taken to be off by the
 # distance of the joints of the platform from where the rig has them, at the same positions of the
 # actuators: least squares over the workspace, in a frame of the base that is chosen with it.
 

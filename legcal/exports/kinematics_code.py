@@ -31,9 +31,9 @@ from legcal.exports.subject import (
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
+from legcal.machine.closing import COORDINATES, independent_coordinates
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import EquationKind, Leg, LegKind
-from legcal.machine.mobility import COORDINATES, independent_coordinates
 from legcal.machine.model import Machine
 from legcal.machine.rods import actuator_index
 from legcal.version import __version__

@@ -1,11 +1,22 @@
 """Section 2: a parallel machine from its files, and the equations of its legs at poses.
 
-Inputs are mechanism YAMLs with a URDF, URDFs with loops, MJCF files and tables of joints; the
-output is a :class:`Machine`: legs, joint frames R_b and R_e, mobility, a closed home, and the chain
-in Pinocchio. A :class:`Leg` holds its joints and the numbers of its equations, which follow from
-its joints (:class:`JointType`). :class:`Parametrization` maps the numbers to the parameter vector,
-with names, units and gauge. :func:`pose_equations` has derivatives by pose and by parameters, and
-is compared with Pinocchio whenever a machine is loaded. Poses and closed chains have one solver
-(:func:`solve_poses`, :func:`forward_kinematics_many`), random configurations one sampler
-(:func:`random_configurations`). Calibrated models are written as patches of the files read.
+Inputs are mechanism YAMLs with a URDF, URDFs with loops and MJCF files; the output is a
+:class:`Machine`: legs, joint frames R_b and R_e, mobility, a closed home, and the chain in
+Pinocchio. What flows, each step in the modules named:
+
+===============================  ===============================================
+text to a tree, pairs of frames  files, urdf, mjcf, spanning_tree, formats
+bodies and chains between them   bodies, topology
+a chain to a leg                 classification, leg, actuator, rods
+legs to a checked machine        loader, home, shapes, origins, model
+numbers to a parameter vector    parameters, ties, tolerance
+equations with derivatives       equations
+poses, readings, closed chains   chain, solver, closing, kinematics, redundancy
+random poses of the workspace    configurations
+a machine to people and files    inspection, picture, model_writer
+===============================  ===============================================
+
+A :class:`Leg` holds its joints and the numbers of its equations, which follow from its joints
+(:class:`JointType`). :func:`pose_equations` is compared with Pinocchio whenever a machine is
+loaded. Calibrated URDFs are written as patches of the file read.
 """

@@ -81,11 +81,13 @@ def classify_leg(
                 else f"the slider '{axes[0].name}' on the base itself, so that the joint at A moves"
             )
             raise OutOfClass(
-                f"the leg of joint '{leg}' is not supported: found {reason}, needed a joint "
-                "whose centre is fixed in the base, at most one slider, and a joint whose centre "
-                "is fixed in the platform, or a motor that moves the joint at A and then a rod; "
-                "name this motor in name_mot, otherwise the machine cannot be calibrated with "
-                "legcal."
+                f"the leg of joint '{leg}' is not supported",
+                reason,
+                "a joint whose centre is fixed in the base, at most one slider, and a joint "
+                "whose centre is fixed in the platform, or a motor that moves the joint at A "
+                "and then a rod",
+                "name this motor in name_mot, otherwise the machine cannot be calibrated with"
+                " legcal",
             )
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
@@ -110,16 +112,19 @@ def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> 
     second = next((c.joint for c in onward if c.joint in motors), None)
     if second is not None:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported: found a second motor '{second}' "
-            f"beyond the motor '{leg}' on the base, needed one motor for each leg; remove it from "
-            "name_mot if it has none, otherwise this machine cannot be calibrated with legcal."
+            f"the leg of joint '{leg}' is not supported",
+            f"a second motor '{second}' beyond the motor '{leg}' on the base",
+            "one motor for each leg",
+            "remove it from name_mot if it has none, otherwise this machine cannot be "
+            "calibrated with legcal",
         )
     slider = next((c.joint for c in onward if c.type == "prismatic"), None)
     if slider is not None:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported: found the slider '{slider}' beyond "
-            f"the motor '{leg}' on the base, needed a rod of constant length there; this machine "
-            "cannot be calibrated with legcal."
+            f"the leg of joint '{leg}' is not supported",
+            f"the slider '{slider}' beyond the motor '{leg}' on the base",
+            "a rod of constant length there",
+            "this machine cannot be calibrated with legcal",
         )
 
 
@@ -128,10 +133,12 @@ def _check_moves(chain: LegChain, axis: Axis, within: float) -> None:
     turns = chain.steps[0].connection.type == "revolute"
     if turns and axis.distance(chain.A) < within:
         raise OutOfClass(
-            f"the leg of motor '{axis.name}' is not supported: found the joint at A on the "
-            "axis of the motor, which turns the rod and does not move its joint, needed an arm "
-            "between them; remove it from name_mot if it has no motor, otherwise this machine "
-            "cannot be calibrated with legcal."
+            f"the leg of motor '{axis.name}' is not supported",
+            "the joint at A on the axis of the motor, which turns the rod and does not "
+            "move its joint",
+            "an arm between them",
+            "remove it from name_mot if it has no motor, otherwise this machine cannot be"
+            " calibrated with legcal",
         )
 
 
@@ -272,9 +279,10 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -
     tilt = off_square(lines[0].along, lines[1].along)
     if tilt > PERPENDICULAR:
         raise OutOfClass(
-            f"leg '{leg}' could not be classified: the axes of {_names(lines)} are "
-            f"{np.degrees(tilt):.4g} deg from perpendicular, needed a universal joint within "
-            f"{np.degrees(PERPENDICULAR):.2g} deg; correct their axes."
+            f"leg '{leg}' could not be classified",
+            f"the axes of {_names(lines)} {np.degrees(tilt):.4g} deg from perpendicular",
+            f"a universal joint within {np.degrees(PERPENDICULAR):.2g} deg",
+            "correct their axes",
         )
     return Pivot(JointType.UNIVERSAL, centre, tuple(lines), (), spare)
 
@@ -285,9 +293,10 @@ def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str, within: float)
         miss = axis.distance(sphere.point)
         if miss > within:
             raise OutOfClass(
-                f"leg '{leg}' could not be classified: the axis of '{axis.name}' misses the centre "
-                f"of {sphere.name} by {1e3 * miss:.4g} mm, needed one joint at each end of the leg "
-                f"within {1e3 * within:.2g} mm; correct their origins."
+                f"leg '{leg}' could not be classified",
+                f"the axis of '{axis.name}' {1e3 * miss:.4g} mm from the centre of {sphere.name}",
+                f"one joint at each end of the leg within {1e3 * within:.2g} mm",
+                "correct their origins",
             )
     return Pivot(JointType.SPHERICAL, sphere.point, (), (), len(others))
 
@@ -313,19 +322,21 @@ def _meeting(lines: Sequence[Axis], leg: str, within: float) -> Array:
         near, far = nearest(first, second)
         gap = None if near is None or far is None else float(np.linalg.norm(far - near))
         if near is None or gap is None or gap > within:
-            relation = "are parallel" if gap is None else f"miss each other by {1e3 * gap:.4g} mm"
+            relation = "parallel" if gap is None else f"{1e3 * gap:.4g} mm apart"
             raise OutOfClass(
-                f"leg '{leg}' could not be classified: the axes of '{first.name}' and "
-                f"'{second.name}' {relation}, needed axes that meet within "
-                f"{1e3 * within:.2g} mm; correct their origins."
+                f"leg '{leg}' could not be classified",
+                f"the axes of '{first.name}' and '{second.name}' {relation}",
+                f"axes that meet within {1e3 * within:.2g} mm",
+                "correct their origins",
             )
         points.append(near)
     apart = max(float(np.linalg.norm(point - points[0])) for point in points)
     if apart > within:
         raise OutOfClass(
-            f"leg '{leg}' could not be classified: the axes of {_names(lines)} meet in two points "
-            f"{1e3 * apart:.4g} mm apart, needed one point within {1e3 * within:.2g} mm; correct "
-            "their origins."
+            f"leg '{leg}' could not be classified",
+            f"that the axes of {_names(lines)} meet in two points {1e3 * apart:.4g} mm apart",
+            f"one point within {1e3 * within:.2g} mm",
+            "correct their origins",
         )
     return points[0]
 
@@ -379,16 +390,19 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
     left, twisting = sum(spare), [end.type.twists_freely for end in ends]
     if ends[0].type is JointType.FIXED:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported: found the axis of "
-            f"'{base.spins[0].name}' along the leg, needed one perpendicular to it within "
-            f"{np.degrees(PERPENDICULAR):.2g} deg; this machine cannot be calibrated with legcal."
+            f"the leg of joint '{leg}' is not supported",
+            f"the axis of '{base.spins[0].name}' along the leg",
+            f"one perpendicular to it within {np.degrees(PERPENDICULAR):.2g} deg",
+            "this machine cannot be calibrated with legcal",
         )
     if left and not any(twisting):
         name = (*base.spins, *platform.spins)[0].name
         raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported: found the axis of '{name}' along the "
-            "leg, and no S joint; needed the inner axis of a universal joint perpendicular to the "
-            f"leg within {np.degrees(PERPENDICULAR):.2g} deg; correct its axis."
+            f"the leg of joint '{leg}' is not supported",
+            f"the axis of '{name}' along the leg, and no S joint",
+            "the inner axis of a universal joint perpendicular to the leg within "
+            f"{np.degrees(PERPENDICULAR):.2g} deg",
+            "correct its axis",
         )
     idle = left + base.spare + platform.spare + all(twisting)
     return ends[0], ends[1], idle
@@ -404,10 +418,11 @@ def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
                 is_revolute = end.type is JointType.REVOLUTE
                 axis_kind = "a revolute axis" if is_revolute else "an inner axis of a U joint"
                 raise OutOfClass(
-                    f"the leg of joint '{leg}' is not supported: found the axis of "
-                    f"'{end.axes[-1].name}' {np.degrees(tilt):.4g} deg from perpendicular to the "
-                    f"leg, needed {axis_kind} within {np.degrees(PERPENDICULAR):.2g} deg; "
-                    "correct it."
+                    f"the leg of joint '{leg}' is not supported",
+                    f"the axis of '{end.axes[-1].name}' {np.degrees(tilt):.4g} deg from "
+                    "perpendicular to the leg",
+                    f"{axis_kind} within {np.degrees(PERPENDICULAR):.2g} deg",
+                    "correct it",
                 )
 
 
@@ -441,17 +456,19 @@ def _rod(
     where = f"{len(places)} joints in different places" if several else "all joints in one place"
     if on is not None:
         raise OutOfClass(
-            f"the leg of motor '{on}' is not supported: found no slider and {where} beyond "
-            "it, needed a rod of constant length with a joint at each end; this machine cannot be "
-            "calibrated with legcal."
+            f"the leg of motor '{on}' is not supported",
+            f"no slider and {where} beyond it",
+            "a rod of constant length with a joint at each end",
+            "this machine cannot be calibrated with legcal",
         )
     hangs = ", so that the rod hangs on a moving arm and the joint at A moves" * several
     raise OutOfClass(
-        f"the leg of joint '{leg}' is not supported: found no slider and {where}{hangs}, "
-        "needed a joint whose centre is fixed in the base, then a slider or a rod of constant "
-        "length, and a joint whose centre is fixed in the platform, or a motor that moves the "
-        "joint at A; name this motor in name_mot, otherwise the machine cannot be calibrated this "
-        "way."
+        f"the leg of joint '{leg}' is not supported",
+        f"no slider and {where}{hangs}",
+        "a joint whose centre is fixed in the base, then a slider or a rod of "
+        "constant length, and a joint whose centre is fixed in the platform, or a "
+        "motor that moves the joint at A",
+        "name this motor in name_mot, otherwise the machine cannot be calibrated this way",
     )
 
 
@@ -493,16 +510,20 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
     length = float(np.linalg.norm(B - A))
     if length < within:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported: found both its joints in one "
-            "point, needed a distance between them; correct their origins."
+            f"the leg of joint '{leg}' is not supported",
+            "both its joints in one point",
+            "a distance between them",
+            "correct their origins",
         )
     u = (B - A) / length
     base, platform = _pivot(lower, u, leg, within), _pivot(upper, u, leg, within)
     base, platform, idle_spins = _with_spins(base, platform, leg)
     if platform.type is JointType.FIXED:
         raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported: found a rod that only turns "
-            "about itself at the platform, needed a joint there; correct its axes."
+            f"the leg of joint '{leg}' is not supported",
+            "a rod that only turns about itself at the platform",
+            "a joint there",
+            "correct its axes",
         )
     _check_axes(base, platform, u, leg)
     return base, platform, A, B, u, idle_spins
@@ -573,15 +594,17 @@ def _telescope(
     base, platform, idle_spins = _with_spins(base, platform, leg)
     origin = axes[slider].point
     A, B, miss = _on_slider(base, platform, u, origin)
-    misfit = f"its axis through the {_END[platform.type]} misses the base joint"
+    at_base = "axis" if base.centre is None else "centre"
+    misfit = f"its axis through the {_END[platform.type]} misses the base joint {at_base}"
     for spin in (*base.spins, *platform.spins):
         if spin.distance(A) > miss:
             miss, misfit = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
     if miss > within:
         raise OutOfClass(
-            f"the leg of slider '{axes[slider].name}' is not supported: {misfit} "
-            f"{'axis' if base.centre is None else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
-            f"{1e3 * within:.2g} mm; correct the origins along the leg."
+            f"the leg of slider '{axes[slider].name}' is not supported",
+            f"that {misfit} by {1e3 * miss:.4g} mm",
+            f"at most {1e3 * within:.2g} mm",
+            "correct the origins along the leg",
         )
     if platform.type is JointType.FIXED:
         B = A + ((platform_origin - A) @ u) * u

@@ -22,8 +22,8 @@ from legcal.errors import DidNotConverge, ModelError, Problem
 from legcal.geometry.lines import segment_distance
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.closing import LOOSE, free_motions, project, singularities, singularity
 from legcal.machine.kinematics import follow, follow_poses
-from legcal.machine.mobility import LOOSE, free_motions, project, singularities, singularity
 from legcal.machine.model import (
     B_at,
     Machine,

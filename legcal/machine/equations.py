@@ -51,14 +51,15 @@ class PoseEquations:
     measured: BoolArray  # (m,) rows of readings; the others are constraints
     by_q: Array  # (k, m, n) derivative by readings of actuators; or (k, m, 0)
 
-    def of(self, rows: BoolArray) -> PoseEquations:
-        """Return some of the rows."""
+    def of(self, rows: BoolArray | IntArray) -> PoseEquations:
+        """Return some of the rows, or all in another order."""
+        chosen = np.arange(len(self.leg))[rows]
         return PoseEquations(
             self.values[:, rows],
             self.by_pose[:, rows],
             self.by_local[:, rows],
             self.leg[rows],
-            tuple(kind for kind, is_in in zip(self.kinds, rows, strict=True) if is_in),
+            tuple(self.kinds[row] for row in chosen.tolist()),
             self.measured[rows],
             self.by_q[:, rows],
         )
@@ -88,42 +89,45 @@ def pose_equations(
     if q is None and max(on, default=-1) >= 0:
         there = pose_equations(legs, R, t, by_local=False, q=readings_of_rods(legs, R, t))
         return _without_readings(legs, there)
-    if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
-        return _lengths(legs, R, t, by_local, q)
-    groups: dict[tuple[object, ...], list[int]] = {}  # of similar legs; those on actuators alone
+    groups: dict[tuple[object, ...], list[int]] = {}  # of similar legs
     for j, leg in enumerate(legs):
-        alone = j if on[j] >= 0 else -1
-        joints = leg.base_joint, leg.platform_joint
-        groups.setdefault((alone, leg.kind, *joints, *leg.equations), []).append(j)
-    parts: dict[int, PoseEquations] = {}
+        joints = (leg.base_joint, leg.platform_joint) * (leg.twist is not None)
+        key = on[j] >= 0, leg.kind is LegKind.PASSIVE, *joints, *leg.equations
+        groups.setdefault(key, []).append(j)
+    parts = []
     for alike in groups.values():
-        leg, a = legs[alike[0]], on[alike[0]]
-        at = None if q is None or a < 0 else q[:, a]
-        length, *equations, by_reading = _equations_of_similar(
-            [legs[j] for j in alike], R, t, by_local, at
-        )
-        by_q = np.zeros((*equations[0].shape, 0 if q is None else q.shape[1]))
+        similar, at = [legs[j] for j in alike], None
+        if q is not None and on[alike[0]] >= 0:
+            at = q[:, [on[j] for j in alike]]
+        length, *of_rows = _equations_of_similar(similar, R, t, by_local, at)
+        rows = slice(1 if similar[0].kind is LegKind.PASSIVE else 0, None)
+        kinds = similar[0].equations[rows]
+        values, by_pose, local, by_reading = (x[:, :, rows] for x in of_rows)
+        by_q = np.zeros((*values.shape, 0 if q is None else q.shape[1]))
         if at is not None:
-            by_q[..., a] = by_reading[..., 0]
-        rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
-        kinds = leg.equations[rows]
-        is_length = np.array([kind is EquationKind.LENGTH for kind in kinds], dtype=np.bool_)
-        arm = np.where(is_length, 1.0, length[..., None])
-        values, by_pose, local, by_q = (x[:, :, rows] for x in (*equations, by_q))
-        values = arm * values
-        by_pose, local, by_q = (arm[..., None] * x for x in (by_pose, local, by_q))
-        measured = _measured(leg)[rows]
-        for i, j in enumerate(alike):
-            parts[j] = PoseEquations(
-                values[:, i],
-                by_pose[:, i],
-                local[:, i],
-                np.full(len(kinds), j),
-                kinds,
-                measured,
-                by_q[:, i],
+            for i, j in enumerate(alike):
+                by_q[:, i, :, on[j]] = by_reading[:, i, :, 0]
+        if set(kinds) != {EquationKind.LENGTH}:
+            is_length = np.array([kind is EquationKind.LENGTH for kind in kinds], dtype=np.bool_)
+            arm = np.where(is_length, 1.0, length[..., None])
+            values = arm * values
+            by_pose, local, by_q = (arm[..., None] * x for x in (by_pose, local, by_q))
+        shape = len(t), len(alike) * len(kinds)
+        parts.append(
+            PoseEquations(
+                values.reshape(shape),
+                by_pose.reshape(*shape, 6),
+                local.reshape(*shape, local.shape[3]),
+                np.repeat(alike, len(kinds)),
+                kinds * len(alike),
+                np.array([_is_read(leg, kind) for leg in similar for kind in kinds], np.bool_),
+                by_q.reshape(*shape, by_q.shape[3]),
             )
-    return _stacked([parts[j] for j in range(len(legs))])
+        )
+    if len(parts) == 1:
+        return parts[0]
+    stacked = _stacked(parts)
+    return stacked.of(np.argsort(stacked.leg, kind="stable"))
 
 
 def n_pose_constraints(legs: Sequence[Leg]) -> int:
@@ -210,21 +214,19 @@ def leg_equations(
     All rows but the length are dimensionless; a passive leg has a length row, too. For a rod on an
     actuator *q* (k,) are the readings, zero by default.
     """
-    _, *equations = _equations_of_similar([leg], R, t, by_local, q)
+    at = None if q is None or leg.actuator is None else q[:, None]
+    _, *equations = _equations_of_similar([leg], R, t, by_local, at)
     values, by_pose, local, by_q = (x[:, 0] for x in equations)
     owner = np.zeros(len(leg.equations), dtype=np.intp)
-    return PoseEquations(values, by_pose, local, owner, leg.equations, _measured(leg), by_q)
+    measured = np.array([_is_read(leg, kind) for kind in leg.equations])
+    return PoseEquations(values, by_pose, local, owner, leg.equations, measured, by_q)
 
 
-def _measured(leg: Leg) -> BoolArray:
-    """Return which equations of a leg contain its reading, (m,)."""
-    return np.array(
-        [
-            leg.actuator is not None
-            or (kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED)
-            for kind in leg.equations
-        ]
-    )
+def _is_read(leg: Leg, kind: EquationKind) -> bool:
+    """Return whether an equation of a leg contains its reading."""
+    if leg.actuator is not None:
+        return True
+    return kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED
 
 
 def _equations_of_similar(
@@ -234,19 +236,22 @@ def _equations_of_similar(
     by_local: bool,
     q: Array | None,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the equations of n legs with the same joints and equations; n is 1 for moving A.
+    """Return the equations of n legs with the same joints and equations.
 
     The result is lengths (k, n), and for m rows values (k, n, m) and derivatives (k, n, m, 6) by
-    the pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the reading q (k,).
+    the pose, (k, n, m, 21) by the numbers of the legs and (k, n, m, 1) by the readings q (k, n) of
+    their actuators, zero by default.
     """
     A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
-    actuator, moved = legs[0].actuator, None
-    if actuator is not None:
-        moved = actuator.motion(legs[0].A, np.zeros(len(t)) if q is None else q)
+    motions = [
+        leg.actuator.motion(leg.A, np.zeros(len(t)) if q is None else q[:, i])
+        for i, leg in enumerate(legs)
+        if leg.actuator is not None
+    ]
     arm = B @ np.swapaxes(R, 1, 2)
-    vector = arm + t[:, None] - (A if moved is None else moved.A[:, None])
-    length = np.linalg.norm(vector, axis=2)
-    at = _Placed(legs, R, length, vector / length[..., None], moved)
+    vector = arm + t[:, None] - (_of_each(motions, "A") if motions else A)
+    length = np.sqrt(_dot(vector, vector))
+    at = _Placed(legs, R, length, vector / length[..., None], motions)
     kinds, shape = legs[0].equations, length.shape
     values, by_pose = np.empty((*shape, len(kinds))), np.empty((*shape, len(kinds), 6))
     local = np.zeros((*shape, len(kinds), LegColumns.COUNT if by_local else 0))
@@ -257,16 +262,16 @@ def _equations_of_similar(
         by_pose[:, :, i, :3], by_pose[:, :, i, 3:] = cross(arm, row.by_leg), row.by_leg
         if row.by_tied is not None:
             by_pose[:, :, i, :3] += cross(at.in_base(row.tied), row.by_tied)
-        if moved is not None:
-            by_q[:, 0, i, 0] = _by_actuator(legs[0], moved, row, local[:, 0, i])
+        if motions:
+            by_q[:, :, i, 0] = _by_actuators(at, row, local[:, :, i])
         if by_local:
-            local[:, :, i, LegColumns.A] = -_back(moved, row.by_leg)
+            local[:, :, i, LegColumns.A] = -at.back(row.by_leg)
             local[:, :, i, LegColumns.B] = row.by_leg @ R
             local[:, :, i, LegColumns.LENGTH] = row.by_q0
             local[:, :, i, LegColumns.TWIST] = row.by_twist
             if row.by_base_axis is not None:
                 e = _basis(at.axes("base"))
-                by_axis = _back(moved, row.by_base_axis)
+                by_axis = at.back(row.by_base_axis)
                 turns = [-_dot(by_axis, e[:, 1]), _dot(by_axis, e[:, 0])]
                 local[:, :, i, LegColumns.BASE_AXIS] = np.stack(turns, axis=-1)
             if row.by_tied is not None:
@@ -276,40 +281,35 @@ def _equations_of_similar(
     return length, values, by_pose, local, by_q
 
 
-def _back(moved: JointMotion | None, vectors: Array) -> Array:
-    """Convert gradients (k, ..., 3) by moved points into gradients by the points at reading 0."""
-    return vectors if moved is None else np.einsum("kij,k...i->k...j", moved.by_A, vectors)
+def _of_each(motions: Sequence[JointMotion], name: str) -> Array:
+    """Return positions or derivatives (k, n, ...) of n joints at A."""
+    return np.stack([getattr(motion, name) for motion in motions], axis=1)
 
 
-def _write_actuator(moved: JointMotion, by_leg: Array, local: Array) -> None:
-    """Write derivatives by the numbers of an actuator, through the joint at A, into (k, 21)."""
-    columns = ActuatorColumns
-    local[:, columns.AXIS] = -np.einsum("kij,ki->kj", moved.by_axis, by_leg)
-    local[:, columns.POINT] = -np.einsum("kij,ki->kj", moved.by_point, by_leg)
-    local[:, columns.GAIN] = -_dot(moved.by_gain, by_leg)
+def _by_actuators(at: _Placed, row: _EquationRow, local: Array) -> Array:
+    """Return the derivatives (k, n) of a row by readings; write those by numbers of actuators.
 
-
-def _by_actuator(leg: Leg, moved: JointMotion, row: _EquationRow, local: Array) -> Array:
-    """Return the derivative (k,) of a row by the reading; write those by numbers of the actuator.
-
-    The latter go into *local* (k, 21), which may have no columns.
+    The latter go into *local* (k, n, 21), which may have no columns.
     """
-    by_leg = row.by_leg[:, 0]
-    by_q, columns = -_dot(moved.by_q, by_leg), ActuatorColumns
-    if local.shape[1]:
-        _write_actuator(moved, by_leg, local)
-    actuator = leg.actuator
-    if row.by_base_axis is None or actuator is None or not actuator.turns:
-        return by_q
-    v = moved.by_A @ _given(leg.base_axis)  # it turns with the arm
-    by_axis = row.by_base_axis[:, 0]
-    by_angle = _dot(cross(actuator.axis, v), by_axis)
-    if local.shape[1]:
-        for k, e in enumerate(_basis(actuator.axis[None])[0]):
-            turned = cross(e, v) - moved.by_A @ cross(e, _given(leg.base_axis))
-            local[:, columns.AXIS.start + k] += _dot(turned, by_axis)
-        local[:, columns.GAIN] += by_angle * moved.angle / actuator.gain
-    return by_q + actuator.gain * by_angle
+    by_q, columns = -_dot(_of_each(at.motions, "by_q"), row.by_leg), ActuatorColumns
+    if local.shape[2]:
+        for name, place in (("by_axis", columns.AXIS), ("by_point", columns.POINT)):
+            by_line = np.einsum("knij,kni->knj", _of_each(at.motions, name), row.by_leg)
+            local[..., place] = -by_line
+        local[..., columns.GAIN] = -_dot(_of_each(at.motions, "by_gain"), row.by_leg)
+    for i, moved in enumerate(at.motions if row.by_base_axis is not None else ()):
+        actuator, axis = moved.actuator, at.legs[i].base_axis
+        if row.by_base_axis is None or axis is None or not actuator.turns:
+            continue
+        v, by_axis = moved.by_A @ axis, row.by_base_axis[:, i]  # it turns with the arm
+        by_angle = _dot(cross(actuator.axis, v), by_axis)
+        by_q[:, i] += actuator.gain * by_angle
+        if local.shape[2]:
+            for k, e in enumerate(actuator.line.across):
+                turned = cross(e, v) - moved.by_A @ cross(e, axis)
+                local[:, i, columns.AXIS.start + k] += _dot(turned, by_axis)
+            local[:, i, columns.GAIN] += by_angle * moved.angle / actuator.gain
+    return by_q
 
 
 def least_squares_equations(
@@ -473,44 +473,6 @@ def violated_constraint(machine: Machine, T_base_platform: RigidTransform) -> st
     return describe_worst(machine, here, "would be")
 
 
-def _lengths(
-    legs: Sequence[Leg], R: Array, t: Array, by_local: bool, q: Array | None
-) -> PoseEquations:
-    """Return the lengths of all legs at once."""
-    A, on = np.array([leg.A for leg in legs]).reshape(-1, 3), actuator_index(legs)
-    moved = dict[int, JointMotion]()
-    if q is not None:
-        A = np.tile(A, (len(q), 1, 1))
-        for j, leg in enumerate(legs):
-            if leg.actuator is not None:
-                moved[j] = leg.actuator.motion(leg.A, q[:, on[j]])
-                A[:, j] = moved[j].A
-    B = np.array([leg.B for leg in legs]).reshape(-1, 3)
-    arms = B @ np.swapaxes(R, 1, 2)
-    vectors = arms + t[:, None] - A
-    lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
-    u = vectors / lengths[..., None]
-    local = np.zeros((*lengths.shape, LegColumns.COUNT if by_local else 0))
-    if by_local:
-        local[..., LegColumns.A], local[..., LegColumns.B] = -u, u @ R
-        local[..., LegColumns.LENGTH] = -1.0
-    by_q = np.zeros((*lengths.shape, 0 if q is None else q.shape[1]))
-    for j, motion in moved.items():
-        by_q[:, j, on[j]] = -_dot(motion.by_q, u[:, j])
-        if by_local:
-            local[:, j, LegColumns.A] = -_back(motion, u[:, j])
-            _write_actuator(motion, u[:, j], local[:, j])
-    return PoseEquations(
-        lengths - np.array([leg.q0 for leg in legs]),
-        np.concatenate([cross(arms, u), u], axis=2),
-        local,
-        np.arange(len(legs)),
-        (EquationKind.LENGTH,) * len(legs),
-        np.array([leg.is_motor for leg in legs], dtype=np.bool_),
-        by_q,
-    )
-
-
 def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
     """Return the three equations of a planar platform, tilts as lengths at a mean leg's end."""
     normal = machine.T_base_Rb.as_matrix()[:3, 2]
@@ -571,7 +533,7 @@ class _Placed(NamedTuple):
     R: Array  # (k, 3, 3)
     length: Array  # (k, n) [m]
     u: Array  # (k, n, 3)
-    moved: JointMotion | None = None  # motion of the joint at A of one leg on an actuator
+    motions: Sequence[JointMotion] = ()  # of the joints at A, if all legs are on actuators
 
     def axes(self, end: Literal["base", "platform"]) -> Array:
         """Return the axes of the joints at one end, (n, 3), at reading 0."""
@@ -581,7 +543,15 @@ class _Placed(NamedTuple):
     def base_axis(self) -> Array:
         """The axes of the joints at A, (k, n, 3)."""
         v = np.broadcast_to(self.axes("base"), self.u.shape)
-        return v if self.moved is None else np.einsum("kij,knj->kni", self.moved.by_A, v)
+        if not self.motions:
+            return v
+        return np.asarray(np.einsum("knij,knj->kni", _of_each(self.motions, "by_A"), v))
+
+    def back(self, vectors: Array) -> Array:
+        """Convert gradients (k, n, 3) by moved points into gradients by the points at reading 0."""
+        if not self.motions:
+            return vectors
+        return np.asarray(np.einsum("knij,kni->knj", _of_each(self.motions, "by_A"), vectors))
 
     def in_base(self, vectors: Array) -> Array:
         """Return directions (n, 3) of the platform in the frame of the base, (k, n, 3)."""

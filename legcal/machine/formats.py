@@ -2,11 +2,18 @@
 
 A YAML with its URDF (ours, or Gepetto's, with stand-in joints), a URDF with its own loops, or MJCF
 (:mod:`legcal.machine.mjcf`): all are converted to a :class:`Source`, a tree with pairs of
-coincident frames. Without a block ``legcal`` the tree is closed near its drawn configuration.
+coincident frames.
+
+CAD exports contain the whole machine: a head turns on its base, a hand or an antenna moves on the
+platform, a robot floats in its world. A joint on no path of the tree between the two frames of a
+closure does not move the loops; it is held where it is drawn, so that only the mechanism moves.
+Without a block ``legcal`` the loops are closed near the drawn configuration, and sliders without
+limits get a travel.
 """
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +21,14 @@ from typing import cast
 
 import numpy as np
 from lxml import etree
+from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link, rigid_bodies
-from legcal.machine.drawn_state import completed, is_drawn_closed, with_held_joints
+from legcal.machine.chain import ClosedChain
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,
@@ -31,42 +39,32 @@ from legcal.machine.files import (
     yaml_of_urdf,
 )
 from legcal.machine.mjcf import read_mjcf_source
+from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
-    Loop,
-    LoopKind,
     Source,
     UrdfBuilder,
     check_one_mechanism,
-    close_loops,
+    closing_frames,
     moving_groups,
+    origin_xml,
+    read_loop_source,
     reference_poses,
 )
-from legcal.machine.topology import find_chains, motors_on, propose_block
+from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
     BLOCK,
     LOOP_TAGS,
     NO_BLOCK,
     URDF_LOOPS,
     Urdf,
-    XmlProblems,
-    checked_tree,
-    number_list,
-    parse_robot,
+    UrdfJoint,
     parse_urdf,
     parse_xml,
     read_urdf,
 )
 
-_CLOSING = re.compile(r"closing_(.+)_([12])")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
-
-KINDS: dict[str, LoopKind] = {
-    **dict.fromkeys(("spherical", "ball", "point"), "point"),
-    **dict.fromkeys(("fixed", "weld"), "weld"),
-    **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
-    "universal": "universal",
-}
 
 
 def read_source(model: str | Path, base: str | None = None, platform: str | None = None) -> Source:
@@ -279,191 +277,328 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
     return replaced
 
 
-def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
-    """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot."""
-    ends: dict[str, dict[str, str]] = {}
-    for element in robot.findall("link"):
-        match = _CLOSING.fullmatch(element.get("name", ""))
-        if match:
-            ends.setdefault(match[1], {})[match[2]] = match[0]
-    for name, numbers in ends.items():
-        if len(numbers) == 1:
-            (number, link) = next(iter(numbers.items()))
-            raise ModelError(
-                "the loops could not be closed",
-                f"the frame '{link}' and no 'closing_{name}_{3 - int(number)}'",
-                "both ends of each loop",
-                f"export the model again with both parts of the mate closing_{name}, or "
-                f"remove '{link}'",
-                path,
-            )
-    return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
+TRIALS = 24
+STEPS = 200
+CLOSED = 1e-10  # largest residual of a closed loop [m, rad]
+TRAVEL_OF_SIZE = 0.05  # assumed travel of sliders to either side, relative to the machine
+_DRAWN_CLOSED = 1e-4  # gap of drawn loops, relative to the machine, that is rounding
+_OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
+_RIGID = 1e-3  # tolerance of determinants of rotations
+_SPREAD = 0.1  # start offset of a trial per trial number [rad], and relative to the machine
+_MAX_STEP = 0.3  # largest step [rad], and relative to the machine
+_SHOWN = 6  # joints named in a note
 
 
-def read_loop_source(path: Path, content: bytes) -> Source:
-    """Return the mechanism of a URDF with loops: elements of its own, or pairs of closing frames.
+def with_held_joints(source: Source) -> Source:
+    """Return a mechanism whose joints outside all loops are fixed at their drawn values.
 
-    Motors are the prismatic joints named in ``<transmission>`` or ``<ros2_control>``, or all
-    prismatic joints if none is named.
+    A chain with a motor and a passive joint that ends in the air is refused: a leg left open.
     """
-    robot = parse_robot(path, content)
-    problems = XmlProblems(path)
-    elements = [element for element in robot if element.tag in LOOP_TAGS]
-    bare = checked_tree(robot, path, content, problems, travel_needed=False)
-    loops = _loops(elements, bare, problems)
-    motors, notes = _motors(robot, bare, problems)
-    problems.raise_if_any()
-    for element in elements:
-        robot.remove(element)
-    poses = reference_poses(bare)
-    text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
-    pairs, kinds = close_loops(loops, text, poses, path)
-    for line in filter(None, text.body().split("\n")):
-        robot.append(etree.fromstring(line))
-        robot[-1].tail = "\n"
-    named = closing_frames(robot, path)
-    if named:
-        kinds.extend("3d" for _ in named)
-        notes.append(
-            f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
-            "joints."
-        )
-    file = MechanismFile(
-        closed_loop=[*pairs, *named],
-        type=kinds,
-        name_mot=motors,
+    urdf, motors = source.urdf, source.file.name_mot
+    held = open_joints(urdf, source.file.closed_loop)
+    if source.file.legcal is not None:
+        held.pop(source.file.legcal.platform_joint or "", None)
+    if not held:
+        return source
+    _refuse_open_leg(urdf, held, motors, source)
+    robot = urdf.robot()
+    for element in robot.findall("joint"):
+        joint = held.get(element.get("name", ""))
+        if joint is None:
+            continue
+        for tag in ("origin", "mimic", "limit", "axis"):
+            for part in element.findall(tag):
+                element.remove(part)
+        element.set("type", "fixed")
+        T = joint.T_parent_origin * _motion(joint, source.values.get(joint.name, 0.0))
+        element.append(etree.fromstring(origin_xml(T)))
+    file = source.file.model_copy(update={"name_mot": [m for m in motors if m not in held]})
+    return replace(
+        source,
+        file=file,
+        # The travel of sliders was asked for, or not, when the file was read.
+        urdf=urdf.edited(robot),
+        notes=(*source.notes, _note(list(held))),
+        values={name: value for name, value in source.values.items() if name not in held},
     )
-    return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))
 
 
-def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
-    """Return the valid loops of a URDF, and note the problems of the others."""
-    loops = []
-    problems.check_unique(elements)
-    for i, element in enumerate(elements, start=1):
-        n_before = len(problems)
-        name = element.get("name", "").strip() or f"{element.tag}_{i}"
-        kind = element.get("type", "").strip().lower()
-        if kind not in KINDS:
-            problems.at(
-                element,
-                f"closes a loop with the type '{element.get('type', '')}', needed one of "
-                f"{', '.join(KINDS)}",
-                "cut the loop at another joint",
+def open_joints(urdf: Urdf, closures: Iterable[Sequence[str]]) -> dict[str, UrdfJoint]:
+    """Return the joints that can move and are in no loop, by name."""
+    above = {joint.child: joint for joint in urdf.joints.values()}
+
+    def to_root(link: str) -> set[str]:
+        names = set[str]()
+        while link in above:
+            names.add(above[link].name)
+            link = above[link].parent
+        return names
+
+    in_loops = set[str]()
+    for first, second in closures:
+        in_loops |= to_root(frame_link(urdf, first)) ^ to_root(frame_link(urdf, second))
+    return {
+        name: joint for name, joint in urdf.joints.items() if joint.moves and name not in in_loops
+    }
+
+
+def _motion(joint: UrdfJoint, value: float) -> RigidTransform:
+    """Return the motion of a joint at a value [m or rad], none for a floating or planar one."""
+    if joint.type == "prismatic":
+        return RigidTransform.from_translation(value * joint.axis)
+    if joint.type in ("revolute", "continuous"):
+        return RigidTransform.from_rotation(Rotation.from_rotvec(value * joint.axis))
+    return RigidTransform.identity()
+
+
+def _refuse_open_leg(
+    urdf: Urdf, held: Mapping[str, UrdfJoint], motors: Sequence[str], source: Source
+) -> None:
+    """Refuse a chain with a motor and a passive joint that ends without closing a loop."""
+    children: dict[str, list[UrdfJoint]] = {}
+    for joint in urdf.joints.values():
+        children.setdefault(joint.parent, []).append(joint)
+
+    def beyond(joint: UrdfJoint) -> list[UrdfJoint]:
+        """Return a joint and all joints that it carries."""
+        carried, pending = list[UrdfJoint](), [joint]
+        while pending:
+            carried.append(pending.pop())
+            pending += children.get(carried[-1].child, [])
+        return carried
+
+    for joint in held.values():
+        branch = [j for j in beyond(joint) if j.moves]
+        if any(j.name not in held for j in branch):
+            continue  # it carries the mechanism
+        driven = [j.name for j in branch if j.name in motors]
+        passive = [j.name for j in branch if j.name not in motors]
+        if driven and passive:
+            raise OutOfClass(
+                "this is not a platform on separate legs",
+                f"the motor '{driven[0]}' of a leg that starts with joint '{joint.name}', "
+                "on no chain from base to platform",
+                "a closed loop for each leg",
+                f"add the missing pair to {urdf.wording.closures}, or make joint "
+                f"'{passive[0]}' fixed if the chain is no leg",
+                source.path,
             )
-            continue
-        ends = _ends(element, urdf, problems)
-        axes = _axes(element, KINDS[kind], problems)
-        if len(problems) > n_before or ends is None:
-            continue
-        (link_1, T_1), (link_2, T_2) = ends
-        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
-    return loops
 
 
-def _ends(
-    element: etree._Element, urdf: Urdf, problems: XmlProblems
-) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
-    """Return the links of a loop and its frame in each, or None after noting problems."""
-    sides = [part for part in element if part.tag in ("link1", "link2")]
-    origins: list[etree._Element | None] = [
-        part if part.find("origin") is None else part.find("origin") for part in sides
+def _note(names: Sequence[str]) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:_SHOWN])
+    more = f" and {len(names) - _SHOWN} more" * (len(names) > _SHOWN)
+    if len(names) == 1:
+        return f"the joint {shown} closes no loop and is held as drawn."
+    return f"the joints {shown}{more} close no loop and are held as drawn."
+
+
+def completed(source: Source) -> Source:
+    """Return a mechanism without a block, completed with the closed poses and all travels."""
+    chain = _closed_chain(source)
+    start = chain.neutral()
+    for joint, value in source.values.items():
+        start[chain.q_index(joint)] = value
+    drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
+    unit = chain.column_units(float(np.ptp(drawn_at, axis=0).max()) or 1.0)
+    closed = closed_near(chain, start, source.urdf.links, unit)
+    configuration = start if closed is None else closed
+    urdf = source.urdf
+    sliders = [
+        joint.name
+        for joint in urdf.joints.values()
+        if joint.type == "prismatic" and joint.limits is None
     ]
-    if not sides:
-        sides = [part for tag in ("parent", "child") for part in element.findall(tag)]
-        origins = [element.find(f"{part.tag}_origin") for part in sides]
-    if len(sides) != 2:
-        problems.at(
-            element,
-            f"names {len(sides)} links, needed two",
-            "write <link1 link=...> and <link2 link=...>, or <parent ...> and <child ...>",
-        )
-        return None
-    n_before = len(problems)
-    links = [side.get("link", "") for side in sides]
-    for link in links:
-        if link not in urdf.links:
-            problems.at(
-                element, f"names the link '{link}', which is not in the file",
-                closest(link, urdf.links).rstrip("."),
-            )  # fmt: skip
-    if links[0] == links[1]:
-        problems.at(element, f"joins the link '{links[0]}' to itself", "name two links")
-    poses = [_pose(element, origin, problems) for origin in origins]
-    if len(problems) > n_before:
-        return None
-    return (links[0], poses[0]), (links[1], poses[1])
+    off = _loop_error(chain, start)
+    if sliders and closed is not None and off > CLOSED:
+        configuration = closed = _levelled(chain, closed, source, unit)
+    elif closed is not None and off > CLOSED:
+        configuration = closed = _at_drawn_motors(chain, closed, start, source, unit)
+    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
+    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
+    if sliders:
+        readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
+        source = _with_travel(source, readings, size)
+    if closed is None:
+        return source
+    drawn = {
+        name: float(configuration[chain.q_index(name)])
+        for name in source.file.name_mot
+        if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
+    }
+    is_open = not sliders and off > _OPEN * size
+    return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
 
 
-def _pose(
-    element: etree._Element, origin: etree._Element | None, problems: XmlProblems
-) -> RigidTransform:
-    """Return the motion of ``xyz`` and ``rpy``, zero by default."""
-    xyz, rpy = (_three(element, origin, key, problems) for key in ("xyz", "rpy"))
-    return RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy))
-
-
-def _three(
-    element: etree._Element, part: etree._Element | None, key: str, problems: XmlProblems
+def _at_drawn_motors(
+    chain: ClosedChain, closed: Array, start: Array, source: Source, unit: Array
 ) -> Array:
-    """Return three numbers of an element of a loop; zero by default."""
-    text = None if part is None else part.get(key)
-    numbers = [0.0] * 3 if text is None else number_list(text, 3)
-    if numbers is None:
-        problems.at(
-            element, f"has {key}={str(text)[:60]!r}, needed 3 finite numbers", "correct the value"
+    """Return a closed configuration with the motors where the file draws them, if there is one."""
+    moved = [source.urdf.joints[name].type in ("prismatic", "revolute")
+             for name in source.file.name_mot if name in source.urdf.joints]  # fmt: skip
+    if len(moved) < len(source.file.name_mot) or not all(moved):
+        return closed
+    values = [chain.q_index(name) for name in source.file.name_mot]
+    rates = np.zeros((len(values), chain.nv))
+    rates[range(len(values)), [chain.v_index(name) for name in source.file.name_mot]] = 1.0
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        off = points[0][values] - start[values]
+        return np.concatenate([residual, off])[None], np.concatenate([jacobian, rates])[None]
+
+    there = _solved(chain, equations, closed, unit)
+    return closed if there is None else there
+
+
+def _levelled(chain: ClosedChain, configuration: Array, source: Source, unit: Array) -> Array:
+    """Return a closed configuration with a level platform, or the given one if there is none.
+
+    A file without a closed drawing and without slider limits leaves the pose undetermined. Among
+    the level poses the one with sliders nearest to their drawn positions is taken.
+    """
+    urdf = source.urdf
+    try:
+        block = propose_block(source, source.file.name_mot)
+    except OutOfClass:
+        return configuration  # refused later
+    bodies = rigid_bodies(urdf, source.closures, block.platform_joint)
+    motors = source.file.name_mot
+    chains = find_chains(bodies, urdf, block.base, block.platform, motors)
+    A, B = (
+        np.array(points) @ bodies.T_body_link[link][:3, :3]
+        for link, points in (
+            (block.base, [leg.A for leg in chains]),
+            (block.platform, [leg.B_platform for leg in chains]),
         )
-    return np.array(numbers or [0.0] * 3)
+    )
+    level = RigidTransform.from_rotation(level_rotation(A, B))
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        turned, by_joints = chain.welded(block.base, block.platform, level)
+        rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
+        return rows[0][None], rows[1][None]
+
+    closed = _solved(chain, equations, configuration, unit)
+    if closed is None:
+        return configuration
+    sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
+    values = [chain.q_index(name) for name in sliders]
+    rates = [chain.v_index(name) for name in sliders]
+    for _ in range(STEPS):
+        free = null_space(equations(closed[None])[1][0], rcond=1e-9)
+        step = -free @ np.linalg.lstsq(free[rates], closed[values], rcond=1e-6)[0]
+        nearer = _solved(chain, equations, chain.integrate(closed, _shortened(step, unit)), unit)
+        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(closed[values]):
+            break
+        closed = nearer
+    return closed
 
 
-def _axes(element: etree._Element, kind: LoopKind, problems: XmlProblems) -> tuple[Array, Array]:
-    """Return the unit axes of a loop in its two frames; the URDF default is x."""
-    x = np.array([1.0, 0.0, 0.0])
-    if kind not in ("revolute", "universal"):
-        return x, x
-    common = element.find("axis")
-    if common is not None and common.get("frame") is not None:
-        problems.at(
-            element,
-            f"gives its axis in the frame '{common.get('frame')}' alone, needed it in both",
-            "give both frames with rpy so that the axis is the same in them",
-        )
-    parts = [element.find(f"{side}_axis") for side in ("parent", "child")]
-    if kind == "universal" and None in parts:
-        problems.at(
-            element,
-            "is universal and has not two axes",
-            "write <parent_axis xyz=...> and <child_axis xyz=...>",
-        )
-    axes = []
-    for part in parts:
-        given = common if part is None else part
-        axis = x if given is None else _three(element, given, "xyz", problems)
-        norm = float(np.linalg.norm(axis))
-        if norm < 1e-9 and not problems:
-            problems.at(element, "has a zero axis, needed a direction", "correct its xyz")
-        axes.append(axis / max(norm, 1e-9))
-    return axes[0], axes[1]
+def closed_near(
+    chain: ClosedChain, start: Array, links: Sequence[str], unit: Array
+) -> Array | None:
+    """Return a closed configuration near a given one, or None.
+
+    Of the results of several starts, the one with the smallest rotations of links is taken. *unit*
+    (nv,) is the size of the machine [m], 1 for angles.
+    """
+    if _loop_error(chain, start) <= CLOSED:
+        return start
+    rng = np.random.default_rng(1965)
+    best: tuple[float, Array] | None = None
+    drawn = chain.turns(start, links[0], links)
+    for trial in range(TRIALS):
+        away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
+        closed = _close(chain, away, unit)
+        if closed is None:
+            continue
+        turned = _turned(drawn, chain.turns(closed, links[0], links))
+        if best is None or turned < best[0] - 1e-6:
+            best = turned, closed
+    return None if best is None else best[1]
 
 
-def _motors(
-    robot: etree._Element, urdf: Urdf, problems: XmlProblems
-) -> tuple[list[str], list[str]]:
-    """Return the joints with an encoder, and notes about them."""
-    named = [e for e in robot.iterfind("transmission/joint") if e.get("name") is not None]
-    named += [e for e in robot.iterfind("ros2_control/joint") if e.get("name") is not None]
-    for element in named:
-        if element.get("name") not in urdf.joints:
-            problems.at(
-                element,
-                "names no joint of the file",
-                closest(str(element.get("name")), urdf.joints).rstrip("."),
-            )
-    motors = list(dict.fromkeys(str(e.get("name")) for e in named))
-    if motors:
-        return motors, []
-    sliders = [joint.name for joint in urdf.joints.values() if joint.type == "prismatic"]
-    return sliders, [
-        f"The file names no motors: all {len(sliders)} prismatic joints were taken as motors; "
-        "name the motors in <transmission> elements if some are not."
-    ] * bool(sliders)
+def _turned(before: Array, after: Array) -> float:
+    """Return the total difference of rotations (n, 3, 3) [rad]."""
+    apart = np.swapaxes(before, 1, 2) @ after
+    if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # degenerate or not finite
+        return math.inf
+    return float(Rotation.from_matrix(apart).magnitude().sum())
+
+
+def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | None:
+    """Return a closed configuration near a given one, or None."""
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        return residual[None], jacobian[None]
+
+    return _solved(chain, equations, configuration, unit)
+
+
+def _shortened(step: Array, unit: Array) -> Array:
+    """Return a step (nv,), shortened to ``_MAX_STEP``."""
+    longest = float(np.abs(step / unit).max(initial=0.0))
+    return np.asarray(step * min(1.0, _MAX_STEP / max(longest, 1e-300)))
+
+
+def _solved(
+    chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
+) -> Array | None:
+    """Return the solution of equations near a configuration, or None."""
+    solution = solve(
+        equations,
+        lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
+        configuration[None],
+        tolerance=CLOSED,
+        unit=unit,
+        damped=True,
+        steps=STEPS,
+    )
+    return solution.points[0] if solution.worst[0] <= CLOSED else None
+
+
+def is_drawn_closed(source: Source) -> bool:
+    """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
+    chain = _closed_chain(source)
+    poses = reference_poses(source.urdf).values()
+    size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
+    return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
+
+
+def _closed_chain(source: Source) -> ClosedChain:
+    try:
+        return ClosedChain(source.urdf.text, source.closures)
+    except ModelError as error:
+        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
+
+
+def _loop_error(chain: ClosedChain, configuration: Array) -> float:
+    """Return the largest residual of the loops."""
+    residual = chain.residual(configuration)
+    return float(np.abs(residual).max()) if len(residual) else 0.0
+
+
+def _with_travel(source: Source, readings: Mapping[str, float], size: float) -> Source:
+    """Return a mechanism of a size [m] with an assumed travel of sliders about readings [m]."""
+    reach = float(f"{TRAVEL_OF_SIZE * size:.0e}") if size > 0.0 else TRAVEL_OF_SIZE
+    robot = source.urdf.robot()
+    for element in robot.findall("joint"):
+        name = str(element.get("name"))
+        if name in readings:
+            limit = element.find("limit")
+            if limit is None:
+                limit = etree.SubElement(element, "limit")
+            limit.set("lower", repr(readings[name] - reach))
+            limit.set("upper", repr(readings[name] + reach))
+            for key in ("effort", "velocity"):
+                limit.set(key, limit.get(key, "1000"))
+    names = ", ".join(f"'{name}'" for name in list(readings)[:_SHOWN])
+    note = (
+        f"The file gives no travel for {len(readings)} sliders ({names}): {reach:g} m to either "
+        "side of the closed pose was assumed; add their limits."
+    )
+    urdf = source.urdf.edited(robot, travel_needed=True)
+    return replace(source, urdf=urdf, notes=(*source.notes, note))

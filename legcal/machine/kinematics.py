@@ -16,7 +16,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.closing import ROUNDING, TOLERANCE, close_at, closure_equations, project_pose
+from legcal.machine.closing import (
+    CLOSED,
+    ROUNDING,
+    TOLERANCE,
+    close_at,
+    closure_equations,
+    dimensionless,
+    excludes_singularity,
+    is_on_same_side,
+    leg_scale,
+    project_pose,
+)
 from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
@@ -24,13 +35,6 @@ from legcal.machine.equations import (
     violated_constraint,
 )
 from legcal.machine.leg import LegKind
-from legcal.machine.mobility import (
-    CLOSED,
-    dimensionless,
-    excludes_singularity,
-    is_on_same_side,
-    leg_scale,
-)
 from legcal.machine.model import (
     Machine,
     Pose,

@@ -28,14 +28,13 @@ from legcal.machine.classification import (
     leg_of,
     parallel,
 )
-from legcal.machine.closing import MAX_POSE_ERROR
-from legcal.machine.cylinders import (
-    at_visible_heights,
-    with_arms,
-    with_cylinders,
-    with_mesh_cylinders,
+from legcal.machine.closing import (
+    CONFIGURATIONS,
+    MAX_POSE_ERROR,
+    generic_configurations,
+    mobility,
+    motor_rank,
 )
-from legcal.machine.diagnostics import mechanism_notes, proposal_notes
 from legcal.machine.equations import (
     constraints_at,
     leg_equations,
@@ -44,6 +43,7 @@ from legcal.machine.equations import (
 from legcal.machine.files import LegcalBlock, MechanismFile
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
+from legcal.machine.inspection import mechanism_notes, proposal_notes
 from legcal.machine.leg import (
     MAX_LEGS,
     MAX_LENGTH,
@@ -55,17 +55,19 @@ from legcal.machine.leg import (
     LegChain,
     redirected,
 )
-from legcal.machine.mobility import (
-    CONFIGURATIONS,
-    generic_configurations,
-    mobility,
-    motor_rank,
-)
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
-from legcal.machine.occluders import occluders_of, visual_solids, with_covers
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import reading_of_rod, rod_mode
+from legcal.machine.shapes import (
+    at_visible_heights,
+    occluders_of,
+    visual_solids,
+    with_arms,
+    with_covers,
+    with_cylinders,
+    with_mesh_cylinders,
+)
 from legcal.machine.spanning_tree import Source, reference_poses
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
@@ -578,10 +580,10 @@ def _where(*, spatial: bool) -> str:
 def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
     """Refuse a machine of arms with parallel axes, such as a five-bar or a 3-RRR."""
     moving = [joint for joint in urdf.joints.values() if joint.moves and joint.type not in VIRTUAL]
+    if len(moving) < 2 or any(joint.type == "prismatic" for joint in moving):
+        return
     poses = reference_poses(urdf)
     axes = [poses[joint.child].rotation.apply(joint.axis) for joint in moving]
-    if len(axes) < 2 or any(joint.type == "prismatic" for joint in moving):
-        return
     if all(parallel(axes[0], axis) for axis in axes):
         raise _plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path)
 

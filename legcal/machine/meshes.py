@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
+from legcal.geometry.motions import matrix_applied
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.urdf import number_list
+from legcal.machine.urdf import origins_of
 
 
 def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]:
@@ -19,18 +20,29 @@ def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]
 
     Raises ValueError if the file holds no mesh.
     """
-    return _loaded(urdf_path, _alone(visual))
+    vertices, faces = mesh_of_file(urdf_path, visual)
+    return matrix_applied(origins_of([visual])[0], vertices), faces
+
+
+def mesh_of_file(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]:
+    """Return a mesh as :func:`read_mesh`, with its corners in the frame of its file."""
+    shape = visual.find("geometry/mesh")
+    stated = [] if shape is None else [(str(k), str(v)) for k, v in shape.attrib.items()]
+    return _loaded(urdf_path, tuple(stated))
 
 
 @lru_cache(maxsize=512)  # a CAD export has hundreds, which are read for each part of a model
-def _loaded(urdf_path: Path, alone: bytes) -> tuple[Array, IntArray]:
-    """Return corners and triangles from the scene of yourdfpy of a URDF with one visual."""
+def _loaded(urdf_path: Path, shape: tuple[tuple[str, str], ...]) -> tuple[Array, IntArray]:
+    """Return corners and triangles from the scene of yourdfpy of a URDF with one ``<mesh>``."""
     from yourdfpy import URDF  # half a second: imported only for meshes
 
-    name = etree.fromstring(alone).find("link/visual/geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+    robot = etree.Element("robot", {"name": "visual"})
+    visual = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
+    etree.SubElement(etree.SubElement(visual, "geometry"), "mesh", dict(shape))
+    name = dict(shape).get("filename", "")
     try:
         scene: Any = URDF.load(
-            io.BytesIO(alone),
+            io.BytesIO(etree.tostring(robot)),
             filename_handler=lambda fname: str(mesh_file(urdf_path, fname)),
         ).scene
         mesh = scene.to_geometry()
@@ -47,22 +59,6 @@ def _loaded(urdf_path: Path, alone: bytes) -> tuple[Array, IntArray]:
         )
     vertices.flags.writeable = False
     return vertices, faces.astype(np.intp)
-
-
-def _alone(visual: etree._Element) -> bytes:
-    """Return a URDF of one link with the shape and the pose of a visual, and nothing else."""
-    robot = etree.Element("robot", {"name": "visual"})
-    shown = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
-    origin = visual.find("origin")
-    place = {}
-    for key in ("xyz", "rpy"):
-        numbers = None if origin is None else number_list(origin.get(key, ""), 3)
-        place[key] = " ".join(repr(x) for x in numbers or (0.0, 0.0, 0.0))
-    etree.SubElement(shown, "origin", place)
-    shape = visual.find("geometry")[0]  # type: ignore[index]
-    geometry = etree.SubElement(shown, "geometry")
-    etree.SubElement(geometry, str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
-    return etree.tostring(robot)
 
 
 def mesh_file(urdf_path: Path, name: str) -> Path | None:

@@ -30,6 +30,8 @@ _STRAIGHT = 1e-9  # bend that counts as straight, relative to the squared size
 _EDGE, _HEAD, _LINE = 46.0, 44.0, 15.0  # margin, title, text line [px]
 _ARM = 34.0  # length of the axis of a frame [px]
 _APART = 15.0  # smallest distance of the names of marks [px]
+_NAME = np.array([18.0, 11.0])  # least distances of names in a row and in a column [px]
+_STEP, _MOST_STEPS = 6.0, 8  # [px] to the next place that is tried for a name
 _LETTER = 6.6  # width of a letter of the legend [px], at most on average
 _MARK = b"<!-- legcal inspect -->"
 
@@ -181,13 +183,15 @@ def draw_machine(
         for leg, a, b in zip(machine.legs, on_paper(A), on_paper(B), strict=True):
             radius = max([c.radius for c in leg.cylinders], default=0.0)
             canvas.segment(a, b, LEG_COLOUR, max(2.0 * scale * radius, 1.5), 0.7)
+        names = _Names()
         for end, joints, colour in (("base", A, BASE_COLOUR), ("platform", B, PLATFORM_COLOUR)):
-            _joints(canvas, machine, end, on_paper(joints), colour, is_plan=is_plan)
+            _joints(canvas, machine, end, on_paper(joints), colour, names, is_plan=is_plan)
         frames = {"R_b": machine.T_base_Rb, "R_e": machine.home * machine.T_platform_Re}
         for name, T in frames.items():
             tips = np.vstack([np.zeros(3), _ARM / scale * np.eye(3)])
-            _frame(canvas, name, on_paper(T.apply(tips)))
-        _draw_marks(canvas, [(m, on_paper(m.points)) for m in marks if is_plan or not m.only_plan])
+            _frame(canvas, name, on_paper(T.apply(tips)), names)
+        shown = [(m, on_paper(m.points)) for m in marks if is_plan or not m.only_plan]
+        _draw_marks(canvas, shown, names)
     step = _round_length(100.0 / scale)
     canvas.line(12.0, foot, 12.0 + step * scale, foot, BASE_COLOUR, 2.0)
     canvas.text(18.0 + step * scale, foot + 4.0, f"{1e3 * step:g} mm")
@@ -198,15 +202,32 @@ def draw_machine(
     return canvas
 
 
-def _draw_marks(canvas: Canvas, marks: Sequence[tuple[Mark, Array]]) -> None:
-    """Draw marks at points (n, 2), and their names but for those over another name."""
+class _Names:
+    """The places of short names in a drawing, none over another one."""
+
+    def __init__(self) -> None:
+        self._taken: list[Array] = []
+
+    def place(self, at: Array, away: Array) -> Array:
+        """Return the first free place (2,) for a name, from a place on in a direction."""
+        steps = (at + k * _STEP * away for k in range(_MOST_STEPS))
+        place = next((p for p in steps if all(np.any(abs(p - q) > _NAME) for q in self._taken)), at)
+        self._taken.append(place)
+        return place
+
+
+def _draw_marks(canvas: Canvas, marks: Sequence[tuple[Mark, Array]], names: _Names) -> None:
+    """Draw marks at points (n, 2), and their names but for those over the name of another mark."""
     named: list[Array] = []
     for mark, points in marks:
         canvas.path(points, mark.colour, mark.width)
         at = points[mark.name_at]
         if mark.name and all(np.linalg.norm(at - other) > _APART for other in named):
             named.append(at)
-            canvas.text(at[0] + 5.0, at[1] - 5.0, mark.name, colour=mark.colour, size=11)
+            half = 3.0 * len(mark.name)  # names of joints are placed by their middles
+            beside, up = np.array([5.0 + half, -5.0]), np.array([0.0, -1.0])
+            x, y = names.place(at + beside, up)
+            canvas.text(x - half, y, mark.name, colour=mark.colour, size=11)
 
 
 def _outline(joints: Array, colour: str) -> str:
@@ -219,7 +240,14 @@ def _outline(joints: Array, colour: str) -> str:
 
 
 def _joints(
-    canvas: Canvas, machine: Machine, end: str, joints: Array, colour: str, *, is_plan: bool
+    canvas: Canvas,
+    machine: Machine,
+    end: str,
+    joints: Array,
+    colour: str,
+    names: _Names,
+    *,
+    is_plan: bool,
 ) -> None:
     """Draw discs with numbers and names, with a ring if they define the frames."""
     middle = joints.mean(axis=0)
@@ -237,8 +265,8 @@ def _joints(
             )
         away = np.array([x, y]) - middle if is_plan else np.array([0.0, 1.0])
         away = away / max(float(np.linalg.norm(away)), 1e-9) * sign
-        at = (x + 17.0 * away[0], y + 17.0 * away[1] + 4.0)
-        canvas.text(*at, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
+        x, y = names.place(np.array([x, y + 4.0]) + 17.0 * away, away)
+        canvas.text(x, y, f"{joint_letter(end)}{j + 1}", colour=colour, anchor="middle")
 
 
 def joint_letter(end: str) -> str:
@@ -246,15 +274,16 @@ def joint_letter(end: str) -> str:
     return "A" if end == "base" else "B"
 
 
-def _frame(canvas: Canvas, name: str, points: Array) -> None:
+def _frame(canvas: Canvas, name: str, points: Array, names: _Names) -> None:
     """Draw the axes of a frame: its origin and the ends of x, y and z."""
     for axis, (end, colour) in enumerate(zip(points[1:], AXIS_COLOURS, strict=True)):
         if np.linalg.norm(end - points[0]) < 3.0:  # towards the viewer
             continue
         canvas.segment(points[0], end, colour, 2.0)
-        x, y = points[0] + 1.2 * (end - points[0])
+        along = (end - points[0]) / np.linalg.norm(end - points[0])
+        x, y = names.place(points[0] + 1.2 * (end - points[0]) - np.array([0.0, 2.0]), along)
         letter = f"{name} {'xyz'[axis]}" if axis == 0 else "xyz"[axis]
-        canvas.text(x, y - 2.0, letter, colour=colour, anchor="middle", size=11)
+        canvas.text(x, y, letter, colour=colour, anchor="middle", size=11)
 
 
 def _legend(machine: Machine, width: float) -> list[str]:

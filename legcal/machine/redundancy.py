@@ -6,14 +6,14 @@ of this residual for a correct reading, the root of its redundancy (Baarda's dat
 largest test of a pose identifies the wrong reading, unless another one explains as much.
 
 With a nominal model even correct readings contradict each other, because the joints of the model
-are inexact. Errors of joints, lengths and axes are the same at all poses, which distinguishes them
-from wrong readings: they are estimated from the readings, with a prior.
+are inexact: its parameters have a prior here. Smaller errors of readings are found by the fit,
+which knows the model better.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.causes import Cause
 from legcal.geometry.motions import components
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.closing import solve_poses
 from legcal.machine.equations import equations_at, equations_at_readings, freedoms
 from legcal.machine.model import Machine, readings_at, slider_columns
@@ -37,7 +37,6 @@ MIN_REDUNDANCY = 1e-3  # least redundancy of a reading that can be tested
 _MODEL = 0.005  # standard deviation of a nominal model, relative to the mean leg length
 _DEPENDENT = 1e-7  # singular value of dependent equations, relative to the largest
 _AT_REST = 2.5e-6  # last step of a converged pose [mean leg lengths, rad]
-_ROUNDS = 20  # largest number of poses with contradicting readings that are set aside
 _SAYS = 1e-6  # least redundancy of a reading that may explain a contradiction
 _OF_MEDIAN = 0.6745  # median of absolute values, relative to the standard deviation
 
@@ -123,48 +122,39 @@ def contradictions(
     if not machine.is_redundant or len(readings) == 0:
         return {}
     R, t = components(T_Rb_Re)
+    rough = ROUGH_READING * machine.size
     unit = np.array([machine.legs[j].reading_of(1.0) for j in machine.motors])  # reading per metre
-    surplus = _Surplus.of(machine, R, t, readings)
-    sigma_m = np.maximum(np.zeros(len(unit)) if sigma is None else sigma / unit, surplus.rough)
-    used, scale = np.ones(len(readings), dtype=np.bool_), 1.0
-    model = _fitted_model(surplus, sigma_m, used)
-    # One at a time, since a wrong reading distorts the model, so that others seem wrong.
-    for _ in range(min(_ROUNDS, len(used))):
-        tests = _tests(machine, surplus, sigma_m, model, used)
-        worst = int(tests.pose[np.argmax(tests.squared)])
-        others = used & (np.arange(len(used)) != worst)
-        by_others = _fitted_model(surplus, sigma_m, others)
-        scale = _tests(machine, surplus, sigma_m, by_others, others).scale
-        if not tests.squared.max() > (REJECTION * scale) ** 2:
-            break
-        used, model = others, by_others
-    if used.all():
+    sigma_m = np.maximum(np.zeros(len(unit)) if sigma is None else sigma / unit, rough)
+    chi2, r, redundancy = _tested(machine, R, t, readings, sigma_m)
+    tests = ReadingTests(
+        *_numbers(machine, np.arange(len(readings))), r.ravel(), redundancy.ravel()
+    )
+    suspected = np.unique(tests.pose[tests.squared > REJECTION**2])
+    if not len(suspected):
         return {}
     # A wrong reading shifts the pose of all readings: each is tested at the pose of the others. A
     # reading without which the pose is undetermined explains everything.
-    chi2, r, redundancy = _tested(surplus.at(~used), sigma_m, *model)
-    R, t, suspected = R[~used], t[~used], readings[~used]
+    chi2, r, redundancy = chi2[suspected], r[suspected], redundancy[suspected]
+    R, t, readings = R[suspected], t[suspected], readings[suspected]
     is_told = redundancy > 0.0
     off = np.where(is_told, r / np.where(is_told, redundancy, 1.0), 0.0)
     explained = np.where(is_told, chi2[:, None], 0.0)
     for i in range(len(unit)):
-        others = suspected.copy()
+        others = readings.copy()
         others[:, i] = np.nan
         lengthening = machine.sign * machine.at_readings(others)
         there = solve_poses(geometries(machine), machine.frame_legs, R, t, lengthening)
-        at = _Surplus.of(machine, there.R, there.t, suspected)
-        left, r_there, redundancy_there = (
-            x if x.ndim == 1 else x[:, i] for x in _tested(at, sigma_m, *model)
-        )
-        good = (redundancy_there > 0.0) & (there.size < _AT_REST)
-        redundancy[good, i] = redundancy_there[good]
-        off[good, i] = r_there[good] / redundancy_there[good]
-        explained[good, i] = np.maximum(chi2 - left + redundancy_there * off[:, i] ** 2, 0.0)[good]
+        left, r_there, redundancy_there = _tested(machine, there.R, there.t, readings, sigma_m)
+        good = (redundancy_there[:, i] > 0.0) & (there.size < _AT_REST)
+        redundancy[good, i] = redundancy_there[good, i]
+        off[good, i] = r_there[good, i] / redundancy_there[good, i]
+        freed = chi2 - left + redundancy_there[:, i] * off[:, i] ** 2
+        explained[good, i] = np.maximum(freed, 0.0)[good]
     r = np.sqrt(explained * redundancy)
-    judged = ReadingTests(*_numbers(machine, ~used), r.ravel(), redundancy.ravel())
+    tests = ReadingTests(*_numbers(machine, suspected), r.ravel(), redundancy.ravel())
     by_pose = dict[int, Contradiction]()
-    for k, pose in enumerate(np.flatnonzero(~used).tolist()):
-        alike = [reading - k * len(unit) for reading in judged.of_pose(pose, REJECTION, scale)]
+    for k, pose in enumerate(suspected.tolist()):
+        alike = [reading - k * len(unit) for reading in tests.of_pose(pose, REJECTION, 1.0)]
         if not alike:
             continue
         distance = np.abs(off[k]) * sigma_m
@@ -174,115 +164,49 @@ def contradictions(
             tuple(machine.motors[motor] for motor in alike),
             float(off[k, i] * sigma_m[i] * unit[i]),
             tuple(distance[alike].tolist()),
-            float(REJECTION * scale * sigma_m[i] / np.sqrt(redundancy[k, i])),
+            float(REJECTION * sigma_m[i] / np.sqrt(redundancy[k, i])),
         )
     return by_pose
 
 
-def _numbers(machine: Machine, poses: BoolArray) -> tuple[IntArray, IntArray]:
+def _numbers(machine: Machine, poses: IntArray) -> tuple[IntArray, IntArray]:
     """Return pose and leg of every reading of some poses."""
-    chosen = np.flatnonzero(poses)
-    return np.repeat(chosen, len(machine.motors)), np.tile(machine.motors, len(chosen))
-
-
-def _tests(
-    machine: Machine,
-    surplus: _Surplus,
-    sigma_m: Array,
-    model: tuple[Array, Array],
-    used: BoolArray,
-) -> ReadingTests:
-    """Return the tests of the readings of poses, with a fitted model."""
-    _, r, redundancy = _tested(surplus, sigma_m, *model, used)
-    return ReadingTests(*_numbers(machine, used), r[used].ravel(), redundancy[used].ravel())
-
-
-@dataclass(frozen=True, eq=False)
-class _Surplus:
-    """The components of leg equations that no platform motion changes, s at each of k poses [m]."""
-
-    values: Array  # (k, s)
-    by_reading: Array  # (k, s, n_motors) derivative by joint motions due to readings [m]
-    by_model: Array  # (k, s, p) derivative by parameters in standard deviations
-    is_told: BoolArray  # (k, n_motors) readings that they contain
-    rough: float  # standard deviation of inexact equations [m]
-
-    @classmethod
-    def of(cls, machine: Machine, R: Array, t: Array, readings: Array) -> _Surplus:
-        """Return the components of a nominal model at poses R, t of R_e in R_b and readings."""
-        legs, motors = geometries(machine), machine.motors
-        lengthening = machine.sign * machine.at_readings(readings)
-        equations = equations_at_readings(legs, R, t, lengthening, by_local=True)
-        by_pose = equations.by_pose[:, :, list(freedoms(machine.frame_legs))]
-        left = np.linalg.svd(by_pose)[0][:, :, by_pose.shape[2] :]  # unchanged by motion
-        on, by_reading = actuator_index(legs), np.zeros((*equations.values.shape, len(motors)))
-        for i, j in enumerate(motors):
-            if on[j] >= 0:
-                by_reading[:, :, i] = equations.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
-            else:
-                by_reading[:, equations.measured & (equations.leg == j), i] = -legs[j].sign
-        parametrization = parametrization_of(machine)
-        length = machine.size
-        size = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
-        by_model = equations.by_parameters(parametrization) * (_MODEL * size)
-        values, reading_effects, of_model = (
-            np.einsum("kms,km...->ks...", left, x) for x in (equations.values, by_reading, by_model)
-        )
-        share = np.sum(reading_effects**2, axis=1) / np.maximum(
-            np.sum(by_reading**2, axis=1), 1e-300
-        )
-        return cls(values, reading_effects, of_model, share > _SAYS, ROUGH_READING * length)
-
-    def at(self, poses: BoolArray) -> _Surplus:
-        """Return the components of some poses."""
-        return replace(
-            self,
-            values=self.values[poses],
-            by_reading=self.by_reading[poses],
-            by_model=self.by_model[poses],
-            is_told=self.is_told[poses],
-        )
-
-    def information(self, sigma_m: Array) -> Array:
-        """Return the inverse covariance (k, s, s) for a correct model."""
-        moved = self.by_reading * sigma_m
-        rough = self.rough**2 * np.eye(self.values.shape[1])  # constraints are not exact either
-        return np.asarray(np.linalg.inv(moved @ np.swapaxes(moved, 1, 2) + rough))
-
-
-def _fitted_model(surplus: _Surplus, sigma_m: Array, used: BoolArray) -> tuple[Array, Array]:
-    """Return the errors of a model, estimated from some poses, and their covariance."""
-    subset = surplus.at(used)
-    weighted = np.swapaxes(subset.by_model, 1, 2) @ subset.information(sigma_m)
-    H = np.eye(subset.by_model.shape[2]) + np.einsum("kps,ksq->pq", weighted, subset.by_model)
-    covariance = np.linalg.inv(H)
-    return -covariance @ np.einsum("kps,ks->p", weighted, subset.values), covariance
+    return np.repeat(poses, len(machine.motors)), np.tile(machine.motors, len(poses))
 
 
 def _tested(
-    surplus: _Surplus,
-    sigma_m: Array,
-    model: Array,
-    covariance: Array,
-    used: BoolArray | None = None,
+    machine: Machine, R: Array, t: Array, readings: Array, sigma_m: Array
 ) -> tuple[Array, Array, Array]:
-    """Return chi2 (k,) of poses, and residuals and redundancies (k, n_motors) of their readings.
+    """Return chi2 (k,) of poses R, t of R_e in R_b, and r and redundancy (k, n_motors).
 
-    *used* are the poses from which the model was estimated; by default none of them.
+    They are of the components of the equations that no platform motion changes. A nominal model
+    is inexact: its parameters and equations have standard deviations beside the readings.
     """
-    e, P = surplus.values + surplus.by_model @ model, surplus.by_model
-    W = surplus.information(sigma_m)
-    spread = P @ covariance @ np.swapaxes(P, 1, 2)
-    apart = np.linalg.inv(np.linalg.inv(W) + spread)
-    if used is None:
-        Q, v = apart, (apart @ e[..., None])[..., 0]
-    else:  # residuals of a fit
-        Q = np.where(used[:, None, None], W - W @ spread @ W, apart)
-        v = np.where(used[:, None], (W @ e[..., None])[..., 0], (apart @ e[..., None])[..., 0])
-    by = surplus.by_reading
+    legs, motors = geometries(machine), machine.motors
+    lengthening = machine.sign * machine.at_readings(readings)
+    equations = equations_at_readings(legs, R, t, lengthening, by_local=True)
+    by_pose = equations.by_pose[:, :, list(freedoms(machine.frame_legs))]
+    left = np.linalg.svd(by_pose)[0][:, :, by_pose.shape[2] :]  # unchanged by motion
+    on, by_reading = actuator_index(legs), np.zeros((*equations.values.shape, len(motors)))
+    for i, j in enumerate(motors):
+        if on[j] >= 0:
+            by_reading[:, :, i] = equations.by_q[:, :, on[j]] * legs[j].reading_of(1.0)
+        else:
+            by_reading[:, equations.measured & (equations.leg == j), i] = -legs[j].sign
+    parametrization = parametrization_of(machine)
+    size = np.array([machine.size if unit == "m" else 1.0 for unit in parametrization.units])
+    of_model = equations.by_parameters(parametrization) * (_MODEL * size)
+    e, by, P = (
+        np.einsum("kms,km...->ks...", left, x) for x in (equations.values, by_reading, of_model)
+    )
+    share = np.sum(by**2, axis=1) / np.maximum(np.sum(by_reading**2, axis=1), 1e-300)
+    moved, rough = by * sigma_m, (ROUGH_READING * machine.size) ** 2 * np.eye(e.shape[1])
+    spread = moved @ np.swapaxes(moved, 1, 2) + P @ np.swapaxes(P, 1, 2) + rough
+    information = np.linalg.inv(spread)
+    v = (information @ e[..., None])[..., 0]
     r = sigma_m * np.einsum("ksn,ks->kn", by, v)
-    redundancy = sigma_m**2 * np.einsum("ksn,kst,ktn->kn", by, Q, by)
-    return np.einsum("ks,ks->k", e, v), r, np.where(surplus.is_told, redundancy, 0.0)
+    redundancy = sigma_m**2 * np.einsum("ksn,kst,ktn->kn", by, information, by)
+    return np.einsum("ks,ks->k", e, v), r, np.where(share > _SAYS, redundancy, 0.0)
 
 
 def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Models of other formats, converted to a tree with pairs of coincident frames.
+"""Trees with loops: models of other formats, converted to pairs of coincident frames; URDF loops.
 
 All readers return a :class:`Source`; :class:`UrdfBuilder` writes the URDF of the tree. A joint that
 closes a loop (:class:`Loop`) is converted to a pair of frames: a point to a ``3d`` pair, a weld to
@@ -6,24 +6,35 @@ a ``6d`` pair, a revolute or universal joint to one or two revolute joints with 
 welded to the other side.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from math import pi
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
+from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
 from legcal.machine.chain import Closure
 from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import (
+    LOOP_TAGS,
+    URDF_LOOPS,
+    Urdf,
+    XmlProblems,
+    checked_tree,
+    number_list,
+    parse_robot,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,3 +355,202 @@ def _across(axis: Array, direction: Array) -> Array:
 def _columns(x: Array, y: Array, z: Array) -> Rotation:
     """Return the rotation whose columns are three perpendicular unit vectors."""
     return Rotation.from_matrix(np.column_stack([x, y, z]))
+
+
+_CLOSING = re.compile(r"closing_(.+)_([12])")
+KINDS: dict[str, LoopKind] = {
+    **dict.fromkeys(("spherical", "ball", "point"), "point"),
+    **dict.fromkeys(("fixed", "weld"), "weld"),
+    **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
+    "universal": "universal",
+}
+
+
+def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
+    """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot."""
+    ends: dict[str, dict[str, str]] = {}
+    for element in robot.findall("link"):
+        match = _CLOSING.fullmatch(element.get("name", ""))
+        if match:
+            ends.setdefault(match[1], {})[match[2]] = match[0]
+    for name, numbers in ends.items():
+        if len(numbers) == 1:
+            (number, link) = next(iter(numbers.items()))
+            raise ModelError(
+                "the loops could not be closed",
+                f"the frame '{link}' and no 'closing_{name}_{3 - int(number)}'",
+                "both ends of each loop",
+                f"export the model again with both parts of the mate closing_{name}, or "
+                f"remove '{link}'",
+                path,
+            )
+    return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
+
+
+def read_loop_source(path: Path, content: bytes) -> Source:
+    """Return the mechanism of a URDF with loops: elements of its own, or pairs of closing frames.
+
+    Motors are the prismatic joints named in ``<transmission>`` or ``<ros2_control>``, or all
+    prismatic joints if none is named.
+    """
+    robot = parse_robot(path, content)
+    problems = XmlProblems(path)
+    elements = [element for element in robot if element.tag in LOOP_TAGS]
+    bare = checked_tree(robot, path, content, problems, travel_needed=False)
+    loops = _loops(elements, bare, problems)
+    motors, notes = _motors(robot, bare, problems)
+    problems.raise_if_any()
+    for element in elements:
+        robot.remove(element)
+    poses = reference_poses(bare)
+    text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
+    pairs, kinds = close_loops(loops, text, poses, path)
+    for line in filter(None, text.body().split("\n")):
+        robot.append(etree.fromstring(line))
+        robot[-1].tail = "\n"
+    named = closing_frames(robot, path)
+    if named:
+        kinds.extend("3d" for _ in named)
+        notes.append(
+            f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
+            "joints."
+        )
+    file = MechanismFile(
+        closed_loop=[*pairs, *named],
+        type=kinds,
+        name_mot=motors,
+    )
+    return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))
+
+
+def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
+    """Return the valid loops of a URDF, and note the problems of the others."""
+    loops = []
+    problems.check_unique(elements)
+    for i, element in enumerate(elements, start=1):
+        n_before = len(problems)
+        name = element.get("name", "").strip() or f"{element.tag}_{i}"
+        kind = element.get("type", "").strip().lower()
+        if kind not in KINDS:
+            problems.at(
+                element,
+                f"closes a loop with the type '{element.get('type', '')}', needed one of "
+                f"{', '.join(KINDS)}",
+                "cut the loop at another joint",
+            )
+            continue
+        ends = _ends(element, urdf, problems)
+        axes = _axes(element, KINDS[kind], problems)
+        if len(problems) > n_before or ends is None:
+            continue
+        (link_1, T_1), (link_2, T_2) = ends
+        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
+    return loops
+
+
+def _ends(
+    element: etree._Element, urdf: Urdf, problems: XmlProblems
+) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
+    """Return the links of a loop and its frame in each, or None after noting problems."""
+    sides = [part for part in element if part.tag in ("link1", "link2")]
+    origins: list[etree._Element | None] = [
+        part if part.find("origin") is None else part.find("origin") for part in sides
+    ]
+    if not sides:
+        sides = [part for tag in ("parent", "child") for part in element.findall(tag)]
+        origins = [element.find(f"{part.tag}_origin") for part in sides]
+    if len(sides) != 2:
+        problems.at(
+            element,
+            f"names {len(sides)} links, needed two",
+            "write <link1 link=...> and <link2 link=...>, or <parent ...> and <child ...>",
+        )
+        return None
+    n_before = len(problems)
+    links = [side.get("link", "") for side in sides]
+    for link in links:
+        if link not in urdf.links:
+            problems.at(
+                element, f"names the link '{link}', which is not in the file",
+                closest(link, urdf.links).rstrip("."),
+            )  # fmt: skip
+    if links[0] == links[1]:
+        problems.at(element, f"joins the link '{links[0]}' to itself", "name two links")
+    poses = [_pose(element, origin, problems) for origin in origins]
+    if len(problems) > n_before:
+        return None
+    return (links[0], poses[0]), (links[1], poses[1])
+
+
+def _pose(
+    element: etree._Element, origin: etree._Element | None, problems: XmlProblems
+) -> RigidTransform:
+    """Return the motion of ``xyz`` and ``rpy``, zero by default."""
+    xyz, rpy = (_three(element, origin, key, problems) for key in ("xyz", "rpy"))
+    return RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy))
+
+
+def _three(
+    element: etree._Element, part: etree._Element | None, key: str, problems: XmlProblems
+) -> Array:
+    """Return three numbers of an element of a loop; zero by default."""
+    text = None if part is None else part.get(key)
+    numbers = [0.0] * 3 if text is None else number_list(text, 3)
+    if numbers is None:
+        problems.at(
+            element, f"has {key}={str(text)[:60]!r}, needed 3 finite numbers", "correct the value"
+        )
+    return np.array(numbers or [0.0] * 3)
+
+
+def _axes(element: etree._Element, kind: LoopKind, problems: XmlProblems) -> tuple[Array, Array]:
+    """Return the unit axes of a loop in its two frames; the URDF default is x."""
+    x = np.array([1.0, 0.0, 0.0])
+    if kind not in ("revolute", "universal"):
+        return x, x
+    common = element.find("axis")
+    if common is not None and common.get("frame") is not None:
+        problems.at(
+            element,
+            f"gives its axis in the frame '{common.get('frame')}' alone, needed it in both",
+            "give both frames with rpy so that the axis is the same in them",
+        )
+    parts = [element.find(f"{side}_axis") for side in ("parent", "child")]
+    if kind == "universal" and None in parts:
+        problems.at(
+            element,
+            "is universal and has not two axes",
+            "write <parent_axis xyz=...> and <child_axis xyz=...>",
+        )
+    axes = []
+    for part in parts:
+        given = common if part is None else part
+        axis = x if given is None else _three(element, given, "xyz", problems)
+        norm = float(np.linalg.norm(axis))
+        if norm < 1e-9 and not problems:
+            problems.at(element, "has a zero axis, needed a direction", "correct its xyz")
+        axes.append(axis / max(norm, 1e-9))
+    return axes[0], axes[1]
+
+
+def _motors(
+    robot: etree._Element, urdf: Urdf, problems: XmlProblems
+) -> tuple[list[str], list[str]]:
+    """Return the joints with an encoder, and notes about them."""
+    named = [e for e in robot.iterfind("transmission/joint") if e.get("name") is not None]
+    named += [e for e in robot.iterfind("ros2_control/joint") if e.get("name") is not None]
+    for element in named:
+        if element.get("name") not in urdf.joints:
+            problems.at(
+                element,
+                "names no joint of the file",
+                closest(str(element.get("name")), urdf.joints).rstrip("."),
+            )
+    motors = list(dict.fromkeys(str(e.get("name")) for e in named))
+    if motors:
+        return motors, []
+    sliders = [joint.name for joint in urdf.joints.values() if joint.type == "prismatic"]
+    return sliders, [
+        f"The file names no motors: all {len(sliders)} prismatic joints were taken as motors; "
+        "name the motors in <transmission> elements if some are not."
+    ] * bool(sliders)

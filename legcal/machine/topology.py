@@ -645,9 +645,8 @@ def _platform_body(
     raise OutOfClass(
         "this mechanism is not supported",
         "one closed chain in which no link is a platform on legs, because on "
-        "each side of any link more than a slider or a rod moves the joint at A; "
-        "needed legs of type joint, slider or rod, joint",
-        "",
+        "each side of any link more than a slider or a rod moves the joint at A",
+        "legs of type joint, slider or rod, joint",
         "this machine cannot be calibrated with legcal",
         path,
     )

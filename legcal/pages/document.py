@@ -62,11 +62,19 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Step:
+    """A thing to do, with a command to copy."""
+
+    what: str
+    command: str = ""
+
+
+@dataclass(frozen=True)
 class Items:
     """A list."""
 
     kind: ClassVar = "items"
-    items: Sequence[str]
+    items: Sequence[str | Step]
     ordered: bool = False
     title: str = ""
 
@@ -235,6 +243,14 @@ class LandmarkEditor:
 
 
 @dataclass(frozen=True)
+class Dialogue:
+    """What a running command asks and says, with a field for answers; the page is served."""
+
+    kind: ClassVar = "dialogue"
+    token: str  # identifies the page to its server
+
+
+@dataclass(frozen=True)
 class Section:
     """A section."""
 
@@ -270,7 +286,12 @@ def number(value: float | None, digits: int, *, signed: bool = False) -> Number:
     return Number(float(value), f"{value:{'+' if signed else ''}z.{digits}f}")
 
 
-_SCRIPTS = {Scene: "scene.js", OutlineEditor: "editor.js", LandmarkEditor: "landmarks.js"}
+_SCRIPTS = {
+    Scene: "scene.js",
+    OutlineEditor: "editor.js",
+    LandmarkEditor: "landmarks.js",
+    Dialogue: "dialogue.js",
+}
 
 
 def time_of_page() -> str:
@@ -303,7 +324,9 @@ def page_html(page: Page) -> str:
                     if any(isinstance(block, kind) for block in blocks)
                 ),
             ],
-            served=any(isinstance(block, LandmarkEditor) and block.token for block in blocks),
+            served=any(
+                isinstance(block, LandmarkEditor | Dialogue) and block.token for block in blocks
+            ),
             pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
         )
     )

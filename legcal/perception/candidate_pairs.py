@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
-from legcal.perception.light import Samples, reduce
+from legcal.perception.profiles import Samples
 from legcal.perception.tuning import EDGE_LENGTH, EDGE_SLOPE
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey
+from legcal.vision.image_file import Grey, shrink
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
@@ -125,7 +125,7 @@ def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
 def find_segments(grey: Grey, camera: Camera) -> EdgeSegments:
     """Return the straight edges of a picture, which is reduced if it is large."""
     factor = reduction(camera, 1.0)
-    return segments_of_reduced(reduce(grey, factor), camera, factor)
+    return segments_of_reduced(shrink(grey, factor), camera, factor)
 
 
 def segments_of_reduced(

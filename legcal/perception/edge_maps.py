@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from legcal.geometry.types import Array, Image
-from legcal.perception.light import Samples
 from legcal.perception.pair_matching import CameraPoses, Pictures, projected
+from legcal.perception.profiles import Samples
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 

@@ -14,8 +14,7 @@ import numpy as np
 from legcal.causes import Cause
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.perception.light import reduce
-from legcal.vision.image_file import Grey
+from legcal.vision.image_file import Grey, shrink
 
 BLACK, WHITE = 8.0, 247.0  # bounds of nearly all pixels of an unusable image [grey levels]
 BRIGHTEST = 254.5  # [grey levels]
@@ -73,8 +72,8 @@ class Exposure:
 
 def measure_exposure(grey: Grey) -> Exposure:
     """Return the range of grey levels and the blur of an image."""
-    half = reduce(grey, 2)
-    small = reduce(half, max(1, min(REDUCTION, min(grey.shape) // 16) // 2))
+    half = shrink(grey, 2)
+    small = shrink(half, max(1, min(REDUCTION, min(grey.shape) // 16) // 2))
     low, high = _tails(small)
     dark, bright = _tails(grey[::STRIDE, ::STRIDE])
     clipped = float(np.mean(grey[::STRIDE, ::STRIDE] >= BRIGHTEST))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.perception.light import Samples
+from legcal.perception.profiles import Samples
 from legcal.perception.tuning import EDGE_SCORE, RIVAL
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey

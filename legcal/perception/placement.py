@@ -21,8 +21,8 @@ from legcal.data.measurements import Measurements, few_views, image_notes
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
-from legcal.machine.occluders import LegHalf, Occluder
 from legcal.machine.rods import arms_at
+from legcal.machine.shapes import LegHalf, Occluder
 from legcal.perception.candidate_pairs import (
     CandidatePairs,
     Still,
@@ -32,12 +32,10 @@ from legcal.perception.candidate_pairs import (
     segments_of_reduced,
 )
 from legcal.perception.edge_maps import EdgeMaps
-from legcal.perception.light import reduce
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
-from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.perception.tuning import WINDOW_PX
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey
+from legcal.vision.image_file import Grey, shrink
 from legcal.vision.visibility import PredictedLeg, predict_legs
 
 Load = Callable[[int], Grey]  # the image of a row
@@ -83,7 +81,7 @@ class Search:
         """Return the edge pairs of an image as if the camera of a view had taken it."""
         if view == int(self.measurements.view[row]) and row in self.edge_pairs:
             return self.edge_pairs[row]
-        return self.pairs_of_reduced(reduce(self.load(row), self.reduction(view)), view)
+        return self.pairs_of_reduced(shrink(self.load(row), self.reduction(view)), view)
 
     def reduction(self, view: int) -> int:
         """Return the factor by which the pictures of a view are reduced."""
@@ -95,7 +93,7 @@ class Search:
         views = [int(self.measurements.view[row]) for row in rows]
         factors = [self.reduction(view) for view in views]
         cameras = [self.measurements.views[view].camera for view in views]
-        small = [reduce(self.load(row), f) for row, f in zip(rows, factors, strict=True)]
+        small = [shrink(self.load(row), f) for row, f in zip(rows, factors, strict=True)]
         moving = [
             moving_pixels(picture, self.still[view]) if view in self.still else None
             for picture, view in zip(small, views, strict=True)
@@ -122,10 +120,6 @@ class Search:
         """The cylinders by which each leg is recognised, with housings as such."""
         housings = housings_of_legs(self.occluders, self.n_legs)
         return [(*own, *around) for own, around in zip(self.cylinders, housings, strict=True)]
-
-    def retargeted(self, row: int, picture: Picture) -> Picture:
-        """Return the image with the legs predicted by other cylinders."""
-        return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
 def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cylinder]]:
@@ -240,7 +234,6 @@ class Placement:
     polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with polished surfaces
     # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
     moved: Array | None = None
-    radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, NotPlaced] = field(default_factory=dict)  # by the names of views
     notes: tuple[str, ...] = ()  # further notes
     # What is said of images that show little or nothing of the legs, by row: near a fit they may

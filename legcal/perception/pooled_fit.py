@@ -2,7 +2,7 @@
 
 The blocks of an outline share amplitudes that change slowly along it, a line, and a blur that is
 nearly that of the whole image; each block adds a little of its own, which is eliminated. A round of
-Gauss-Newton needs no pixel (:mod:`legcal.perception.pixel_sums`) as long as lines turn little.
+Gauss-Newton needs no pixel (:mod:`legcal.perception.profiles`) as long as lines turn little.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +14,6 @@ import numpy as np
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.blocks import Blocks
-from legcal.perception.light import Samples
 from legcal.perception.limb import (
     N_AMPLITUDES,
     N_POWERS,
@@ -24,9 +23,10 @@ from legcal.perception.limb import (
     powers,
     profile_functions,
 )
-from legcal.perception.pixel_sums import (
+from legcal.perception.profiles import (
     PixelBins,
     PixelSums,
+    Samples,
     applied,
     even_weights,
     medians,

@@ -8,7 +8,7 @@ outlines measured at the best poses decide.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -18,10 +18,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.causes import Cause
 from legcal.data.landmarks import LANDMARKS_NAME
-from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.leg import Cylinder, with_radii
 from legcal.perception.camera_search import (
     SOME_PICTURES,
     START_PICTURES,
@@ -35,7 +33,7 @@ from legcal.perception.camera_search import (
     place_near,
     with_first,
 )
-from legcal.perception.detection import measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture
 from legcal.perception.placement import (
     Group,
@@ -45,21 +43,10 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.radii import (
-    CONVERGED,
-    MAX_ITERATIONS,
-    MIN_CHANGE,
-    NO_RADIUS_FACTORS,
-    LegRadius,
-    RadiusFactors,
-    estimate_radii,
-)
 from legcal.perception.tuning import EVIDENCE_RATIO, JOINT_ERROR
 from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
-MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
-SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
@@ -88,8 +75,10 @@ def place_views(
     *,
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
-) -> PlacedViews:
-    """Return the poses at which the images of rows show most legs.
+) -> Placement:
+    """Return the cameras of views where the images of rows show most legs, and these legs.
+
+    Where pairs are ambiguous, outlines decide.
 
     ``hints`` are rough T_base_camera of views; those of views without images are kept. ``joined``
     are T_board_camera of views that know how they stand to each other by a board: they are placed
@@ -118,116 +107,43 @@ def place_views(
     of_left = [_ByEdges(groups[k], pictures, found[k]) for k in left]
     for k, one in zip(left, run(partial(_by_edges, search), of_left), strict=True):
         found[k] = one
-    placed = [one for one in found if one is not None]
-    return PlacedViews(search, hints, groups, pictures, placed)
+    candidates = [one for one in found if one is not None]
+    decide = partial(_decided_by_outlines, search, pictures)
+    placed = list(run(decide, list(zip(groups, candidates, strict=True))))
+    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
+        if group.is_placed and group.hint is not None and not one.is_convincing:
+            seen = group.pictures(pictures, [r for r in group.rows if r in pictures])
+            placed[g] = place_at(seen, group.hint, n_legs)
+    return _gathered(search, hints, groups, pictures, placed, run)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedViews:
-    """Views, what their images show, and the poses at which these show most legs.
-
-    It travels to worker processes.
-    """
-
-    search: Search
-    hints: Sequence[RigidTransform | None]  # T_base_camera of all views
-    groups: Sequence[Group]  # of views that are placed together
-    pictures: Mapping[int, Picture]  # by row
-    placed: Sequence[PoseCandidates]  # of each group
-
-    def recognised(self, run: Run = in_turn) -> Placement:
-        """Return the cameras of all views and the legs in their images."""
-        return self._decided(NO_RADIUS_FACTORS, run)
-
-    def with_other_radii(
-        self, suspects: Collection[LegRadius], run: Run = in_turn
-    ) -> Placement | None:
-        """Return the recognition with other radii of parts, by leg and radius [m]; None without.
-
-        Their outlines were not found with those of the model.
-        """
-        views, radii = _by_other_radii(self, suspects, run)
-        return views._decided(radii, run) if radii.factor else None
-
-    def _decided(self, radii: RadiusFactors, run: Run) -> Placement:
-        """Return the views together, by outlines where pairs are ambiguous."""
-        placed = list(run(self.decided_by_outlines, range(len(self.groups))))
-        for g, (group, one) in enumerate(zip(self.groups, placed, strict=True)):
-            if group.is_placed and group.hint is not None and not one.is_convincing:
-                seen = self.of_group(g, [r for r in group.rows if r in self.pictures])
-                placed[g] = place_at(seen, group.hint, self.search.n_legs)
-        return _gathered(replace(self, placed=placed), radii, run)
-
-    def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
-        """Return the images of a group, all of them or of some rows."""
-        group = self.groups[g]
-        return group.pictures(self.pictures, group.rows if rows is None else rows)
-
-    def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> PlacedViews:
-        """Return images with the legs predicted by other cylinders."""
-        search = replace(self.search, cylinders=cylinders)
-        pictures = {row: search.retargeted(row, one) for row, one in self.pictures.items()}
-        return replace(self, search=search, pictures=pictures)
-
-    def placed_anywhere(self, which: Sequence[int], run: Run) -> PlacedViews:
-        """Return some groups placed anew, by all of their pictures."""
-        placed = list(self.placed)
-        of_groups = [self.of_group(g) for g in which]
-        anywhere = _anywhere(of_groups, self.search.n_legs, START_PICTURES, run)
-        for g, one in zip(which, anywhere, strict=True):
-            placed[g] = one
-        return replace(self, placed=placed)
-
-    def placed_again(self, run: Run) -> PlacedViews:
-        """Return the groups placed near where they were, or anywhere if they were not."""
-        views = self.placed_anywhere(
-            [g for g, one in enumerate(self.placed) if not one.is_convincing], run
-        )
-        placed = list(views.placed)
-        for g, one in enumerate(self.placed):
-            if one.is_convincing:
-                some = self.of_group(g, self.groups[g].some)
-                near = place_near(some, one.pose(), self.search.n_legs)
-                placed[g] = near if near.is_convincing else one
-        return replace(views, placed=placed)
-
-    def for_radii(self) -> Iterator[tuple[int, list[Picture], CameraPoses]]:
-        """Return a few pictures of each group that was placed, one of each pose."""
-        for g, (group, one) in enumerate(zip(self.groups, self.placed, strict=True)):
-            if one.is_convincing:
-                rows = one_of_each_pose(self.search.measurements, group.some)
-                yield g, self.of_group(g, rows), one.poses
-
-    @property
-    def support(self) -> float:
-        """Number of legs that agree in an image, over all placed groups."""
-        return sum(float(one.support[0].mean()) for one in self.placed if one.is_convincing)
-
-    def decided_by_outlines(self, g: int) -> PoseCandidates:
-        """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
-        group, candidates = self.groups[g], self.placed[g]
-        near = candidates.hinted and candidates.is_convincing
-        n = len(candidates.poses)
-        if n == 0 or near or candidates.is_clear:
-            return candidates
-        search, few = self.search, replace(group, rows=group.some)
-        trials = [_measure_at(search, few, candidates, 0)]
-        if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
-            trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
-            if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
-                by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
-                for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
-                    one = trials[i]
-                    if one.fit is not None:
-                        again = refine_views(search, [few], one.placement, one.outlines)
-                        trials[i] = _Trial(again[0], again[1], again[2][0])
-        best = _best(trials)
-        fit = trials[best].fit
-        if fit is None or not _is_decided(trials, candidates, few):
-            return replace(candidates, by_outlines=False)
-        pose = CameraPoses.one(fit.T_base_group, fit.shift)
-        of_group = self.of_group(g, [r for r in group.rows if r in self.pictures])
-        return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
+def _decided_by_outlines(
+    search: Search, pictures: Mapping[int, Picture], task: tuple[Group, PoseCandidates]
+) -> PoseCandidates:
+    """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
+    group, candidates = task
+    near = candidates.hinted and candidates.is_convincing
+    n = len(candidates.poses)
+    if n == 0 or near or candidates.is_clear:
+        return candidates
+    few = replace(group, rows=group.some)
+    trials = [_measure_at(search, few, candidates, 0)]
+    if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
+        trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
+        if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
+            by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
+            for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
+                one = trials[i]
+                if one.fit is not None:
+                    again = refine_views(search, [few], one.placement, one.outlines)
+                    trials[i] = _Trial(again[0], again[1], again[2][0])
+    best = _best(trials)
+    fit = trials[best].fit
+    if fit is None or not _is_decided(trials, candidates, few):
+        return replace(candidates, by_outlines=False)
+    pose = CameraPoses.one(fit.T_base_group, fit.shift)
+    of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
+    return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
 def _pictures(
@@ -286,56 +202,6 @@ def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
         return anywhere
     mean = [float(candidates.support[0].mean()) for candidates in (near, anywhere)]
     return anywhere if mean[1] > 1.1 * mean[0] else near
-
-
-def _by_other_radii(
-    views: PlacedViews, suspects: Collection[LegRadius], run: Run
-) -> tuple[PlacedViews, RadiusFactors]:
-    """Return the views by the radii that images show of suspect parts, corrected in turns."""
-    as_given, given = views, views.search.cylinders
-    radii = step = _first_radii(views, run).only(suspects)
-    for _ in range(MAX_ITERATIONS):
-        if not step.factor:
-            break
-        views = views.by_cylinders(with_radii(given, radii.corrected)).placed_again(run)
-        few = views.for_radii()
-        step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
-        radii = radii.then(step)
-    if radii.common and views.support < MIN_RADII_GAIN * as_given.support:
-        return as_given, NO_RADIUS_FACTORS  # the scale is not known well
-    lasting = radii.beyond(MIN_CHANGE)  # corrections may lead back to the model
-    if len(lasting.factor) < len(radii.factor):
-        views = views.by_cylinders(with_radii(given, lasting.corrected))
-    return views, lasting
-
-
-def _first_radii(views: PlacedViews, run: Run) -> RadiusFactors:
-    """Return the radii that the images contradict, as far as the views can be placed."""
-    if any(one.is_convincing for one in views.placed):
-        return estimate_radii(views.for_radii())
-
-    def scaled(factor: float) -> PlacedViews:
-        cylinders = with_radii(views.search.cylinders, lambda _, c: factor * c.radius)
-        return views.by_cylinders(cylinders)
-
-    others = views
-    for factor in SCALED:
-        others = scaled(factor).placed_anywhere(range(len(views.groups)), run)
-        if any(one.is_clear for one in others.placed):
-            break
-    return estimate_radii(replace(views, placed=others.placed).for_radii())
-
-
-def one_of_each_pose(measurements: Measurements, rows: Sequence[int]) -> list[int]:
-    """Return the first of the rows of each view and pose, in their order.
-
-    Light and shade lie alike on a leg in all images of one pose: they agree on a wrong radius.
-    """
-    same = zip(measurements.view[rows].tolist(), measurements.pose[rows].tolist(), strict=True)
-    first: dict[tuple[int, int], int] = {}
-    for row, key in zip(rows, same, strict=True):
-        first.setdefault(key, row)
-    return list(first.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,23 +281,30 @@ def _gap(one: Array, other: Array) -> float:
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))
 
 
-def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
+def _gathered(
+    search: Search,
+    hints: Sequence[RigidTransform | None],
+    groups: Sequence[Group],
+    pictures: Mapping[int, Picture],
+    placed: Sequence[PoseCandidates],
+    run: Run,
+) -> Placement:
     """Assemble the placement of all views, with the causes of unplaced ones."""
-    search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
-    T, unplaced = list(found.hints), dict[str, NotPlaced]()
+    T, unplaced = list(hints), dict[str, NotPlaced]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
     error: Array = np.full((len(views), search.n_legs), JOINT_ERROR)
     unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
     flipped = []
     for g in unclear:  # those pictures by which it was placed, with left and right exchanged
         few = placed[g].hinted and placed[g].support.shape[1] == len(groups[g].some)
-        flipped.append(mirrored(found.of_group(g, groups[g].some if few else None)))
+        rows = groups[g].some if few else groups[g].rows
+        flipped.append(mirrored(groups[g].pictures(pictures, rows)))
     mirrors = _anywhere(flipped, search.n_legs, MIRRORED_STARTS, run)
     exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(placed[g], m)}
     # Pairs say little of views that are placed by other edges.
     doubted = [g for g in sorted(exchanged) if placed[g].along_edges and placed[g].is_convincing]
-    others = [_ByEdges(groups[g], found.pictures, None, is_mirrored=True) for g in doubted]
+    others = [_ByEdges(groups[g], pictures, None, is_mirrored=True) for g in doubted]
     for g, other in zip(doubted, run(partial(_by_edges, search), others), strict=True):
         if other.along_edges < MIRRORED_EDGES * placed[g].along_edges:
             exchanged.remove(g)
@@ -448,7 +321,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
             error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, JOINT_ERROR)
-    placement = Placement(search.A_base, search.B_base, tuple(T), error, radii=radii)
+    placement = Placement(search.A_base, search.B_base, tuple(T), error)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 
 
@@ -473,7 +346,8 @@ def _why_not_placed(placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) 
             f"its camera could not be placed: no pose {where} explains its images: the best one "
             "matches {:.1f} of {:.0f} legs per image, and {:.1f} are needed; check that the images "
             "belong to this machine and to their readings, that they are not mirrored, the camera "
-            f"file, and the legs of the view if dataset.yaml lists them{clicked}.",
+            "file, the radii of the model, and the legs of the view if dataset.yaml lists them"
+            f"{clicked}.",
             (legs, n, float(placed.needed)),
         )
     if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):

@@ -22,8 +22,7 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.vision.board import Board, dictionary, facing_board
 from legcal.vision.camera import Camera
-from legcal.vision.sight import Bodies, behind_plate
-from legcal.vision.visibility import in_picture, rays_past_axes
+from legcal.vision.visibility import Bodies, behind_plate, in_picture, rays_past_axes
 
 _N_AZIMUTHS = 16  # directions around the machine
 _ELEVATIONS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine

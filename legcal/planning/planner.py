@@ -59,7 +59,7 @@ from legcal.planning.poses import (
 from legcal.planning.session import Plan, PlannedView, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
-from legcal.vision.sight import Bodies, Seen, visible_parts
+from legcal.vision.visibility import Bodies, Seen, visible_parts
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
@@ -187,6 +187,7 @@ class Scene:
         surely: bool = True,
         is_shot: bool = False,
         is_fit: bool = False,
+        found: BoolArray | None = None,  # (n_images, n_legs) legs whose outlines count
     ) -> Contributions | None:
         """Return the information of images at poses T_Rb_Re; None if they show nothing.
 
@@ -198,6 +199,8 @@ class Scene:
             return None
         predictor = self.task.predictor
         outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp), predictor.noise)
+        if found is not None:
+            outlines = outlines.choose(found[outlines.row, outlines.leg])
         view = np.zeros(n, dtype=np.intp)
         added = predictor.contributions(
             {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit

@@ -35,8 +35,7 @@ from legcal.planning.places import (
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.planning.session import Plan
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision.board import Board
-from legcal.vision.board_file import board_document, board_of, parse_board
+from legcal.vision.board import Board, board_document, board_of, parse_board
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
 from legcal.workers import Run, Workers, worker_pool
@@ -160,7 +159,7 @@ def plan(
     predicted_noise = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
     choices, scale_notes = Choices.by_tolerances(machine, only), tuple[str, ...]()
     if only is None:
-        choices, scale_notes = _measured_length(machine, board=board is not None)
+        choices, scale_notes = measured_length(machine, board=board is not None)
     task = Task(
         Predictor(machine, selected_camera, predicted_noise, sigma_q, choices, sigma_by_joint),
         n_images,
@@ -183,7 +182,7 @@ def plan(
         return replace(result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(shot)))
 
 
-def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
+def measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
     """Assume a measured length where readings carry none; return it with a note."""
     rod_and_ends = machine.rod_for_scale(has_length=board)
     if rod_and_ends is None:

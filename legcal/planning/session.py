@@ -48,10 +48,10 @@ from legcal.machine.model_writer import write_model
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, LaidBoard, Setting
 from legcal.planning.poses import HOME
 from legcal.version import __version__
-from legcal.vision.board_file import board_document
+from legcal.vision.board import board_document
 from legcal.vision.camera import Camera
-from legcal.vision.camera_export import camera_info
-from legcal.vision.sight import Seen
+from legcal.vision.camera_file import camera_info
+from legcal.vision.visibility import Seen
 
 CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
 HAND = "hand"  # the view of a hand-held camera
@@ -127,7 +127,9 @@ def _dataset(plan: Plan, model: str) -> dict[str, str]:
         [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
         for name, image, label, v, k in images_of(plan)
     ]
-    board = {} if plan.board is None else {"board": board_document(plan.board.board)}
+    board: dict[str, Any] = (
+        {} if plan.board is None else {"board": board_document(plan.board.board)}
+    )
     return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), **board)
 
 
@@ -148,8 +150,9 @@ def dataset_texts(
     machine: Machine,
     model: str,  # path of its YAML in the dataset
     views: Mapping[str, Any],
-    rows: Iterable[Sequence[Any]],  # view, image, pose, readings
+    rows: Iterable[Sequence[Any]],  # of *columns* and readings
     encoder_sigma: float | dict[str, float],
+    columns: Sequence[str] = ("view", "image", "pose"),
     **blocks: Any,
 ) -> dict[str, str]:
     """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
@@ -163,7 +166,7 @@ def dataset_texts(
     }
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     joints = [column.name for column in reading_columns(machine.legs)]
-    table = format_table(["view", "image", "pose", *joints], rows)
+    table = format_table([*columns, *joints], rows)
     return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}
 
 

@@ -23,10 +23,11 @@ from legcal.vision.board import (
     BoardKind,
     FixedBoard,
     Link,
+    board_document,
     charuco_board,
     dictionary,
+    read_board_file,
 )
-from legcal.vision.board_file import board_document, read_board_file
 from legcal.vision.camera import Camera
 
 INK = 0.06  # reflectance of black, in units of white

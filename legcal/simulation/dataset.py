@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from legcal.brief import brief
-from legcal.data.axes import write_axis_table
 from legcal.data.corners import write_corners
-from legcal.data.dataset import AXES_NAME, CORNERS_NAME, OBSERVATIONS_NAME, PLAN_NAME
+from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, PLAN_NAME
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import write_observations
+from legcal.data.outlines import join_outlines, write_observations
 from legcal.data.reading_units import sigma_too_large
 from legcal.errors import UsageError
 from legcal.files.folder import (
@@ -38,12 +37,16 @@ from legcal.machine.model_writer import write_model
 from legcal.planning.session import dataset_texts, rough_view
 from legcal.progress import Progress, Report, shown_progress
 from legcal.simulation.board import documents
-from legcal.simulation.observe import corners_in_images
+from legcal.simulation.observe import (
+    EVERY_PIXEL,
+    corners_in_images,
+    edges_of_bodies,
+    outlines_of,
+)
 from legcal.simulation.poses import are_extreme
 from legcal.simulation.session import (
     SimulatedSession,
     Streams,
-    exact_outlines,
     photographs,
     simulate_session,
     streams,
@@ -51,7 +54,7 @@ from legcal.simulation.session import (
 from legcal.simulation.settings import Level, SimulationSettings, joint_distance
 from legcal.simulation.truth import write_true_model
 from legcal.version import __version__
-from legcal.vision.camera_export import camera_info
+from legcal.vision.camera_file import camera_info
 from legcal.workers import Workers, is_number
 
 
@@ -75,7 +78,7 @@ class SimulatedDataset:
     seen : (n_rows, n_legs) array of bool
         Mask of the legs that each image shows.
     left_out : int
-        Images without a leg, for which a dataset of axes or outlines has no row.
+        Images without a leg, for which a dataset of outlines has no row.
     n_extreme : int
         Poses with every motor near an end of its travel.
     """
@@ -155,18 +158,22 @@ def simulate(
         write_session(
             folder, nominal, model_name, m, groups=session.groups, board=board, lengths=measured
         )
-        exact = exact_outlines(session.scene)
+        exact = outlines_of(session.scene, replace(EVERY_PIXEL, sigma_px=0.0))
         write_observations(folder / TRUTH / "outlines.csv", exact, m, legs)
-        if session.outlines is not None:
-            write_observations(folder / OBSERVATIONS_NAME, session.outlines, m, legs)
-        if session.axes is not None:
-            write_axis_table(folder / AXES_NAME, *session.axes, m, legs)
+        has_tables = settings.level == Level.OUTLINES
+        if has_tables:
+            noise = replace(EVERY_PIXEL, sigma_px=settings.sigma_px)
+            outlines = outlines_of(session.scene, noise, rngs["observations"])
+            edges = edges_of_bodies(session.scene, truth.occluders, noise, rngs["observations"])
+            outlines = join_outlines([outlines, edges])
+            write_observations(folder / OBSERVATIONS_NAME, outlines, m, legs)
         if session.boards:
-            exact_corners = corners_in_images(session.scene, session.posed_machines, 0.0)
-            write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
-        if session.corners is not None:
-            write_corners(folder / CORNERS_NAME, session.corners, m)
-        if settings.level == Level.PHOTOGRAPHS:
+            of_boards = session.scene, session.posed_machines
+            write_corners(folder / TRUTH / CORNERS_NAME, corners_in_images(*of_boards, 0.0), m)
+            if has_tables:
+                corners = corners_in_images(*of_boards, settings.sigma_px, rngs["corners"])
+                write_corners(folder / CORNERS_NAME, corners, m)
+        if not has_tables:
             _write_photographs(folder, session, settings, rngs, workers, report)
         if settings.plan is not None:
             plan = read_bytes(Path(settings.plan) / PLAN_NAME, MAX_DOCUMENT)
@@ -311,15 +318,23 @@ def write_session(
         entry |= rough_view(view.T_base_camera, view.legs, machine)
         views[groups[v] if groups else view.name] = entry
     names, readings = list(groups) or [view.name for view in m.views], m.q[:, list(machine.motors)]
+    times = () if m.time is None else m.time.tolist()
     rows = (
-        [names[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row].tolist()]
+        [
+            names[v],
+            m.image[row],
+            m.pose_labels[m.pose[row]],
+            *times[row : row + 1],
+            *readings[row].tolist(),
+        ]
         for row, v in enumerate(m.view.tolist())
     )
+    columns = ["view", "image", "pose", *(["time"] if times else [])]
     blocks = {} if board is None else {"board": board}
     if lengths:
         blocks["parameters"] = {"lengths": dict(lengths)}
     sigma = dict(m.sigma_by_joint) or m.sigma_q
-    for name, text in dataset_texts(machine, model, views, rows, sigma, **blocks).items():
+    for name, text in dataset_texts(machine, model, views, rows, sigma, columns, **blocks).items():
         (folder / name).write_text(text, encoding="utf-8")
 
 

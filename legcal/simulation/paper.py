@@ -50,7 +50,7 @@ from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import TableNoise, axes_in_images
 from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import SimulatedSession, simulate_session, streams
+from legcal.simulation.session import SimulatedSession, Streams, simulate_session, streams
 from legcal.simulation.settings import (
     Level,
     ParameterErrors,
@@ -168,19 +168,18 @@ class PaperStudy:
         return PaperSummary.of(records, in_radians=self.noise == TableNoise.in_radians())
 
     def session(
-        self, truth: Machine, views: Sequence[Viewpoint], seed: np.random.SeedSequence
+        self, truth: Machine, views: Sequence[Viewpoint], rngs: Streams
     ) -> SimulatedSession:
         """Return the measurements of one calibration, without occlusion of legs."""
         settings = SimulationSettings(
-            level=Level.AXES,
+            level=Level.OUTLINES,
             poses=self.n_poses,
             images=self.n_images,
             views=views,
             occlusion=False,
             readings=Spread(self.reading_error),
-            table=self.noise,
         )
-        return simulate_session(truth, truth, settings, streams(seed))
+        return simulate_session(truth, truth, settings, rngs)
 
     def _calibrations(self, truth: Machine, seed: np.random.SeedSequence) -> Record:
         """Return the errors of all estimators for one session of a machine."""
@@ -188,13 +187,15 @@ class PaperStudy:
         rng, error = np.random.default_rng(of_others), Spread(self.initial_error)
         wrong = ParameterErrors(base_joints=error, platform_joints=error, offsets=error)
         initial = draw_errors(truth, wrong, rng)
-        session = self.session(truth, paper_cameras(truth, rng), of_session)
+        rngs = streams(of_session)
+        session = self.session(truth, paper_cameras(truth, rng), rngs)
+        axes = axes_of_table(*axes_in_images(session.scene, self.noise, rngs["observations"]))
         checked = checked_poses(truth, initial, self.n_checked, rng)
         covariance = bound_covariance(session, self.noise)
         errors_by_estimator = {INITIAL: _errors(truth, initial, covariance, checked)}
         for name in self.estimators:
             try:
-                legs = ESTIMATORS[name](session, initial)
+                legs = ESTIMATORS[name](session, axes, initial)
             except LegcalError as failure:
                 errors_by_estimator[name] = {"failure": failure_of(failure)}
             else:
@@ -315,15 +316,15 @@ def expected_norm(covariance: Array) -> Array:
 
 
 def four_steps(
-    session: SimulatedSession, initial: Sequence[Leg], criteria: Criteria
+    session: SimulatedSession, axes: LegAxes, initial: Sequence[Leg], criteria: Criteria
 ) -> tuple[Leg, ...]:
     """Return the legs of the four steps."""
     truth = session.truth
     machine = NominalMachine(truth.leg_names, tuple(initial), truth.frame_legs)
-    return run_steps(machine, _axes(session), session.measurements, criteria=criteria).legs
+    return run_steps(machine, axes, session.measurements, criteria=criteria).legs
 
 
-def one_fit(session: SimulatedSession, initial: Sequence[Leg]) -> tuple[Leg, ...]:
+def one_fit(session: SimulatedSession, axes: LegAxes, initial: Sequence[Leg]) -> tuple[Leg, ...]:
     """Return the legs of the joint fit, started from initial legs and rough cameras.
 
     ``legcal calibrate`` also starts from the result of the steps and keeps the better fit; here the
@@ -331,10 +332,10 @@ def one_fit(session: SimulatedSession, initial: Sequence[Leg]) -> tuple[Leg, ...
     """
     m, legs = session.measurements, _fitted(session.truth, initial)
     start = nominal_start(legs, m, session.truth.T_base_Rb)
-    return refine(legs, m, no_outlines(), start, axes=average_images(_axes(session), m)).legs
+    return refine(legs, m, no_outlines(), start, axes=average_images(axes, m)).legs
 
 
-Estimator = Callable[[SimulatedSession, Sequence[Leg]], Sequence[Leg]]
+Estimator = Callable[[SimulatedSession, LegAxes, Sequence[Leg]], Sequence[Leg]]
 ESTIMATORS: dict[str, Estimator] = {
     "literal": partial(four_steps, criteria="literal"),
     "default": partial(four_steps, criteria="default"),
@@ -372,12 +373,6 @@ def bound_covariance(session: SimulatedSession, noise: TableNoise) -> Array:
     cameras = [view.T_base_camera.inv() * truth.T_base_Rb for view in session.scene.views]
     poses = platforms_in_base(truth, session.poses.poses)
     return bound(problem, Start(legs.nominal, tuple(cameras), poses, "truth"))
-
-
-def _axes(session: SimulatedSession) -> LegAxes:
-    """Return the measured axes of a session."""
-    assert session.axes is not None
-    return axes_of_table(*session.axes)
 
 
 def _fitted(truth: Machine, legs: Sequence[Leg]) -> FittedLegs:

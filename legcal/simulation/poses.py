@@ -13,6 +13,7 @@ from legcal.data.measurements import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, UsageError
 from legcal.files.table import read_table
 from legcal.geometry.types import Array, BoolArray
+from legcal.machine.closing import singularities, singularity
 from legcal.machine.configurations import (
     JITTER,
     TRAVEL_TOLERANCE,
@@ -24,7 +25,6 @@ from legcal.machine.configurations import (
     poses_at,
 )
 from legcal.machine.kinematics import followed, followed_poses, platform_in_base
-from legcal.machine.mobility import singularities, singularity
 from legcal.machine.model import Machine, platform_pose
 from legcal.machine.redundancy import contradictions
 from legcal.progress import Report, no_progress

@@ -1,7 +1,8 @@
 """The session simulator: from a machine and settings to its measurements, in memory.
 
-:func:`simulate_session` puts a true machine into poses and cameras around it, and returns readings,
-outlines or axes, corners of a board, and the truth. :func:`photographs` renders its images.
+:func:`simulate_session` puts a true machine into poses and cameras around it, and returns readings
+and the truth. :mod:`legcal.simulation.observe` observes outlines and corners in it, and
+:func:`photographs` renders its images.
 """
 
 from __future__ import annotations
@@ -16,10 +17,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.corners import Corners
 from legcal.data.dataset import PLAN_NAME, load_dataset
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
 from legcal.files.schema import validate
@@ -42,15 +41,7 @@ from legcal.simulation.cameras import (
     read_lens,
     rough_pose,
 )
-from legcal.simulation.observe import (
-    EVERY_PIXEL,
-    AxisTable,
-    OutlineNoise,
-    Scene,
-    axes_in_images,
-    corners_in_images,
-    outlines_of,
-)
+from legcal.simulation.observe import Scene
 from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
@@ -66,6 +57,7 @@ Streams = Mapping[str, np.random.Generator]
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
              "corners", "lengths")  # fmt: skip
 _MIN_SIGMA_Q = 1e-9  # [m] stated standard deviation of readings without noise
+_SECONDS_A_POSE = 10.0  # poses are taken one after the other, images of one a second apart
 _MIN_SEEN = 0.5  # minimum share of photographs of a view that show a leg named in its hint
 
 
@@ -83,15 +75,12 @@ class SimulatedSession:
     """The measurements of a simulated machine, and the truth behind them."""
 
     measurements: Measurements
-    outlines: Outlines | None  # with noise, where the settings ask for them
-    axes: AxisTable | None
-    corners: Corners | None
     truth: Machine
     poses: Configurations  # all drawn poses; images may show only some
     labels: tuple[str, ...]  # their names
     posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
     scene: Scene
-    left_out: int  # images without a leg, for which a table of outlines or axes has no row
+    left_out: int  # images without a leg, for which a table of outlines has no row
     boards: tuple[FixedBoard, ...]
     groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
 
@@ -294,19 +283,11 @@ class _Simulator:
         return setup, kept, len(images) - len(rows)
 
     def observe(self, setup: _Setup, images: Images, left_out: int) -> SimulatedSession:
-        """Return the session: readings and tables with their errors, and the truth."""
+        """Return the session: readings with their errors, and the truth."""
         settings, rngs, posed = self.settings, self.rngs, setup.posed_machines
         A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
         arms = {j: np.array([m.arms[j] for m in posed]) for j in posed[0].arms}
         scene = Scene(A, B, setup.views, images, arms)
-        outlines = axes = corners = None
-        if settings.level == Level.OUTLINES:
-            noise = OutlineNoise(settings.sigma_px, n_points=None)
-            outlines = outlines_of(scene, noise, rngs["observations"])
-        elif settings.level == Level.AXES:
-            axes = axes_in_images(scene, settings.table, rngs["observations"])
-        if setup.boards and settings.level != Level.PHOTOGRAPHS:
-            corners = corners_in_images(scene, posed, settings.sigma_px, rngs["corners"])
         n_poses = len(setup.poses.poses)
         width = max(2, len(str(n_poses)))
         labels = tuple(f"p{k + 1:0{width}d}" for k in range(n_poses))
@@ -319,14 +300,9 @@ class _Simulator:
             hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in view_pairs)
             measurements = replace(measurements, views=hinted)
         return SimulatedSession(
-            measurements, outlines, axes, corners, self.truth, setup.poses, labels, posed, scene,
+            measurements, self.truth, setup.poses, labels, posed, scene,
             left_out, setup.boards, setup.groups,
         )  # fmt: skip
-
-
-def exact_outlines(scene: Scene) -> Outlines:
-    """Return the exact outlines of a scene, with a negligible stated noise."""
-    return outlines_of(scene, replace(EVERY_PIXEL, sigma_px=0.0))
 
 
 def _numbered(
@@ -407,6 +383,7 @@ def _recorded(
         if any(a.turns for a in truth.actuators)
         else {},
         pose_labels=tuple(labels[p] for p in visible_poses),
+        time=np.asarray(_SECONDS_A_POSE * images.pose + images.repeat, dtype=np.float64),
     )
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.joint_fit.parameter_choices import joints_of_length
-from legcal.data.axes import SIGMA_RANGE
 from legcal.errors import UsageError
 from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
 from legcal.files.schema import closest, describe, is_plain_name
@@ -21,7 +20,6 @@ from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
-from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import CAMERAS, Appearance
 from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board
@@ -35,7 +33,6 @@ ANGLES = ("axes", "twists")
 class Level(StrEnum):
     """The kind of observations in a simulated dataset."""
 
-    AXES = "axes"
     OUTLINES = "outlines"
     PHOTOGRAPHS = "photographs"
 
@@ -169,7 +166,7 @@ class SimulationSettings:
     Attributes
     ----------
     level : Level
-        ``axes`` with the noise of Table 1, ``outlines`` with noise in pixels, or ``photographs``.
+        ``outlines`` with noise in pixels, or ``photographs``.
     errors : ParameterErrors
         Errors of the true machine relative to the nominal model.
     poses : int or path
@@ -191,8 +188,6 @@ class SimulationSettings:
         State the gamma of the cameras in the dataset.
     sigma_px : float
         Standard deviation of each edge point of outlines, and of each corner of a board [px].
-    table : TableNoise
-        Noise of axes.
     readings : Spread
         Errors of encoder readings [m]; for motors that turn, displacements of A.
     appearance : Appearance
@@ -235,7 +230,6 @@ class SimulationSettings:
     hints: bool = True
     tell_gamma: bool = True
     sigma_px: float = 0.1
-    table: TableNoise = field(default_factory=TableNoise)
     readings: Spread = DEFAULT_READINGS
     appearance: Appearance = field(default_factory=Appearance)
     board: Board | str | Path | None = None
@@ -289,7 +283,6 @@ class SimulationSettings:
             "errors": (self.errors, ParameterErrors, "ParameterErrors"),
             "readings": (self.readings, Spread, "Spread"),
             "angles": (self.angles, Spread | None, "Spread"),
-            "table": (self.table, TableNoise, "TableNoise"),
             "appearance": (self.appearance, Appearance, "Appearance"),
             "sigma_px": (self.sigma_px, Real, "number"),
             "poses": (self.poses, Integral | str | Path, "whole number or the path of a CSV"),
@@ -303,8 +296,6 @@ class SimulationSettings:
         }
         if isinstance(self.errors, ParameterErrors):
             needed |= {f"errors.{k}": (getattr(self.errors, k), Spread, "Spread") for k in KINDS}
-        if isinstance(self.table, TableNoise):
-            needed |= {f"table.{k}": (x, Real, "number") for k, x in vars(self.table).items()}
         if isinstance(self.views, list | tuple):
             needed |= {f"view {k}": (x, Viewpoint, "Viewpoint") for k, x in enumerate(self.views)}
         for name, (value, kind, kind_name) in needed.items():
@@ -326,9 +317,6 @@ class SimulationSettings:
             "the seed": (self.seed, 0, math.inf, ""),
             "the noise of edge points": (self.sigma_px, 0.0, MAX_SIGMA_PX, " px"),
         }
-        for name, sigma in vars(self.table).items():
-            unit = " rad" if name in ("psi", "theta") else " m"
-            limits[f"the noise of {name}"] = (sigma, *SIGMA_RANGE, unit)
         for name, (value, least, most, unit) in limits.items():
             if not least <= value <= most:
                 needed = (

@@ -18,11 +18,11 @@ from legcal.geometry.motions import matrix_product, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
-from legcal.machine.cylinders import coaxial_tolerance
 from legcal.machine.leg import Leg
 from legcal.machine.meshes import mesh_file, ray_caster, read_mesh
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
+from legcal.machine.shapes import coaxial_tolerance
 from legcal.machine.urdf import number_list, origins_of, parse_robot
 
 _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}

@@ -1,7 +1,7 @@
 """The visible parts of simulated legs: their stretches that no solid hides, by rays.
 
 This is what photographs show. The method predicts it from a model, in another way
-(:mod:`legcal.vision.sight`).
+(:mod:`legcal.vision.visibility`).
 """
 
 from __future__ import annotations

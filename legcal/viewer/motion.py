@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import LegcalError
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
+from legcal.machine.closing import coordinates_of, independent_coordinates, poses_at_coordinates
 from legcal.machine.kinematics import Follower, followed_poses
-from legcal.machine.mobility import coordinates_of, independent_coordinates, poses_at_coordinates
 from legcal.machine.model import Machine, joint_values, readings_at, readings_at_poses
 from legcal.machine.redundancy import consistent_readings
 

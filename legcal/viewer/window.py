@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from legcal.errors import UsageError
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
-from legcal.machine.mobility import COORDINATES
+from legcal.machine.closing import COORDINATES
 from legcal.scene.motions import FACTORS
 from legcal.viewer.address import Address, check_address
 from legcal.viewer.motion import Motion

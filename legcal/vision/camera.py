@@ -126,6 +126,9 @@ class Camera:
     covariance: Array | None = None
     # Metadata of the photographs used for its calibration, if recorded
     photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    # (k, 2): corners of the convex part of the image in which its calibration saw boards [px];
+    # none if that is not known
+    covered: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @cached_property
     def has_distortion(self) -> bool:

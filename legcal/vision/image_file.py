@@ -1,19 +1,32 @@
-"""Image files: checked without decoding, read as grey levels, made larger for searches."""
+"""Image files: checked without decoding, their metadata, grey levels, and scaled images.
+
+Pillow reads the headers: compression, camera, lens, zoom, time. Damaged or absent metadata are
+ignored. OpenCV decodes the pixels.
+
+HEIC is read by the package pi-heif where it is installed (``legcal[heic]``). Its wheels hold the
+decoders libheif and libde265 (LGPL-3); the wheels of pillow-heif, of which it is a part, hold the
+encoder x265 too (GPL-2). Pixels are rotated according to the file.
+"""
+
+from __future__ import annotations
 
 import os
+import struct
 import threading
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TypeVar
+from types import ModuleType
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL.ExifTags import Base
+from PIL.ExifTags import IFD, Base
+from PIL.Image import Exif
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
@@ -21,24 +34,228 @@ from legcal.causes import Cause
 from legcal.errors import BadValue, Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
-from legcal.vision.camera import Camera
-from legcal.vision.image_facts import (
-    HEIC_SUFFIXES,
-    JPEG_SIGNATURE,
-    PILLOW_ERRORS,
-    PNG_SIGNATURE,
-    TIFF_SIGNATURES,
-    ImageFacts,
-    UnreadableError,
-    can_read_heic,
-    exif_tags,
-    heic_pixels,
-    heic_size,
-    is_heic,
-    quiet_pillow,
-    read_facts,
-    size_change,
-)
+from legcal.vision.camera import Camera, intrinsic_names
+
+JPEG_SIGNATURE = b"\xff\xd8\xff"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
+PILLOW_ERRORS = (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError,
+                 AttributeError, EOFError, struct.error)  # fmt: skip
+"""The exceptions of Pillow for damaged files."""
+
+_MOST_TEXT = 60  # maximum number of characters shown
+# Sum of the steps of table K.1 of ITU-T T.81, which is quality 50 on the scale of the IJG
+_STEPS_AT_50 = 3688.0
+
+
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
+_REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # errors of the package
+FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along diagonals
+# Standard deviations, relative to the focal length: of f (whole millimetres, cropping, focus), and
+# of the difference between fx and fy (pixels are square)
+FOCAL_SIGMA, ASPECT_SIGMA = 0.04, 0.002
+CENTRE_SIGMA = 0.02  # standard deviation of the principal point, in units of the longer side
+DISTORTION_SIGMA = {"k1": 0.1, "k2": 0.1}  # standard deviations of the distortion of usual lenses
+
+
+class ImageSize(NamedTuple):
+    """Size of an image [px]."""
+
+    width: int
+    height: int
+
+
+class UnreadableError(ValueError):
+    """A HEIC file that is damaged, or that the package cannot read."""
+
+
+@dataclass(frozen=True)
+class ImageFacts:
+    """The metadata of an image file; "" and None for missing values."""
+
+    jpeg_quality: int | None = None  # about, on the scale of the IJG, 1 to 100
+    device: str = ""  # make and model of the camera
+    serial: str = ""  # its number
+    lens: str = ""
+    software: str = ""  # the program that wrote the file
+    focal_length: float | None = None  # [mm]
+    focal_length_35mm: float | None = None  # with the same field of view on 35 mm film [mm]
+    focus_distance: float | None = None  # distance in focus [m]
+    digital_zoom: float | None = None  # magnification of the middle of the image
+    orientation: int | None = None  # EXIF orientation for display, 1 to 8; 1 is unrotated
+    taken_size: tuple[int, int] | None = None  # original width and height [px]
+    taken_at: str = ""  # time by the clock of the camera, ``2026:11:23 10:15:00``
+
+
+@contextmanager
+def quiet_pillow() -> Iterator[None]:
+    """Silence Pillow's warnings of damaged files inside the block."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def read_facts(content: bytes) -> ImageFacts:
+    """Return the metadata in the bytes of an image file."""
+    with quiet_pillow():
+        try:
+            if content.startswith(JPEG_SIGNATURE):
+                jpeg = JpegImageFile(BytesIO(content))
+                tags = exif_tags(jpeg.info.get("exif", b""))
+                return _facts(tags, _quality(jpeg.quantization))
+            if content.startswith(PNG_SIGNATURE):
+                info = PngImageFile(BytesIO(content)).info
+                software = {Base.Software: info.get("Software", "")}
+                return _facts(software | exif_tags(info.get("exif", b"")))
+            if content.startswith(TIFF_SIGNATURES):
+                return _facts(exif_tags(content))
+            if is_heic(content):  # its pixels are decoded upright
+                return _facts(exif_tags(heic_exif(content)) | {Base.Orientation: None})
+        except PILLOW_ERRORS:
+            pass
+    return ImageFacts()
+
+
+def exif_tags(block: bytes) -> dict[int, Any]:
+    """Return the tags of a block of EXIF, or of a TIFF, by their numbers: all that can be read."""
+    exif = Exif()
+    tags: dict[int, Any] = {}
+    with suppress(*PILLOW_ERRORS):
+        exif.load(block)
+        tags |= exif
+        tags |= exif.get_ifd(IFD.Exif)
+    return tags
+
+
+def _facts(tags: Mapping[int, Any], jpeg_quality: int | None = None) -> ImageFacts:
+    """Return the facts of a file from its tags."""
+    make, model = _text(tags, Base.Make), _text(tags, Base.Model)
+    names_make = model.casefold().startswith(make.casefold())
+    width, height = (
+        _number(tags, tag, 1.0, 65_535.0) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)
+    )
+    orientation = _number(tags, Base.Orientation, 1.0, 8.0)
+    zoom = _number(tags, Base.DigitalZoomRatio, 0.0, 100.0)
+    return ImageFacts(
+        jpeg_quality=jpeg_quality,
+        device=(model if names_make else f"{make} {model}").strip(),
+        serial=_text(tags, Base.BodySerialNumber),
+        lens=_text(tags, Base.LensModel),
+        software=_text(tags, Base.Software),
+        focal_length=_number(tags, Base.FocalLength, 1e-3, 1e5),
+        focal_length_35mm=_number(tags, Base.FocalLengthIn35mmFilm, 1e-3, 1e5),
+        focus_distance=_number(tags, Base.SubjectDistance, 1e-3, 1e5),
+        digital_zoom=1.0 if zoom == 0.0 else zoom,  # 0 means no zoom
+        orientation=None if orientation is None else int(orientation),
+        taken_size=None if width is None or height is None else (int(width), int(height)),
+        taken_at=_text(tags, Base.DateTimeOriginal),
+    )
+
+
+def _number(tags: Mapping[int, Any], tag: int, least: float, most: float) -> float | None:
+    """Return the number of a tag, None if there is none between limits."""
+    try:
+        number = float(tags[tag])
+    except (KeyError, TypeError, ValueError, ArithmeticError):
+        return None
+    return number if least <= number <= most else None
+
+
+def _text(tags: Mapping[int, Any], tag: int) -> str:
+    """Return the printable beginning of the text of a tag, on one line."""
+    value = tags.get(tag)
+    text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    words = text.partition("\0")[0].split() if isinstance(text, str) else []
+    return "".join(c for c in " ".join(words) if c.isprintable())[:_MOST_TEXT].strip()
+
+
+def _quality(tables: Mapping[int, list[int]]) -> int | None:
+    """Return the quality of a JPEG by the sum of the steps of its table of luminance."""
+    if not tables:
+        return None
+    scale = max(sum(tables[min(tables)]) / _STEPS_AT_50, 1e-3)
+    return round(min(max(100.0 - 50.0 * scale if scale < 1.0 else 50.0 / scale, 1.0), 100.0))
+
+
+def size_change(before: tuple[int, int], after: tuple[int, int]) -> str:
+    """Return in words how an image may have come from one size to another, "" if unknown."""
+    if after == before[::-1]:
+        return "turned by a quarter turn"
+    for (width, height), word in ((after, ""), (after[::-1], "turned and ")):
+        factor = width / before[0]
+        if abs(height - factor * before[1]) <= max(1.0, factor):
+            return f"{word}rescaled by {factor:.4g}"
+    return "cropped" if after[0] <= before[0] and after[1] <= before[1] else ""
+
+
+def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) -> Camera | None:
+    """Return the camera of photographs of one size by their focal length on 35 mm film.
+
+    Its covariance states the uncertainty. None if they state no focal length, or several.
+    """
+    stated = {(photograph.device, photograph.focal_length_35mm) for photograph in facts}
+    focal = next(iter(stated))[1] if len(stated) == 1 else None
+    if focal is None:
+        return None
+    f = focal * float(np.hypot(width, height)) / float(FILM_DIAGONAL)
+    K = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    camera = Camera(K, width, height)
+    names = intrinsic_names(camera)
+    centre = CENTRE_SIGMA * max(width, height)
+    sigma = {"cx": centre, "cy": centre, **DISTORTION_SIGMA}
+    C = np.diag([sigma.get(name, 0.0) ** 2 for name in names])
+    focals = [names.index("fx"), names.index("fy")]
+    C[np.ix_(focals, focals)] = (FOCAL_SIGMA * f) ** 2 + np.diag([(ASPECT_SIGMA * f) ** 2] * 2)
+    return Camera(K, width, height, covariance=C)
+
+
+def is_heic(content: bytes) -> bool:
+    """Return whether the bytes of a file look like HEIC."""
+    return content[4:8] == b"ftyp" and content[8:12] in _HEIC_BRANDS
+
+
+def can_read_heic() -> bool:
+    """Return whether the package is installed."""
+    return _package() is not None
+
+
+def heic_pixels(content: bytes) -> NDArray[np.generic]:
+    """Return the pixels (height, width, 3) of 8 or 16 bits, blue first, or grey (height, width)."""
+    try:
+        pixels = np.asarray(_opened(content))
+    except _REFUSALS as error:
+        raise UnreadableError(str(error)) from error
+    return pixels[..., :3] if pixels.ndim == 3 else pixels  # without the alpha channel
+
+
+def heic_exif(content: bytes) -> bytes:
+    """Return the block of EXIF, b"" where there is none, or no package."""
+    try:
+        return bytes(_opened(content).info.get("exif") or b"")
+    except UnreadableError:
+        return b""
+
+
+def _package() -> ModuleType | None:
+    try:
+        import pi_heif
+    except ImportError:
+        return None
+    module: ModuleType = pi_heif
+    return module
+
+
+def _opened(content: bytes) -> Any:
+    """Return the picture of a file, its pixels not yet decoded."""
+    package = _package()
+    if package is None:
+        raise UnreadableError("no package that reads it")
+    try:
+        return package.open_heif(content, convert_hdr_to_8bit=False, bgr_mode=True)
+    except _REFUSALS as error:
+        raise UnreadableError(str(error)) from error
+
 
 _Level = TypeVar("_Level", np.uint8, np.float32)
 Grey = NDArray[np.float32]  # (height, width) grey levels, 0 to 255
@@ -83,10 +300,10 @@ CONVERT = (
     "format"
 )
 CONVERT_HEIC = f"install what reads HEIC (pip install 'legcal[heic]'), or {CONVERT}"
-_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}
+_FOREIGN_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}
 
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
-_AGAIN = "copy it again or remove the row"
+COPY_AGAIN = "copy it again or remove the row"  # the remedy of a file that may be incomplete
 _LEVELS = "8 or 16 bit grey levels or colours"
 NOWHERE = Place()
 
@@ -94,16 +311,10 @@ NOWHERE = Place()
 class BadImage(BadValue):
     """A problem with the bytes of an image file."""
 
-    def __init__(self, found: str | Cause, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
+    def __init__(
+        self, found: str | Cause, needed: str = _COMPLETE, remedy: str = COPY_AGAIN
+    ) -> None:
         super().__init__(found, needed, remedy)
-
-
-@dataclass(frozen=True)
-class ImageSize:
-    """Size of an image [px]."""
-
-    width: int
-    height: int
 
 
 def read_image(path: Path, camera: Camera) -> Grey:
@@ -176,9 +387,9 @@ def image_size(content: bytes) -> ImageSize:
         size = _size_read("PNG", _png_size, content)
     elif content.startswith(TIFF_SIGNATURES):
         size = _size_read("TIFF", _tiff_size, content)
-    elif content[4:8] == b"ftyp" and content[8:12] in _BRANDS:
+    elif content[4:8] == b"ftyp" and content[8:12] in _FOREIGN_BRANDS:
         raise BadImage(
-            f"a {_BRANDS[content[8:12]]} file, which cannot be read here", remedy=CONVERT
+            f"a {_FOREIGN_BRANDS[content[8:12]]} file, which cannot be read here", remedy=CONVERT
         )
     else:
         raise BadImage("a file that is none of these")
@@ -239,7 +450,7 @@ def _heic_size(content: bytes) -> ImageSize:
     if not can_read_heic():
         raise BadImage("a HEIC file, which cannot be read here", remedy=CONVERT_HEIC)
     try:
-        return ImageSize(*heic_size(content))
+        return ImageSize(*map(int, _opened(content).size))
     except UnreadableError as error:
         raise BadImage(f"a HEIC file that cannot be read ({error})") from error
 
@@ -259,7 +470,7 @@ def size_problem(width: int, height: int) -> tuple[str, str] | None:
 
 def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
     """Return in brackets the likely cause of an image size unlike the camera's, "" if unknown."""
-    change = size_change((needed.width, needed.height), (size.width, size.height))
+    change = size_change(needed, size)
     causes = [change] if change else []
     if change == "cropped":
         causes = ["cropped, or taken in another mode of the camera"]
@@ -268,7 +479,7 @@ def likely_cause(size: ImageSize, needed: ImageSize, facts: ImageFacts) -> str:
             f", as programs show it by its EXIF orientation {facts.orientation}; pixels are taken "
             "as they are stored"
         )
-    if facts.taken_size not in (None, (size.width, size.height)):
+    if facts.taken_size not in (None, size):
         width, height = facts.taken_size
         causes.append(f"taken with {width} x {height} px, as its EXIF data say")
     return f" ({', '.join(causes)})" if causes else ""
@@ -306,7 +517,7 @@ def _problem(
     named: Place,
     found: str | Cause,
     needed: str,
-    remedy: str = _AGAIN,
+    remedy: str = COPY_AGAIN,
     code: Code = Code.UNREADABLE_FILE,
 ) -> Problem:
     """Return the problem of an image that cannot be read."""
@@ -332,3 +543,13 @@ def rescaled(image: NDArray[_Level], scale: float) -> NDArray[_Level]:
 def reduced(px: Array, scale: float) -> Array:
     """Return the coordinates in the image of pixels of a rescaled image; centres are integers."""
     return np.asarray((px + 0.5) / scale - 0.5)
+
+
+def shrink(grey: Grey, factor: int) -> Grey:
+    """Return an image made smaller by a whole factor, each pixel the mean of a square."""
+    if factor == 1:
+        return grey
+    height, width = (factor * (size // factor) for size in grey.shape)
+    size = (width // factor, height // factor)
+    small = cv2.resize(grey[:height, :width], size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.float32)

@@ -47,17 +47,17 @@ from legcal.perception.board_corners import (
     tags_are_mirrored,
 )
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision.board import Board
-from legcal.vision.board_file import board_of
+from legcal.vision.board import Board, board_of
 from legcal.vision.camera import Camera
 from legcal.vision.distortion import DistortionModel
-from legcal.vision.image_facts import ImageFacts, read_facts
 from legcal.vision.image_file import (
     BadImage,
+    ImageFacts,
     ImageSize,
     image_size,
     image_suffixes,
     likely_cause,
+    read_facts,
     read_image,
 )
 from legcal.workers import Run, Workers, worker_pool

@@ -22,8 +22,7 @@ from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import SHEET
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values
-from legcal.vision.camera_export import camera_info
-from legcal.vision.camera_file import CALIBRATED
+from legcal.vision.camera_file import CALIBRATED, camera_info
 
 CAMERA_FILE = OutputFile(
     "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
@@ -192,6 +191,7 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
         "sigma": {name: _short(s) for name, s in zip(names, sigma, strict=True)},
         "names": list(names),
         "covariance": calibration.covariance.tolist(),
+        "covered": _covered(calibration),
         "images": [
             {"image": i.image, "corners": i.used, "rms_px": _short(i.rms_px)}
             for i in calibration.images
@@ -202,6 +202,12 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
     }
     text = camera_info(calibration.camera, path.stem, {CALIBRATED: block})
     CAMERA_FILE.write(path, text)
+
+
+def _covered(calibration: CameraCalibration) -> list[list[float]]:
+    """Return the corners of the convex hull of all corners of boards [px]."""
+    points = calibration.corners[:, :2].astype(np.float32)
+    return [[_short(x) for x in corner] for corner in cv2.convexHull(points)[:, 0].tolist()]
 
 
 def _short(value: float) -> float:

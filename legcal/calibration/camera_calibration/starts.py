@@ -11,8 +11,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.perception.board_adjustment import AdjustedBoard, BoardImages, Sheet, adjust_board
-from legcal.perception.board_poses import plane_poses
+from legcal.perception.board_adjustment import (
+    AdjustedBoard,
+    BoardImages,
+    Sheet,
+    adjust_board,
+    plane_poses,
+)
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize, quiet_opencv

@@ -53,12 +53,12 @@ from legcal.calibration.joint_fit.predicted import (
 from legcal.data.dataset import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files.schema import closest
-from legcal.machine.diagnostics import singularity_note
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.inspection import singularity_note
 from legcal.machine.leg import JointType
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.parameters import geometries, is_held_by_default, legs_in_words
+from legcal.machine.parameters import geometries, is_held_by_default, leg_labels, legs_in_words
 from legcal.machine.ties import ties_in_words
 from legcal.paper.conditions import (
     Condition,
@@ -66,6 +66,7 @@ from legcal.paper.conditions import (
     three_legs_at_once,
     two_directions,
 )
+from legcal.perception.body_edges import bodies_of
 
 MOST_VIEWS = 50
 MOST_IMAGES = 2000  # of a session; more add nothing and take minutes
@@ -122,7 +123,6 @@ def answer(
     parameters = known_parameters(
         dataset.machine,
         dataset.measurements.views,
-        axes_given=dataset.axes is not None,
         boards=dataset.boards,
     )
     by_parts = Choices.by_tolerances(dataset.machine, only)
@@ -223,9 +223,7 @@ def identifiability_of_dataset(
     """
     analysis = replace(_analysis_of(dataset, choices), noise=noise)
     report = _report_on(dataset.machine, analysis, None, None)
-    if dataset.axes is None:
-        intrinsics = expected_intrinsics(analysis)
-        report = report.model_copy(update={"intrinsics": intrinsics})
+    report = report.model_copy(update={"intrinsics": expected_intrinsics(analysis)})
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
@@ -348,7 +346,8 @@ def _rough_notes(analysis: Analysis) -> list[str]:
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    hidden = [j for j, leg in enumerate(machine.legs) if not leg.cylinders]
+    bodies = bodies_of(machine.occluders, len(machine.legs))
+    hidden = [j for j, leg in enumerate(machine.legs) if not (leg.cylinders or bodies[j])]
     notes = []
     if hidden:
         which = legs_in_words(hidden, machine.leg_names)
@@ -392,7 +391,8 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
 
 
 def read_views(
-    views: Sequence[Sequence[str]],  # names of the legs visible from each camera position
+    # Names of the legs visible from each camera position, or their numbers as reports show them
+    views: Sequence[Sequence[str]],
     leg_names: Sequence[str],
     images: int,  # number of images a view
 ) -> tuple[tuple[int, ...], ...]:
@@ -400,7 +400,8 @@ def read_views(
 
     Raises UsageError with one sentence for each problem.
     """
-    problems = []
+    problems, known = [], list[list[str]]()
+    name_of = {label: name for name, label in leg_labels(leg_names).items()}
     if images < 1:
         problems.append(
             f"The views could not be judged: found {images} images a view, needed at least 1; "
@@ -424,6 +425,8 @@ def read_views(
             )
             continue
         names = [str(name).strip() for name in view]
+        names = [name if name in leg_names else name_of.get(name, name) for name in names]
+        known.append(names)
         if not any(names):
             problems.append(
                 f"View {v} could not be used: found no leg, needed at least one; name its legs, "
@@ -443,14 +446,19 @@ def read_views(
                 )
     if problems:
         raise UsageError(problems)
-    return tuple(tuple(sorted(leg_names.index(name.strip()) for name in view)) for view in views)
+    return tuple(tuple(sorted(leg_names.index(name) for name in view)) for view in known)
 
 
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
     """Describe why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
-    unseen = [leg.name for leg in dataset.machine.legs if not leg.cylinders]
-    if unseen and dataset.axes is None:
+    bodies = bodies_of(dataset.machine.occluders, len(dataset.machine.legs))
+    unseen = [
+        leg.name
+        for leg, of_leg in zip(dataset.machine.legs, bodies, strict=True)
+        if not (leg.cylinders or of_leg)
+    ]
+    if unseen:
         names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
         remedies.insert(0, f"add a <visual> cylinder along {names}: without it, no image shows it")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"

@@ -405,8 +405,6 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
     """Describe why the scale of a session is open, and the remedies."""
     machine = dataset.machine
     sources = scale_sources(analysis)
-    if dataset.axes is not None:  # radii and boards are of images
-        sources = tuple(source for source in sources if source.source == "length")
     fixing = [source.assumed for source in sources if source.sigma is not None]
     options = ", or ".join(fixing or [source.assumed for source in sources])
     reason, fix_gain = "readings of arms are angles", ""
@@ -419,11 +417,10 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
         analysis, _all_known(analysis)
     ):  # something is stated
         reason += f", and the stated values determine the scale no better than {100 * _VAGUE:g} %"
-    stated = f"state a measured length ({machine.length_option})"
-    if dataset.axes is None:
-        stated += (
-            ", or radii that you know better than the model (--set '*.radius.*=VALUE±SIGMAmm')"
-        )
+    stated = (
+        f"state a measured length ({machine.length_option}), or radii that you know better than "
+        "the model (--set '*.radius.*=VALUE±SIGMAmm')"
+    )
     return (
         f"{dataset.folder}: the parameters cannot be identified: {reason}, so the overall scale is "
         f"undetermined; any of these would determine it: {options}; {fix_gain}{stated}."

@@ -30,7 +30,7 @@ from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines, join_outlines
+from legcal.data.outlines import Outlines, join_outlines, no_outlines
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
@@ -55,10 +55,12 @@ from legcal.machine.rods import (
     joints_at,
     readings_of_rods,
 )
+from legcal.machine.shapes import Occluder
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
+from legcal.perception.body_edges import bodies_in_view, bodies_of, predicted_edges
 from legcal.vision.board import Board, FixedBoard, Link, facing_board
 from legcal.vision.camera import sample_camera
-from legcal.vision.sight import Bodies, visible_parts
+from legcal.vision.visibility import Bodies, visible_parts
 
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
@@ -70,6 +72,7 @@ THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg lengt
 _BOARD = 0.5  # half side of a board on the platform, over the spread of its joints
 _SQUARES = 8  # along both of its sides
 _CORNER_PX = 0.1  # standard deviation of its corners
+EDGE_SIGMA_PX = 0.2  # of an edge of a body, at its ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +102,7 @@ class Session:
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
-    shows_arms: bool = True  # which a table of axes does not
+    occluders: tuple[Occluder, ...] = ()  # solids of legs; bodies among them have edges
 
     @property
     def n_legs(self) -> int:
@@ -119,10 +122,11 @@ class Session:
 
     @cached_property
     def fitted(self) -> FittedLegs:
-        """The legs as the joint fit takes them; a leg without a visible cylinder has a thin one."""
+        """The legs as the joint fit takes them; a leg without any visible part has a thin rod."""
         shortest, legs = self.length.min(axis=0).tolist(), list(self.legs)
+        bodies = bodies_of(self.occluders, self.n_legs)
         for j, leg in enumerate(self.legs):
-            if not leg.cylinders:
+            if not leg.cylinders and not bodies[j]:
                 thin = Cylinder(leg.name, THIN * self.mean_length, "base", 0.0, shortest[j])
                 legs[j] = replace(leg, cylinders=(thin,))
         radii = {(j, p): r for j, leg in enumerate(legs) for p, r in leg.radius_of_part.items()}
@@ -144,11 +148,19 @@ class Session:
             bodies = Bodies.at(self.fitted.nominal, self.R[pose], self.t[pose], self.mean_length)
             seen = visible_parts(view.camera, self.places[v], bodies, stated=self.seen[v])
             tables.append(predicted_outlines(seen, row, DEFAULT_NOISE))
-        outlines = join_outlines(tables)
-        if self.shows_arms:
-            return outlines
-        parts = zip(outlines.leg.tolist(), outlines.part, strict=True)
-        return outlines.choose(np.array([not self.legs[j].is_arm(p) for j, p in parts]))
+        return join_outlines(tables)
+
+    @cached_property
+    def edges(self) -> Outlines:
+        """Edges of bodies of the legs that views show, hidden by bodies of other legs alone."""
+        B, tables = self.arm + self.t[:, None], list[Outlines]()
+        if not any(bodies_of(self.occluders, self.n_legs)):
+            return no_outlines()
+        for row, (v, pose) in enumerate(zip(self.view.tolist(), self.pose.tolist(), strict=True)):
+            camera, ends = self.cameras[v].camera, (self.A_at[pose], B[pose])
+            seen = bodies_in_view(self.occluders, camera, self.places[v], ends, self.seen[v])
+            tables += [predicted_edges(row, camera, body, EDGE_SIGMA_PX) for body in seen]
+        return join_outlines(tables)
 
     @cached_property
     def measurements(self) -> Measurements:
@@ -187,6 +199,7 @@ class Session:
             noise,
             choices,
             board=board,
+            edges=self.edges,
         )
         places = zip(self.cameras, self.places, self.board, strict=True)
         return contributions.tied_by_board({view.name: T for view, T, has in places if has})
@@ -356,6 +369,7 @@ def planned_session(
         unread=np.zeros((n_poses, len(legs)), dtype=np.bool_),
         board=np.full(len(views), board, dtype=np.bool_),
         platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
+        occluders=_solids_of_legs(machine),
     )
 
 
@@ -379,8 +393,7 @@ def random_postures(machine: Machine, legs: Sequence[Leg], count: int) -> tuple[
 
 
 def recorded_session(
-    # A view is taken to show the legs that have axes in it; without a table of axes those that it
-    # names, or all, which have a visible cylinder
+    # A view is taken to show the legs that it names, or all, which have a visible cylinder
     dataset: Dataset,
     *,
     twists: bool = False,  # count twists of legs and gains of actuators among the parameters
@@ -407,13 +420,13 @@ def recorded_session(
         t_reached = np.concatenate([t, t_more[n_drawn:]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
-    seen = np.array(
-        [[bool(leg.cylinders) and view.uses(leg.name) for leg in machine.legs] for view in views]
-    )
-    if dataset.axes is not None:
-        shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)
-        shown_legs[m.view[dataset.axes.row], dataset.axes.leg] = True
-        seen = shown_legs[used]
+    solids = _solids_of_legs(machine)
+    bodies = bodies_of(solids, len(machine.legs))
+    is_visible = [
+        bool(leg.cylinders or of_leg) for leg, of_leg in zip(machine.legs, bodies, strict=True)
+    ]
+    of_views = [[view.uses(leg.name) for leg in machine.legs] for view in views]
+    seen = np.array(of_views, dtype=np.bool_) & is_visible
     A, B = ends_at_pose(legs, home)
     shown = [np.flatnonzero(row).tolist() for row in seen]
     placed = default_cameras(A, B, shown, machine.spatial, rng)
@@ -445,8 +458,12 @@ def recorded_session(
         unread=np.isnan(m.q_of_poses),
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),
-        shows_arms=dataset.axes is None,
+        occluders=solids,
     )
+
+
+def _solids_of_legs(machine: Machine) -> tuple[Occluder, ...]:
+    return tuple(occluder for occluder in machine.occluders if occluder.leg >= 0)
 
 
 def default_cameras(

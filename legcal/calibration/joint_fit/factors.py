@@ -1,4 +1,4 @@
-"""Measurements and their factors: outlines, readings, axes, and corners of calibration boards.
+"""Measurements and their factors: outlines, edges of bodies, readings, axes, corners of boards.
 
 Each kind is a class of arrays, one row per measurement, with its ``Factor``; :class:`Observed`
 registers the kinds. A measurement in an image depends on both ends of a leg in the camera frame,
@@ -47,6 +47,7 @@ class Observed(NamedTuple):
     outlines: ObservedOutlines
     readings: Readings
     axes: ObservedAxes
+    edges: ObservedEdges  # of bodies
     corners: ObservedCorners  # of the board on the base
     platform_corners: ObservedCorners
 
@@ -57,7 +58,7 @@ class Observed(NamedTuple):
     @property
     def views(self) -> IntArray:
         """Indices of views with measurements."""
-        seen = (self.outlines, self.axes, self.corners, self.platform_corners)
+        seen = (self.outlines, self.axes, self.edges, self.corners, self.platform_corners)
         return np.unique(np.concatenate([kind.view for kind in seen]))
 
     @property
@@ -79,6 +80,7 @@ def observed_arrays(
     axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     cameras: Sequence[Camera] | None = None,
+    edges: Outlines | None = None,
 ) -> Observed:
     """Return measurements as arrays; *cameras* override the cameras of the views.
 
@@ -95,6 +97,7 @@ def observed_arrays(
         observed,
         observed_readings(measurements, legs),
         observed_axes(axes, measurements, legs),
+        observed_edges(edges, measurements, legs, view_cameras if cameras is None else cameras),
         *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
     )
 
@@ -457,6 +460,132 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
     }
     names = [view.name for view in measurements.views]
     return {n: gamma_of[c] for n, c in zip(names, cameras, strict=True) if c in gamma_of}
+
+
+# ---------------------------------------------------------------------------------------- edges
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedEdges:
+    """The n straight edges of the bodies of legs in the fit.
+
+    An edge parallel to the axis of a leg is a line to its vanishing point, wherever it is about the
+    axis and however the body has turned about itself. A body leans by a constant vector in R_b, of
+    which the component along the leg has no effect.
+    """
+
+    index: IntArray  # (n,) rows of the table of edges
+    leg: IntArray  # (n,)
+    view: IntArray  # (n,)
+    pose: IntArray  # (n,)
+    body: IntArray  # (n,) in ``bodies``
+    feet: Array  # (n, 2, 2) both ends on the sensor plane
+    pixels: Array  # (n, 2, 2) the same in the image [px]
+    lens: Array  # (n, 2, 2) J^-T at the second end, J the derivative of pixels there [1/px]
+    # (n,) standard deviation of the offset of the second end from a line through the first [px]
+    sigma: Array
+    bodies: tuple[tuple[int, str], ...]  # leg index and link of each
+    on_actuators: bool = False  # some joints at A move
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def chosen(self, which: BoolArray, scale: float = 1.0) -> ObservedEdges:
+        """Select edges, and scale their standard deviations."""
+        shared = "bodies", "on_actuators"
+        of_edge = [f.name for f in fields(self) if f.name not in shared]
+        chosen = replace(self, **{name: getattr(self, name)[which] for name in of_edge})
+        return replace(chosen, sigma=scale * chosen.sigma)
+
+    def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
+        """Return the offsets (n, 1) [px] of second ends with their derivatives."""
+        arm = np.zeros(len(self), dtype=np.bool_)
+        ends = _ends_in_camera(state, self.leg, self.view, self.pose, arm)
+        D, lean = ends.B - ends.A, state.leans[self.body]
+        length = np.sqrt(np.einsum("in,in->n", D, D))
+        u = D / length
+        along = u + np.einsum("ijn,nj->in", ends.R_camera, lean)
+        xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
+        r, by_along, by_xy = edge_offsets(along, xy.T, self.lens.transpose(1, 2, 0))
+        by_B = (by_along - np.einsum("in,in->n", by_along, u) * u) / length
+        by_lean = np.einsum("ijn,in->jn", ends.R_camera, by_along)
+        by_key = np.einsum("cpn,npck->kn", by_xy, by_intrinsics)
+        slope = np.concatenate([-by_B, by_B, by_lean, by_key])
+
+        def chain(slope: Array) -> tuple[Array, Array]:
+            kept, by_pose = ends.chain(slope)
+            # The lean is fixed in R_b: a rotation of the camera turns it as well.
+            by_rotation = cross(lean[:, None], slope[..., 6:9])
+            kept[..., 6:9] += np.einsum("ijn,nqj->nqi", ends.R_camera, by_rotation)
+            return kept, by_pose
+
+        return Residuals(r[:, None], slope[:, None].T, chain)
+
+    def factor(self, keys: tuple[str, ...]) -> Factor[State]:
+        """Return the factor."""
+        touches: tuple[Touch, ...] = (
+            ("legs", self.leg, _SIX),
+            ("camera_pose", self.view, _ALL),
+            ("leans", self.body, _ALL),
+            ("cameras", self.view, _ALL),
+        )
+        if self.on_actuators:
+            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
+        whitening = 1.0 / self.sigma[:, None, None]
+
+        def rows(state: State) -> Residuals:
+            return self.rows(keys, state)
+
+        return Factor("edges", rows, touches, len(self), 1, self.pose, whitening, robust=True)
+
+
+def observed_edges(
+    edges: Outlines | None,
+    measurements: Measurements,
+    legs: FittedLegs,
+    cameras: Sequence[Camera],
+) -> ObservedEdges:
+    """Return the used edges of bodies as arrays.
+
+    Raises
+    ------
+    DatasetError
+        If the covariance of an edge is not positive definite.
+    """
+    index = np.zeros(0, dtype=np.intp) if edges is None else np.flatnonzero(edges.used)
+    n, none = len(index), np.zeros(0, dtype=np.intp)
+    row = none if edges is None else edges.row[index]
+    leg = none if edges is None else edges.leg[index]
+    pixels = np.zeros((0, 2, 2)) if edges is None else edges.ends[index]
+    covariance = np.zeros((0, 2, 2)) if edges is None else edges.covariance[index]
+    problems = _bad_covariances(covariance, row, leg, measurements, legs)
+    if problems:
+        raise DatasetError(problems)
+    links = () if edges is None else tuple(edges.part[i] for i in index.tolist())
+    keys = list(zip(leg.tolist(), links, strict=True))
+    bodies = tuple(sorted(set(keys)))
+    body = np.array([bodies.index(key) for key in keys], dtype=np.intp)
+    view = measurements.view[row]
+    feet, lens = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
+    for v in np.unique(view).tolist():
+        of_view = view == v
+        feet[of_view] = cameras[v].undistort(pixels[of_view])
+        lens[of_view] = np.swapaxes(_inverses(cameras[v].pixels_per_unit(feet[of_view, 1])), 1, 2)
+    difference = np.array([-1.0, 1.0])
+    variance = np.einsum("i,nij,j->n", difference, covariance, difference)
+    return ObservedEdges(
+        index,
+        leg,
+        view,
+        measurements.pose[row],
+        body,
+        feet,
+        pixels,
+        lens,
+        np.sqrt(variance),
+        bodies,
+        legs.n_actuators > 0,
+    )
 
 
 # ------------------------------------------------------------------------------------- readings
@@ -939,6 +1068,41 @@ def axis_offsets(A: Array, B: Array, M: Array, basis: Array) -> tuple[Array, Arr
     by_A = np.concatenate([-by_leg, (length + height) * by_leg], axis=1)
     by_B = np.concatenate([by_leg, -height * by_leg], axis=1)
     return np.concatenate([alpha, beta]), np.concatenate([by_A, by_B])
+
+
+def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Array]:
+    """Return the distances of points from lines to vanishing points, and derivatives.
+
+    The line through the first point and the vanishing point of a direction D is h = (x0, 1) x D;
+    the distance of the second point is h . (x1, 1) / |J^-T (h1, h2)|.
+
+    Parameters
+    ----------
+    along : (3, n) array
+        D in the camera frame, of any length.
+    xy : (2, 2, n) array
+        Both points on the sensor plane, by coordinate and point.
+    lens : (2, 2, n) array
+        J^-T at the second point [1/px].
+
+    Returns
+    -------
+    offset : (n,) array
+        Distances [px].
+    by_along : (3, n) array
+        Derivatives by D.
+    by_xy : (2, 2, n) array
+        Derivatives by the coordinates of the points.
+    """
+    first, second = (np.concatenate([xy[:, k], np.ones((1, xy.shape[2]))]) for k in (0, 1))
+    h = _cross(first, along)
+    normal = np.einsum("ijn,jn->in", lens, h[:2])
+    size = np.sqrt(np.einsum("in,in->n", normal, normal))
+    offset = np.einsum("in,in->n", h, second) / size
+    by_h = second / size
+    by_h[:2] -= (offset / size**2) * np.einsum("ijn,in->jn", lens, normal)
+    by_xy = np.stack([_cross(along, by_h)[:2], h[:2] / size], axis=1)
+    return offset, _cross(by_h, first), by_xy
 
 
 # ----------------------------------------------------------------------------------- chain rule

@@ -78,6 +78,7 @@ def refine(
     axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
+    edges: Outlines | None = None,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii jointly to all data.
 
@@ -103,6 +104,8 @@ def refine(
         Calibration boards fixed to base and platform, and their corners in images.
     choices : Choices
         Fixed and freed parameters, and priors.
+    edges : Outlines, optional
+        Straight edges of bodies, parallel to their legs; only the used ones enter.
 
     Returns
     -------
@@ -122,11 +125,12 @@ def refine(
 
     def fitted(used: Outlines) -> Solution:
         problem = build_fit(
-            legs, measurements, used, settings, axes=axes, board=board, choices=choices
+            legs, measurements, used, settings, axes=axes, board=board, choices=choices, edges=edges
         )
         problem.require_determined()
         with explaining_missing_scale(problem):
-            return _fit_from_best_start(problem, used, starts)
+            solution = _fit_from_best_start(problem, used, starts)
+        return solution if edges is None else _with_edges(solution, edges)
 
     return _fit_without_wrong_arms(fitted, outlines, legs.nominal)
 
@@ -158,6 +162,26 @@ def _fit_without_wrong_arms(
         else:
             if not wrong:
                 return dataclasses.replace(solution, notes=(*notes, *solution.notes))
+
+
+def _with_edges(solution: Solution, edges: Outlines) -> Solution:
+    """Return a solution with the edges of bodies and their rejections, and a detail on them."""
+    problem = solution.posterior.problem
+    used, weight = problem.edges, np.ravel(problem.factor("edges").whitening)
+    disagrees = np.zeros(len(edges), dtype=np.bool_)
+    disagrees[used.index] = weight == 0.0
+    if not weight.any():
+        return dataclasses.replace(solution, edges=edges.reject(disagrees, Reason.DISAGREES))
+    sigma = float(np.median(1.0 / weight[weight > 0.0]))
+    detail = (
+        f"{np.count_nonzero(weight)} of {len(edges)} edges of bodies were used; one end of an "
+        f"edge, seen from the other, is known to {sigma:.2f} px."
+    )
+    return dataclasses.replace(
+        solution,
+        edges=edges.reject(disagrees, Reason.DISAGREES),
+        details=(*solution.details, detail),
+    )
 
 
 def _origin(start: Start) -> str:

@@ -148,6 +148,8 @@ def judged_readings(
             ]
         wrong.append(WrongReading(leg, pose, motor, *image, float(error[k]), unit, tuple(alike)))
     tests = _tests(problem, linear, normal)
+    assumed = 1.0 / np.asarray(problem.factor("readings").whitening)[used, 0, 0]
+    tests = replace(tests, r=tests.r * assumed / readings.sigma[used])  # of what is stated
     distance = np.array([1.0 / legs[j].reading_of(1.0) for j in tests.leg.tolist()])
     displacements = tests.r * readings.sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, displacements))

@@ -42,7 +42,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 
 _SUM = np.array([1.0, 1.0])
 _DIFFERENCE = np.array([-1.0, 1.0])
-_MEDIAN_OF_1 = 0.454936423119573  # median square of a unit Gaussian
+MEDIAN_OF_1 = 0.454936423119573  # median square of a unit Gaussian
 MEDIAN_OF_2 = 2.0 * np.log(2.0)  # median squared norm of two unit Gaussians
 _MIN_SCALE = 0.1
 _MIN_NOISE_GAIN = (
@@ -135,7 +135,7 @@ def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
     ss, sd, dd, turned = s * s, s * d, d * d, _turned(claimed)
 
     def scale_of(squares: Array, variances: Array) -> float:
-        return float(np.sqrt(np.median(squares / variances) / _MEDIAN_OF_1))
+        return float(np.sqrt(np.median(squares / variances) / MEDIAN_OF_1))
 
     def excess(noise: NoiseModel) -> float:
         (a, b, c), _ = _inverted(_covariance(noise.variances, turned))

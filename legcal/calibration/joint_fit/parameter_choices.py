@@ -167,7 +167,6 @@ def known_parameters(
     machine: Machine,
     views: Sequence[View],
     *,
-    axes_given: bool = False,
     boards: Sequence[FixedBoard] = (),
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
@@ -180,10 +179,6 @@ def known_parameters(
         for fixed in boards
     }
     lengths = _lengths(machine)
-    if axes_given:
-        reason = "measured axes, in which cameras and radii are contained already"
-        others |= dict.fromkeys((*seen, *synonyms), reason)
-        return KnownParameters(by_name | board, others, {}, lengths)
     return KnownParameters(by_name | seen | board, others, synonyms, lengths)
 
 

@@ -56,7 +56,7 @@ from legcal.machine.model import Machine
 from legcal.machine.rods import reading_of_rod
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.sight import Seen
+from legcal.vision.visibility import Seen
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
@@ -262,12 +262,13 @@ def information_of_images(
     choices: Choices = NO_CHOICES,
     *,
     board: BoardCorners | None = None,
+    edges: Outlines | None = None,  # of bodies
     is_fit: bool = False,  # as in :meth:`Predictor.contributions`
     known_length: float | None = None,  # mean leg length of weak priors; without it there are none
 ) -> Contributions:
     """Return the information of the joint fit, linearised at a start."""
     usual = _as_calibrated(legs, choices)
-    problem = build_fit(legs, measurements, outlines, board=board, choices=usual)
+    problem = build_fit(legs, measurements, outlines, board=board, choices=usual, edges=edges)
     biases = possible_biases(problem.outlines, legs.names)
     problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
     state = problem.begin(start)

@@ -23,12 +23,14 @@ from legcal.calibration.joint_fit.factors import (
     Observed,
     ObservedAxes,
     ObservedCorners,
+    ObservedEdges,
     ObservedOutlines,
     Readings,
     measured_lengths,
     observed_arrays,
     observed_axes,
     observed_corners,
+    observed_edges,
     observed_readings,
 )
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel
@@ -52,7 +54,7 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
-from legcal.calibration.tuning import EDGE_BIAS_PX
+from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
 from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.outlines import Outlines
@@ -129,6 +131,11 @@ class FitProblem(EstimationProblem[State]):
         return self.observed.axes
 
     @property
+    def edges(self) -> ObservedEdges:
+        """The edges of bodies."""
+        return self.observed.edges
+
+    @property
     def boards(self) -> tuple[ObservedCorners, ...]:
         """Corners of the calibration board on each link; empty without a board."""
         return self.observed.boards
@@ -192,6 +199,7 @@ class FitProblem(EstimationProblem[State]):
             Frames.of([start.T_Rb_board, start.T_Re_board]),
             self.postures(start.legs, start.T_Rb_Re),
             np.zeros(self.block("own_zeros").n_unknowns),
+            np.zeros((len(self.edges.bodies), 3)),
         )
 
     def postures(self, legs: Sequence[Leg], T_Rb_Re: Sequence[RigidTransform]) -> Postures:
@@ -242,6 +250,11 @@ class FitProblem(EstimationProblem[State]):
         )
         return other.with_factors(corners.factor(self.keys))
 
+    def with_edges(self, edges: ObservedEdges) -> FitProblem:
+        """Replace the edges of bodies; those left out keep their lean."""
+        other = self.changed(observed=self.observed._replace(edges=edges))
+        return other.with_factors(edges.factor(self.keys))
+
     def with_measurements(
         self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
     ) -> FitProblem:
@@ -253,6 +266,7 @@ class FitProblem(EstimationProblem[State]):
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
             observed_readings(measurements, self.legs),
             observed_axes(None, measurements, self.legs),
+            replace(observed_edges(None, measurements, self.legs, ()), bodies=self.edges.bodies),
             *observed_corners(None, measurements, ()),
         )
         radii = self.block("radii")
@@ -286,6 +300,7 @@ def build_fit(
     axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
+    edges: Outlines | None = None,
 ) -> FitProblem:
     """Build the joint fit without solving it; arguments as those of :func:`refine`.
 
@@ -302,7 +317,7 @@ def build_fit(
     cameras = tuple(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
-    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras)
+    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras, edges)
     n_poses, images = measurements.n_poses, _images(measurements)
     return _build_problem(
         _FitInputs(legs, observed, cameras, owners, n_poses, images, settings), choices
@@ -343,7 +358,7 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
     outlines, boards = observed.outlines, observed.boards
     parameters, kinematic = _kinematic(given, choices)
     views_with_outlines_or_corners = np.concatenate(
-        [outlines.view, *(corners.view for corners in boards)]
+        [outlines.view, observed.edges.view, *(corners.view for corners in boards)]
     )
     observed_owners = {given.owners[v] for v in np.unique(views_with_outlines_or_corners).tolist()}
     intrinsics, keys = _intrinsics(outlines.views, cameras, given.owners, observed_owners, choices)
@@ -362,6 +377,7 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
         _scalars("radii", radii, "m", nominal, settings.radius_sigma * nominal, choices),
         intrinsics,
         _board_scales(boards, settings, choices),
+        _leans(legs.names, observed.edges.bodies),
         no_biases,
         Variables("camera_pose", camera_pose, Frames.moved, max_step=_MAX_STEP),
         Variables("board_pose", board_pose, Frames.moved, max_step=_MAX_STEP),
@@ -453,6 +469,14 @@ def arm_sigmas(
         for leg in seen
         for i, sigma in zip(place[leg].tolist(), sigmas, strict=True)
     }
+
+
+def _leans(names: Sequence[str], bodies: Sequence[tuple[int, str]]) -> Variables:
+    """Return the block of the leans of bodies, with their prior."""
+    labels = tuple(f"{names[leg]}.lean.{link}.{axis}" for leg, link in bodies for axis in "xyz")
+    n = len(labels)
+    prior = GaussianPrior(np.arange(n, dtype=np.intp), np.zeros(n), np.full(n, LEAN_SIGMA))
+    return Variables("leans", all_free(n // 3, 3), labels=labels, units=("rad",) * n, prior=prior)
 
 
 def _poses(n_poses: int, n_actuators: int) -> Variables:

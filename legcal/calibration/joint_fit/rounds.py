@@ -26,6 +26,7 @@ from legcal.calibration.joint_fit.outlier_readings import (
 )
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
+    MEDIAN_OF_1,
     MEDIAN_OF_2,
     N_KINDS,
     PLACES,
@@ -85,6 +86,7 @@ class Fit:
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
     at_places: RepeatedErrors | None = None  # errors shared there, None where there are none
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
+    edge_scale: float = 1.0  # of the standard deviations of edges of bodies
 
     @property
     def state(self) -> State:
@@ -175,13 +177,26 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
     Axes keep their claimed covariances; only the robust loss guards against outliers among them.
-    *first* is the result of :func:`first_minimum`.
+    *first* is the result of :func:`first_minimum`. Readings of redundant motors that contradict
+    each other in many images bend a fit until outlines contradict it: they get rough standard
+    deviations then, so that what is wrong with them can be named.
 
     Raises
     ------
     DidNotConverge
         If a minimisation fails, most outlines or axes are outliers, or the rounds do not converge.
     """
+    try:
+        return _fit_in_rounds(problem, first)
+    except DidNotConverge:
+        if not problem.legs.is_redundant:
+            raise
+        rough = with_inflated_reading_noise(problem)
+        return _fit_in_rounds(rough, replace(first, linear=linearize(rough, first.state)))
+
+
+def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
+    """Fit with the noise of readings as it is."""
     possible = possible_biases(problem.outlines, problem.legs.names)
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
@@ -243,7 +258,7 @@ def _with_estimated_errors(fit: Fit, possible: EdgeBiases, least: Array) -> tupl
     for turn in range(settings.noise_rounds if len(fit.accepted) else 1):
         # Two kinds of noise that are told apart by a hair would take turns.
         included = fit.noise if turn >= _TURNS_OF_NOISE else NoiseModel()
-        before, fit = fit, fit.weighted(_noise(fit, included))
+        before, fit = fit, _with_edge_noise(fit.weighted(_noise(fit, included)))
         changes = Changes.of(before, fit)
         if are_white and changes.converged(settings):
             fit = _linearized(fit)
@@ -376,6 +391,27 @@ def _noise(fit: Fit, included: NoiseModel) -> NoiseModel:
     return estimate_noise(offsets, explained, claimed[used], weight[used], included)
 
 
+def _with_edge_noise(fit: Fit) -> Fit:
+    """Estimate the noise of edges of bodies from their residuals, by their median.
+
+    Outliers keep their place: the weight of an edge falls to zero beyond the rejection distance.
+    """
+    edges, settings = fit.problem.edges, fit.problem.settings
+    if not len(edges):
+        return fit
+    linear = fit.minimum.linear
+    normal = information(fit.problem, fit.state, linear, fit.problem.loss)
+    share = leverage(fit.problem, linear, normal, "edges")[:, 0, 0]
+    redundancy = max(1.0 - float(np.mean(share)), _MIN_REDUNDANCY)
+    offsets = edges.rows(fit.problem.keys, fit.state).r[:, 0] / edges.sigma
+    variance = float(np.median(offsets**2)) / MEDIAN_OF_1 / redundancy
+    scale = max(float(np.sqrt(variance)), _MIN_SCALE)
+    agrees = np.abs(offsets) <= settings.rejection * scale
+    whitening = (agrees / (scale * edges.sigma))[:, None, None]
+    factor = replace(fit.problem.factor("edges"), whitening=whitening)
+    return replace(fit, problem=fit.problem.with_factors(factor), edge_scale=scale)
+
+
 def _weights(problem: FitProblem, state: State, noise: NoiseModel) -> Array:
     """Weights of outlines at a fit; zero in images with an undetermined pose.
 
@@ -500,7 +536,8 @@ NO_CHANGES = Changes(np.zeros(0), np.zeros(0), 0, 0)
 def _sizes(fit: Fit) -> Array:
     """All standard deviations of errors: a factor, the others [px]."""
     noise, biases = fit.noise, fit.edge_biases
-    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *biases.sigma[: len(KINDS)]])
+    sizes = noise.scale, noise.bias_px, noise.tilt_px, *biases.sigma[: len(KINDS)]
+    return np.array([*sizes, fit.edge_scale] if len(fit.problem.edges) else sizes)
 
 
 def check_convergence(

@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_o
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
-from legcal.calibration.tuning import SCALE_BY_CHANCE
+from legcal.calibration.tuning import SCALE_BY_CHANCE, TRAVEL_SIGMA
 from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
@@ -33,6 +33,7 @@ from legcal.machine.leg import LegColumns, ParameterId
 from legcal.vision.board import LINKS
 
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
+ALL_READINGS = "an error that all readings share, by one standard deviation of pitches"
 TRAVEL, BOARD = "the travel of the motors", "the calibration board"
 RADII, MODEL = "the radii", "the nominal model"
 _CLEARLY = 4.0  # squared sigmas, by which the others agree better without one witness
@@ -80,13 +81,23 @@ def explaining_missing_scale(problem: FitProblem) -> Iterator[None]:
 
 
 def sensitivity_to_scale(
-    problem: FitProblem, state: State, covariance: Array
+    problem: FitProblem, state: State, linear: Linearization, covariance: Array
 ) -> tuple[Sensitivity, ...]:
-    """Return the change of parameters with one sigma of a scale that is known from radii alone.
+    """Return the change of parameters with one sigma of a scale that no sigma of the fit contains.
 
-    *covariance* is of the kept unknowns. The scale is the relative change of the mean length of
-    rods; its share of the covariance would vanish with one measured length.
+    *covariance* is of the kept unknowns. Where radii alone say the scale, it is the relative change
+    of the mean length of rods; its share of the covariance would vanish with one measured length.
+    Where motors slide, their readings are exact in the fit, but screws and belts are not: they
+    share an error of which boards and stated lengths say as much as they know, by its score.
     """
+    if (travel := _travel(problem)).any():
+        columns = {"readings": _whitened_travel(problem, travel)[..., None]}
+        normal = normal_equations(problem, state, linear)
+        (score,), ((information,),) = score_test(problem, linear, normal, columns)
+        variance = 1.0 / (TRAVEL_SIGMA**-2 + information)
+        off = float(np.hypot(score * variance, np.sqrt(variance)))
+        moved = kinematic_steps(problem, response(problem, linear, normal, columns))
+        return (Sensitivity(ALL_READINGS, off * moved),)
     parametrization = problem.legs.parametrization
     column = parametrization.place[:, LegColumns.LENGTH]
     rods = np.flatnonzero(column >= 0)
@@ -117,6 +128,11 @@ def _travel(problem: FitProblem) -> Array:
     """Return the readings of motors, (n,) [m]; zero where they are angles."""
     is_angle = np.array([leg.reads_angle for leg in problem.legs.nominal], dtype=np.bool_)
     return np.where(is_angle[problem.readings.leg], 0.0, problem.readings.length)
+
+
+def _whitened_travel(problem: FitProblem, travel: Array) -> Array:
+    """Return the change of whitened residuals (n, 1) by readings that are too large by one unit."""
+    return np.asarray(-np.asarray(problem.factor("readings").whitening)[:, :, 0] * travel[:, None])
 
 
 def stated_lengths(problem: FitProblem) -> dict[str, float]:
@@ -325,8 +341,7 @@ def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_E
 
     errors = list[_Error]()
     if (travel := _travel(problem)).any():
-        whitening = np.asarray(problem.factor("readings").whitening)[:, :, 0]
-        errors.append(_Error(TRAVEL, {"readings": -whitening * travel[:, None]}, no_prior))
+        errors.append(_Error(TRAVEL, {"readings": _whitened_travel(problem, travel)}, no_prior))
     boards = [board_scale(corners.link) for corners in problem.boards if len(corners)]
     if fixed := [name for name in boards if problem.choices.holds(name)]:
         size = np.array([[float(board_scale(link) in fixed)] for link in LINKS])

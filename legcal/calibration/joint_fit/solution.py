@@ -219,6 +219,7 @@ class Solution:
     notes: tuple[str, ...] = ()  # one sentence each
     details: tuple[str, ...] = ()  # on the starts, one sentence each
     left_out: tuple[str, ...] = ()  # legs in views with most outlines rejected, unconfirmed
+    edges: Outlines | None = None  # straight edges of bodies, with the rejections of the fit
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -274,7 +275,7 @@ def assemble_solution(
         gammas=gammas,
         sensitivities=(
             *sensitivities(cameras, normal, contradicted),
-            *sensitivity_to_scale(problem, state, kept),
+            *sensitivity_to_scale(problem, state, linear, kept),
         ),
         outlines=_with_rejections(outlines, fit),
         start=label,
@@ -353,13 +354,10 @@ def _estimates(
     problem: FitProblem, state: State, held: HeldDirections, covariance: Array
 ) -> Estimates:
     """Estimates of all parameters; *covariance* is of the named unknowns."""
-    legs, biases, parametrization = (
-        problem.legs,
-        problem.block("biases").labels,
-        problem.legs.parametrization,
-    )
+    legs, parametrization = problem.legs, problem.legs.parametrization
+    nuisance = {*problem.block("biases").labels, *problem.block("leans").labels}
     radii = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
-    unknown = [name for name in problem.named if name not in biases]
+    unknown = [name for name in problem.named if name not in nuisance]
     unknown_values = dict(zip(problem.named, problem.coordinates(state).tolist(), strict=True))
     values = dict(zip(parametrization.names, legs.vector(state.legs).tolist(), strict=True))
     values |= dict(zip(radii, state.radii.tolist(), strict=True))
@@ -498,6 +496,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=order.restore(solution.outlines),
+        edges=None if solution.edges is None else order.restore(solution.edges),
         quality=replace(
             solution.quality,
             redundant_readings=readings and readings.renumbered(order.legs.tolist(), file_pose),

@@ -134,6 +134,7 @@ class State:
     platform_pose: Postures  # T_Rb_Re, one a pose
     # (n_own_zeros,) readings in images with a zero of their own, over those in others [m or rad]
     own_zeros: Array
+    leans: Array  # (n_bodies, 3) of bodies against the lines of their joints, in R_b [rad]
 
     @cached_property
     def A(self) -> Array:

@@ -1,0 +1,149 @@
+"""Straight edges of the bodies of legs: in the joint fit, in files, in photographs, in identify."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fit_sessions import MachineSession, body_edges, machine_session
+from simulated import PLACES, settings, small_camera
+
+from legcal import calibrate, load_dataset
+from legcal.calibration.identify.identifiability import identifiability_of_dataset
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.ordered_dataset import nominal_poses
+from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason
+from legcal.files.motions import MotionEntry
+from legcal.machine.parameters import geometries
+from legcal.perception.body_edges import bodies_in_view, edges_of_body
+from legcal.perception.photographs import nominal_placement
+from legcal.simulation.cameras import mild_lens, read_lens
+from legcal.simulation.dataset import simulate
+from legcal.simulation.settings import Level
+from legcal.simulation.visibility import Viewpoint
+
+ROOT = Path(__file__).parents[1]
+BODY = (
+    '<visual><origin xyz="0.004 -0.003 -0.255" rpy="0 0 0"/>'
+    '<geometry><box size="0.03 0.03 0.11"/></geometry></visual>'
+)
+
+
+def without_leg(session: MachineSession, leg: int) -> Outlines:
+    return session.outlines.choose(session.outlines.leg != leg)
+
+
+def fitted(session: MachineSession, edges: Outlines | None, outlines: Outlines) -> Solution:
+    return refine(session.legs, session.measurements, outlines, session.start, edges=edges)
+
+
+def error(session: MachineSession, solution: Solution) -> float:
+    """Return the largest error of a joint centre [m]."""
+    pairs = zip(solution.legs, session.truth.legs, strict=True)
+    return float(max(np.abs(a.A - b.A).max() + np.abs(a.B - b.B).max() for a, b in pairs))
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rps"])
+def test_a_leg_with_a_body_and_no_round_part_is_found_exactly(name: str) -> None:
+    session = machine_session(name)
+    solution = fitted(session, body_edges(session), without_leg(session, 0))
+    assert error(session, solution) < 1e-7
+    start = zip(session.start.legs, session.truth.legs, strict=True)
+    assert max(np.abs(a.A - b.A).max() for a, b in start) > 1e-3
+
+
+def test_edges_make_a_machine_more_certain_and_know_their_noise() -> None:
+    session = machine_session("hexapod")
+    measurements, outlines = session.noisy(1)
+    noisy = replace(session, measurements=measurements)
+    edges = body_edges(session, 0.1, seed=2)
+    claimed = replace(edges, covariance=0.25 * edges.covariance)  # half of the true noise
+    with_edges, rods = fitted(noisy, claimed, outlines), fitted(noisy, None, outlines)
+    problem = with_edges.posterior.problem
+    whitening = np.asarray(problem.factor("edges").whitening)
+    scale = 1.0 / (problem.edges.sigma * whitening[:, 0, 0])
+    np.testing.assert_allclose(scale, 2.0, rtol=0.15)
+    names = rods.estimates.names
+    assert names == with_edges.estimates.names
+    assert np.all(with_edges.estimates.sigma < rods.estimates.sigma)
+
+
+def test_wrong_edges_are_rejected_and_bodies_may_lean() -> None:
+    session = machine_session("hexapod")
+    edges = body_edges(session, 0.1, seed=3)
+    wrong = np.arange(0, len(edges), 9)
+    ends = edges.ends.copy()
+    ends[wrong, 1] += 6.0
+    solution = fitted(session, replace(edges, ends=ends), session.outlines)
+    assert solution.edges is not None
+    rejected = np.flatnonzero(solution.edges.rejected_for(Reason.DISAGREES))
+    assert set(wrong) - set(rejected) == set()
+    assert len(rejected) < len(wrong) + 0.02 * len(edges)
+    assert error(session, solution) < 2e-4
+
+
+@pytest.fixture(scope="module")
+def with_bodies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a hexapod whose legs have square bodies, the second one nothing else."""
+    folder = tmp_path_factory.mktemp("bodies")
+    text = (ROOT / "urdf/hexapod.urdf").read_text()
+    first = re.compile(r'(<link name="leg2_[^"]*">)<visual>.*?</visual>(</link>)')
+    text = first.sub(r"\1\2", text)
+    for j in range(1, 7):
+        text = text.replace(f'<link name="leg{j}_tube">', f'<link name="leg{j}_tube">{BODY}')
+    for kind, content in (("urdf", text), ("models", None)):
+        (folder / kind).mkdir()
+        file = folder / kind / f"hexapod.{'urdf' if content else 'yaml'}"
+        file.write_text(content or (ROOT / "models/hexapod.yaml").read_text())
+    return folder / "models/hexapod.yaml"
+
+
+def test_a_leg_with_a_body_alone_is_identified_and_calibrated(
+    with_bodies: Path, tmp_path: Path
+) -> None:
+    places = json.loads(PLACES.read_text())["hexapod"]
+    views = tuple(
+        Viewpoint(name, mild_lens(), MotionEntry(**places[name]["T_base_camera"]).motion())
+        for name in ("c1", "c2")
+    )
+    made = simulate(with_bodies, tmp_path / "set", settings(views=views, poses=8))
+    dataset = load_dataset(made.folder)
+    assert dataset.observations is not None
+    assert dataset.body_edges is not None
+    assert 1 not in dataset.observations.leg
+    assert set(dataset.body_edges.edge.tolist()) == {3, 4}
+    assert identifiability_of_dataset(dataset).identifiable
+    result = calibrate(dataset, output=tmp_path / "out")
+    true = geometries(made.truth)[1]
+    found, nominal = result.solution.legs[1], geometries(made.nominal)[1]
+    assert np.linalg.norm(found.B - true.B) < 0.3 * np.linalg.norm(nominal.B - true.B)
+    written = (tmp_path / "out/observations.csv").read_text()
+    assert written.count("leg2_tube") == np.sum(dataset.body_edges.leg == 1)
+
+
+def test_edges_in_photographs_point_along_their_legs(with_bodies: Path, tmp_path: Path) -> None:
+    place = json.loads(PLACES.read_text())["hexapod"]["c1"]["T_base_camera"]
+    T = MotionEntry(**place).motion()
+    lens = read_lens(small_camera(tmp_path, 1000, 750))
+    seen_from = settings(level=Level.PHOTOGRAPHS, views=(Viewpoint("c1", lens, T),), poses=1)
+    made = simulate(with_bodies, tmp_path / "set", seen_from)
+    dataset, truth = load_dataset(made.folder), made.truth
+    m = dataset.measurements
+    back = truth.T_platform_Re.inv()
+    poses = [truth.T_base_Rb * T_Rb_Re * back for T_Rb_Re in nominal_poses(truth, m)[0]]
+    placement = nominal_placement(truth, m, poses)
+    grey, ends = dataset.image_reader([0])(0), (placement.A_base[0], placement.B_base[0])
+    every = np.ones(6, dtype=np.bool_)
+    found = 0
+    for body in bodies_in_view(truth.occluders, lens, T, ends, every):
+        for edge in edges_of_body(grey, lens, body):
+            rays = np.column_stack([lens.undistort(edge.ends), np.ones(2)])
+            h = np.cross(rays[0], body.B - body.A)
+            off = lens.line_offset(h[None] / np.linalg.norm(h), rays[1:, :2])
+            assert abs(float(off[0])) < 0.7
+            found += 1
+    assert found >= 6
