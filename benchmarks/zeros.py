@@ -88,7 +88,7 @@ def session(seed: int, options: argparse.Namespace, folder: Path) -> tuple[dict[
         travel = np.array([true.legs[j].travel for j in true.motors])
         if np.all((q - zeros > travel[:, 0]) & (q - zeros < travel[:, 1])):
             poses.append(q)
-    rows, views = list[list[str]](), {}
+    rows, views = list[tuple[str, str, str]](), {}
     (folder / "images").mkdir(parents=True)
     look = Appearance(camera="phone", colour=CAMERAS["phone"].colour)
     outlines = list[list[str]]()
@@ -116,6 +116,9 @@ def session(seed: int, options: argparse.Namespace, folder: Path) -> tuple[dict[
         view = f"c{k + 1}"
         made = yaml.safe_load((one / "dataset.yaml").read_text())["views"]["c1"]
         views[view] = {**made, "camera": "camera_info.yaml"}
+        if options.level == "photographs":
+            view, views = f"phone-{k + 1}", {"phone": {**made, "camera": "camera_info.yaml"}}
+            views["phone"]["hand_held"] = True
         image = ""
         if options.level == "photographs":
             file = next((one / "images").iterdir())
@@ -129,14 +132,14 @@ def session(seed: int, options: argparse.Namespace, folder: Path) -> tuple[dict[
                     elif i > 0:
                         outlines.append([view, f"p{p + 1}", *row[2:]])
         shutil.rmtree(one)
-        rows.append([view, image, f"p{p + 1}"])
+        rows.append((view.partition("-")[0], image, f"p{p + 1}"))
     sigma = READINGS.size
     read = [q - zeros + sigma * rng.normal(size=len(q)) for q in poses]
     with (folder / "measurements.csv").open("w") as table:
         writer = csv.writer(table)
         writer.writerow(["view", "image", "pose", *(true.legs[j].prismatic for j in true.motors)])
-        for of, image, pose in rows:
-            writer.writerow([of, image, pose, *read[int(pose[1:]) - 1].tolist()])
+        for view, image, pose in rows:
+            writer.writerow([view, image, pose, *read[int(pose[1:]) - 1].tolist()])
     if outlines:
         with (folder / "observations.csv").open("w") as table:
             csv.writer(table).writerows(outlines)

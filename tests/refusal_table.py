@@ -415,7 +415,6 @@ def _datasets() -> Iterable[Refusal]:
         ("no-legs", entry(views__c1__legs=[]), ("views.c1.legs",)),
         ("legs-twice", entry(views__c1__legs=["leg1", "leg1"]), ("c1", "leg1")),
         ("leg", entry(views__c1__legs=["leg1", "leg7"]), ("c1", "'leg7'")),
-        ("hand-held", entry(views__c1__hand_held=True), ("c1", "board")),
         (
             "all-at-once",
             entry(encoder_sigma=-1, views__c1__legs=3, views__c2={}, measurements=GONE),

@@ -436,6 +436,7 @@ class MotorZero(Document):
 
     motor: str
     value: Number
+    written: Number  # in calibrated.urdf, where it serves the platform best beside nominal parts
     sigma: Number
     tolerance: Number
     unit: Literal["m", "rad"]

@@ -1,9 +1,10 @@
 """One group of parameters from few images: zeros, lengths or all, with tolerances as priors.
 
 The joint fit has the tolerances as priors of all parameters
-(:mod:`legcal.calibration.joint_fit.part_errors`). What is reported and written is the posterior of
-the group, with all else marginalised: the model keeps its nominal values there. The predicted error
-of the platform contains what the fit has found elsewhere and the model does not take.
+(:mod:`legcal.calibration.joint_fit.part_errors`). What is reported is the posterior of
+the group, with all else marginalised. The written model keeps nominal values of all else; its group
+is moved further by what serves the platform best there: the least squares, over the workspace, of
+what the posterior means of all else do to it. The predicted error contains what that leaves.
 """
 
 from __future__ import annotations
@@ -16,25 +17,31 @@ import numpy as np
 
 from legcal.calibration.documents import MotorZero
 from legcal.calibration.doubts import MOST_MOVED, TOLERANCE, Doubt
+from legcal.calibration.joint_fit.parameter_choices import Group
 from legcal.calibration.joint_fit.part_errors import (
-    Group,
     Kind,
     PartErrors,
     part_errors,
     with_zeros,
 )
+from legcal.calibration.joint_fit.platform import platform_by_parameters, workspace_poses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import fitted_legs
-from legcal.errors import UsageError
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import frame_on_points
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.machine.parameters import geometries, in_joint_frames, vector_of
-from legcal.machine.tolerance import NOT_STATED, Tolerance
+from legcal.machine.parameters import (
+    geometries,
+    in_joint_frames,
+    parametrization_of,
+    vector_of,
+)
+from legcal.machine.tolerance import Tolerance
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
+_WELL = 1e-3  # of the largest singular value: motions of the platform by a group that count
 RARE = 10.0  # by which a horn on another tooth must raise twice the logarithm of a likelihood
 _SURE = 2.5  # standard deviations within which an offset is a whole number of teeth
 
@@ -57,6 +64,7 @@ class GroupEstimate:
     errors: PartErrors
     value: Array  # (m,) posterior mean of these errors [m, rad], beside what is turned
     sigma: Array  # (m,) their standard deviations
+    held: Array  # (m,) what the written model has of them
     solution: Solution
     written: tuple[Leg, ...]
 
@@ -77,6 +85,7 @@ class GroupEstimate:
                 MotorZero(
                     motor=motor,
                     value=value,
+                    written=float(self.held[i]) + self.turned.get(motor, 0.0),
                     sigma=float(self.sigma[i]),
                     tolerance=float(self.errors.sigma[i]),
                     unit=self.machine.legs[j].reading_unit,
@@ -134,23 +143,6 @@ class GroupEstimate:
         return found
 
 
-def built_of(machine: Machine) -> Tolerance:
-    """Return the complete tolerances of a machine.
-
-    Raises
-    ------
-    UsageError
-        If neither the model nor the dataset states any.
-    """
-    if machine.tolerance == NOT_STATED:
-        raise UsageError(
-            "--only could not be used: found no tolerance, needed how well the machine is built; "
-            "state machine_kind: printed, machined or bought, or tolerance, in dataset.yaml or in "
-            "the block legcal of the model."
-        )
-    return machine.tolerance.completed(machine.size)
-
-
 def likely_teeth(
     machine: Machine, solution: Solution, built: Tolerance, wide: Tolerance, step: float
 ) -> list[tuple[float, dict[str, float]]]:
@@ -205,12 +197,15 @@ def estimate_group(
     if group == "all":
         moved, left = with_zeros(solution.legs, turned), np.zeros(len(value))
     else:
-        left = np.where(chosen, 0.0, value)
-        moved = _with_group(legs.nominal, near, value, turned, group)
+        marginal = _with_group(legs.nominal, near, value, turned, group)
+        framed = in_joint_frames(marginal, machine.frame_legs)
+        more = _serving_platform(machine, framed, there.J, np.where(chosen, 0.0, value), chosen)
+        moved = _with_group(legs.nominal, near, value + more, turned, group)
+        left = np.where(chosen, -more, value)
     C = there.J @ (covariance + np.outer(left, left)) @ there.J.T
     sigma = np.sqrt(np.diagonal(covariance))
     if group == "all" and not turned:
-        return GroupEstimate(group, machine, turned, near, value, sigma, solution, moved)
+        return GroupEstimate(group, machine, turned, near, value, sigma, value, solution, moved)
     by_fit, free = there.J @ K, np.any(there.J[:, chosen] != 0.0, axis=1)
     frame_legs = list(machine.frame_legs)
     T = frame_on_points(np.array([moved[j].A for j in frame_legs])).inv()
@@ -238,7 +233,27 @@ def estimate_group(
             replace(one, steps=by_fit @ one.steps) for one in solution.sensitivities
         ),
     )
-    return GroupEstimate(group, machine, turned, near, value, sigma, reported, moved)
+    return GroupEstimate(group, machine, turned, near, value, sigma, value - left, reported, moved)
+
+
+def _serving_platform(
+    machine: Machine, legs: tuple[Leg, ...], J: Array, others: Array, chosen: BoolArray
+) -> Array:
+    """Return the errors (m,) of *chosen* parts that move the platform as those of *others* do.
+
+    By least squares over the workspace, rotations as they move the joints of the platform; zero
+    where readings do not determine its pose.
+    """
+    more = np.zeros(len(others))
+    poses = workspace_poses(machine, legs) if machine.is_determined else None
+    if poses is None:
+        return more
+    parametrization = parametrization_of(machine, twists=True)
+    G = platform_by_parameters(legs, parametrization, machine.frame_legs, poses) @ J
+    arm = 0.5 * float(np.linalg.norm(np.ptp(machine.B_platform, axis=0)))
+    G = (G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, len(others))
+    more[chosen] = np.linalg.lstsq(G[:, chosen], G @ others, rcond=_WELL)[0]
+    return more
 
 
 def _with_group(

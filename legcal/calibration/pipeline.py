@@ -43,11 +43,16 @@ from legcal.calibration.estimate import (
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
-from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known_parameters, resolve
-from legcal.calibration.joint_fit.part_errors import Group
+from legcal.calibration.joint_fit.parameter_choices import (
+    Choices,
+    Group,
+    Prior,
+    known_parameters,
+    resolve,
+)
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.only import RARE, built_of, estimate_group, likely_teeth
+from legcal.calibration.only import RARE, estimate_group, likely_teeth
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -185,8 +190,8 @@ def calibrate(
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides)
-    if only is not None:
-        choices = replace(choices, built=built_of(dataset.machine))
+    by_parts = Choices.by_tolerances(dataset.machine, only)
+    choices = replace(choices, built=by_parts.built, only=by_parts.only)
     left_out = chosen_images(dataset, leave_out) if leave_out else None
     if zeros := own_zeros(dataset, listed(split), left_out):
         dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))

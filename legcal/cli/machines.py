@@ -16,6 +16,7 @@ from legcal.cli.options import (
     JsonOption,
     ModelArgument,
     NoiseOption,
+    OnlyOption,
     PageOption,
     as_lines,
     check_page,
@@ -238,6 +239,7 @@ def identify(
     ] = False,
     hand_held: HandHeldOption = False,
     noise: NoiseOption = None,
+    only: OnlyOption = None,
     page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -255,6 +257,7 @@ def identify(
         platform_board=platform_board,
         hand_held=hand_held,
         noise=noise,
+        only=only,
     )
     verdict = identify_verdict(identified)
     write_page(page, f"Identifiability of {model}", identify_table(identified), verdict)

@@ -527,7 +527,8 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
         place = str(dataset.table_path), row + 1
         problems.append((row, Problem(what, found, needed, remedy, *place, columns=columns)))
 
-    held = [view.hand_held for view in measurements.views]
+    by_board = dataset.board_on("base") is not None
+    held = [view.hand_held and by_board for view in measurements.views]
     no_place, of_held = "its camera could not be placed", "every image of a hand-held camera"
     shown = np.zeros(measurements.n_rows, dtype=np.intp)  # corners of the board on the base
     if corners is not None:

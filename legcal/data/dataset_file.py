@@ -230,20 +230,9 @@ def view_problems(
     problems += [
         entry_problem(
             path,
-            f"views.{name}.hand_held",
-            "no board",
-            "a calibration board on the base in every image of a camera that is held in the hand",
-            "describe it in the block board",
-        )
-        for name in held
-        if "base" not in boards
-    ]
-    problems += [
-        entry_problem(
-            path,
             f"views.{name}.T_base_camera",
             "one pose of a camera that is held in the hand",
-            "none, the board gives the pose of every image",
+            "none, each image has its own, by the board or by the legs",
             "remove it",
         )
         for name, view in held.items()

@@ -55,7 +55,7 @@ class View:
     camera: Camera
     T_base_camera: RigidTransform | None = None  # rough: good to 2 cm and 2 degrees
     legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
-    hand_held: bool = False  # one image of a hand-held camera, which only the board can place
+    hand_held: bool = False  # one image of a hand-held camera
     by_landmarks: bool = False  # whether the rough pose comes from clicks on joints
     is_placed: bool = False  # whether enough clicks agree that it is the camera, and not a start
 

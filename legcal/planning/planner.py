@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit.part_errors import predicted_sigmas, sigmas_in_words
 from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.calibration.joint_fit.predicted import (
     Contributions,
@@ -624,6 +625,8 @@ class _Search:
             )
         if not machine.is_determined:
             notes.append(f"Readings do not determine the pose: {machine.undetermined}.")
+        parts = predicted_sigmas(predictor.legs, predictor.choices, covariance)
+        notes += sigmas_in_words(parts)
         parametrization = predictor.legs.parametrization
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         return Plan(
@@ -647,6 +650,7 @@ class _Search:
             given=task.given_name,
             n_given=task.n_given,
             notes=tuple(notes),
+            parts=parts,
         )
 
     def _growth(self, contributions: Sequence[Contributions]) -> Array:

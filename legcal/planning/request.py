@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Group, Prior
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     PredictedNoise,
@@ -65,6 +65,7 @@ def plan(
     board: str | Path | Board | None = None,
     hand_held: bool = False,
     setting: Setting | None = None,
+    only: Group | None = None,
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress = False,
@@ -104,6 +105,8 @@ def plan(
         Hand-held camera: a new pose for every image; requires a board.
     setting : Setting
         Tolerances of tripods and of the machine.
+    only : {"zeros", "lengths", "all"}, optional
+        Tolerances of the model are priors of all parts; say how well these will be known.
     seed : int
         Random seed.
     workers : int, str or executor
@@ -154,9 +157,11 @@ def plan(
         sigma_q = shot.measurements.sigma_q
         sigma_by_joint = dict(shot.measurements.sigma_by_joint)
     predicted_noise = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
-    lengths, scale_notes = measured_length(machine, board=board is not None)
+    choices, scale_notes = Choices.by_tolerances(machine, only), tuple[str, ...]()
+    if only is None:
+        choices, scale_notes = measured_length(machine, board=board is not None)
     task = Task(
-        Predictor(machine, selected_camera, predicted_noise, sigma_q, lengths, sigma_by_joint),
+        Predictor(machine, selected_camera, predicted_noise, sigma_q, choices, sigma_by_joint),
         n_images,
         n_views,
         setting,

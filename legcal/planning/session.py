@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.quantities import mm_deg
@@ -36,7 +37,7 @@ from legcal.files.folder import (
 from legcal.files.motions import Pose, motion_to_xyz_quat
 from legcal.files.published import with_schema
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.schema import Document, Number, Version
+from legcal.files.schema import Document, Number, SparseDocument, Version
 from legcal.files.table import format_table
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array, BoolArray
@@ -281,6 +282,7 @@ class Plan:
     n_given: int = 0  # number of its photographs
     notes: tuple[str, ...] = ()
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
+    parts: tuple[PartSigma, ...] = ()  # what is expected of parts, with tolerances as priors
 
     @property
     def n_images(self) -> int:
@@ -359,6 +361,7 @@ class Plan:
             growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
             limits=self.limits,
             notes=list(self.notes),
+            parts=list(self.parts) or None,
         ).document()
 
 
@@ -417,7 +420,7 @@ class Growth(Document):
     value: Number
 
 
-class PlanDocument(Document):
+class PlanDocument(SparseDocument):
     """What ``plan.json`` holds and ``legcal plan --json`` prints."""
 
     legcal_plan: Version
@@ -439,6 +442,7 @@ class PlanDocument(Document):
     growth: list[Growth]
     limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
+    parts: list[PartSigma] | None = None  # left out where not asked for (--only)
 
 
 def views_in_words(views: Sequence[PlannedView]) -> str:

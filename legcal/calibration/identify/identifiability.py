@@ -39,9 +39,11 @@ from legcal.calibration.identify.session import (
 from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
+    Group,
     known_parameters,
     resolve,
 )
+from legcal.calibration.joint_fit.part_errors import sigmas_in_words
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     WHITE,
@@ -84,6 +86,7 @@ def answer(
     platform_board: bool = False,
     hand_held: bool = False,
     noise: Path | None = None,  # earlier result whose errors of outlines are to be expected
+    only: Group | None = None,  # parts whose tolerances are priors
 ) -> Identifiability:
     """Return the report on a model with views, or on a dataset.
 
@@ -100,6 +103,7 @@ def answer(
             platform_board=platform_board,
             hand_held=hand_held,
             noise=expected,
+            only=only,
         )
     options = {
         "--view": bool(views),
@@ -121,7 +125,11 @@ def answer(
         dataset.measurements.views,
         boards=dataset.boards,
     )
-    return identifiability_of_dataset(dataset, resolve(dataset.overrides, parameters), expected)
+    by_parts = Choices.by_tolerances(dataset.machine, only)
+    choices = replace(
+        resolve(dataset.overrides, parameters), built=by_parts.built, only=by_parts.only
+    )
+    return identifiability_of_dataset(dataset, choices, expected)
 
 
 def identifiability(
@@ -133,6 +141,7 @@ def identifiability(
     hand_held: bool = False,
     platform_board: bool = False,
     noise: PredictedNoise = DEFAULT_NOISE,
+    only: Group | None = None,
 ) -> Identifiability:
     """Judge the identifiability of a mechanism's parameters from planned views.
 
@@ -153,6 +162,8 @@ def identifiability(
         Hand-held camera: a new camera pose for every image.
     noise : PredictedNoise
         Errors of outlines.
+    only : {"zeros", "lengths", "all"}, optional
+        Tolerances of the model are priors; say how well these parts will be known.
 
     Returns
     -------
@@ -194,7 +205,8 @@ def identifiability(
     def planned(images: int) -> Session:
         return planned_session(mechanism, legs, images, **boards, hand_held=hand_held)
 
-    analysis = Analysis(planned(images), noise=noise)
+    choices = Choices.by_tolerances(mechanism, only)
+    analysis = Analysis(planned(images), choices, noise=noise)
     return _report_on(mechanism, analysis, recommendation, None if hand_held else planned)
 
 
@@ -292,6 +304,7 @@ def _report_on(
     notes += _machine_notes(machine)
     if full.complete:
         notes += _rough_notes(analysis)
+    notes += sigmas_in_words(analysis.parts)
     return Identifiability(
         spatial=machine.spatial,
         legs=machine.leg_names,
@@ -311,6 +324,7 @@ def _report_on(
         recommendation=recommendation,
         notes=tuple(notes),
         scale=scale_sources(analysis) or None,
+        parts=analysis.parts or None,
         paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )
 

@@ -22,6 +22,7 @@ from legcal.calibration.identify.report import (
 )
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
+from legcal.calibration.joint_fit.part_errors import PartSigma, predicted_sigmas
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     WHITE,
@@ -99,6 +100,17 @@ class Analysis:
         contributions = self.contributions
         rows = np.concatenate([contributions.all_gains(), contributions.known])
         return self.of_parameters(rows, contributions.basis)
+
+    @cached_property
+    def parts(self) -> tuple[PartSigma, ...]:
+        """What is expected of the parts, with tolerances as priors; () without these."""
+        if self.choices.built is None:
+            return ()
+        found = self.contributions
+        rows, p = np.concatenate([found.all_gains(), found.known]), found.basis.shape[1]
+        C = np.linalg.pinv(rows.T @ rows, hermitian=True)[:p, :p]
+        C = found.basis @ C @ found.basis.T
+        return predicted_sigmas(self.session.fitted, self.choices, C)
 
     def of_parameters(self, rows: Array, basis: Array) -> Array:
         """Return information rows (p, p) by parameters in metres.

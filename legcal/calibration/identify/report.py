@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.files.schema import Document, SparseDocument
 from legcal.paper.conditions import Condition
 
@@ -196,6 +197,8 @@ class Identifiability(SparseDocument):
     # sources of the scale where only radii determine it: readings are angles or missing; else None
     scale: tuple[ScaleSource, ...] | None = None
     paper: PaperBlock
+    # what is expected of the parts asked for (--only); left out without
+    parts: tuple[PartSigma, ...] | None = None
 
     @property
     def conditions_hold(self) -> bool:

@@ -23,9 +23,11 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.machine.tolerance import Tolerance
+from legcal.machine.tolerance import NOT_STATED, Tolerance
 from legcal.vision.board import LINKS, FixedBoard, Link, board_name
 from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
+
+Group = Literal["zeros", "lengths", "all"]  # what --only reports, and writes into the model
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,26 @@ class Choices:
     cameras: Mapping[str, KnownIntrinsics] = field(default_factory=dict)
     # complete tolerances that are priors of all kinematic parameters, beside those above
     built: Tolerance | None = None
+    only: Group | None = None  # what is reported of these
+
+    @classmethod
+    def by_tolerances(cls, machine: Machine, only: Group | None) -> Choices:
+        """Return the choices of ``--only``; no choices without it.
+
+        Raises
+        ------
+        UsageError
+            If neither the model nor the dataset states tolerances.
+        """
+        if only is None:
+            return NO_CHOICES
+        if machine.tolerance == NOT_STATED:
+            raise UsageError(
+                "--only could not be used: found no tolerance, needed how well the machine is "
+                "built; state machine_kind: printed, machined or bought, or tolerance, in "
+                "dataset.yaml or in the block legcal of the model."
+            )
+        return cls(built=machine.tolerance.completed(machine.size), only=only)
 
     def holds(self, name: str, *, by_default: bool = False) -> bool:
         """Whether a parameter is fixed; *by_default*: whether it is without a choice."""
@@ -83,6 +105,7 @@ class Choices:
             },
             "least_shared_px": dict(sorted(self.least_shared_px.items())),
             "built": None if self.built is None else vars(self.built),
+            "only": self.only,
         }
         return {key: value for key, value in document.items() if value}
 

@@ -22,9 +22,12 @@ from typing import Literal
 
 import numpy as np
 
+from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs
 from legcal.calibration.tuning import ARM_AXIS_SIGMA, ARM_POINT_SIGMA
 from legcal.estimation.problem import GaussianPrior
+from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import Document, Number
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, Line
 from legcal.machine.leg import Leg, LegColumns, LegKind
@@ -32,7 +35,6 @@ from legcal.machine.parameters import in_joint_frames, moved_legs, vector_of
 from legcal.machine.rods import reading_legs
 from legcal.machine.tolerance import Tolerance
 
-Group = Literal["zeros", "lengths", "all"]  # what is reported, and written into the model
 Kind = Literal["joints", "axes", "lengths", "zeros", "arms"]
 
 _STEP = 1e-6  # of derivatives [rad], and relative to the size of the machine
@@ -83,6 +85,57 @@ class PartErrors:
     def of(self, kind: Kind) -> IntArray:
         """Return the indices of the errors of a kind."""
         return np.flatnonzero(np.equal(self.kinds, kind))
+
+
+class PartSigma(Document):
+    """How well a part is expected to be known [m or rad]."""
+
+    part: str  # the motor of a zero, else the leg
+    kind: Kind
+    sigma: Number  # one standard deviation; of a joint centre that of its worst direction
+    tolerance: Number
+    unit: Literal["m", "rad"]
+
+
+def predicted_sigmas(legs: FittedLegs, choices: Choices, C: Array) -> tuple[PartSigma, ...]:
+    """Return what a covariance C (p, p) of all parameters leaves open of the parts asked for.
+
+    () without tolerances as priors.
+    """
+    if choices.built is None:
+        return ()
+    errors = part_errors(legs, choices.built)
+    sigma = np.sqrt(np.diagonal(errors.posterior(errors.centre, C)[1]))
+    of_motors = {leg.motor_label: leg.reading_unit for leg in legs.nominal}
+    found = dict[tuple[str, Kind], PartSigma]()
+    for i, (name, kind) in enumerate(zip(errors.names, errors.kinds, strict=True)):
+        before = found.get((name, kind))
+        if kind == "arms" or choices.only not in ("all", kind) or errors.sigma[i] <= 0.0:
+            continue
+        if before is None or sigma[i] > before.sigma:
+            unit = of_motors[name] if kind == "zeros" else "rad" if kind == "axes" else "m"
+            found[name, kind] = PartSigma(
+                part=name,
+                kind=kind,
+                sigma=float(sigma[i]),
+                tolerance=float(errors.sigma[i]),
+                unit=unit,
+            )
+    return tuple(found.values())
+
+
+def sigmas_in_words(parts: Sequence[PartSigma]) -> list[str]:
+    """Return a sentence for each kind of parts."""
+    sentences = []
+    for kind in dict.fromkeys(one.kind for one in parts):
+        some = [one for one in parts if one.kind == kind]
+        scale, unit = SHOWN_IN[some[0].unit]
+        least, most = (scale * pick(one.sigma for one in some) for pick in (min, max))
+        sentences.append(
+            f"Expected of the {kind}, with tolerances as priors: {least:.2g} to {most:.2g} {unit} "
+            f"(1 sigma), where parts like these are {scale * some[0].tolerance:.2g} {unit} off."
+        )
+    return sentences
 
 
 def part_errors(

@@ -149,7 +149,7 @@ def platform_accuracy(
 
     calibrated = poses_at_readings(machine, legs, q, T_Rb_Re)
     nominal = poses_at_readings(machine, geometries(machine), q, T_Rb_Re)
-    sensitivity_at_readings, poses = follow(calibrated), _workspace_poses(machine, legs)
+    sensitivity_at_readings, poses = follow(calibrated), workspace_poses(machine, legs)
     sensitivity_in_workspace = None if poses is None else follow(poses)
     judged_sensitivity = (
         sensitivity_at_readings if sensitivity_in_workspace is None else sensitivity_in_workspace
@@ -164,7 +164,7 @@ def platform_accuracy(
     )
 
 
-def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
+def workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
     """Poses of the calibrated platform at readings all over the travel."""
     try:
         readings, drawn = workspace(machine)
