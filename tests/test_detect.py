@@ -30,7 +30,8 @@ from legcal.perception.overlays import (
     PartMarks,
     marks_of_image,
 )
-from legcal.viewer.click_server import TOKEN_HEADER, ClickServer
+from legcal.viewer.click_server import ClickServer
+from legcal.viewer.server import TOKEN_HEADER
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import PredictedLeg, predict_legs

@@ -158,7 +158,7 @@ PUBLIC: dict[str, set[str]] = {
         "render",
         "session",
     },
-    "viewer": {"address", "click_server", "source", "window"},
+    "viewer": {"click_server", "server", "source", "view_server"},
     "cli": set(),
     "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }

@@ -412,10 +412,9 @@ def detect(
     from legcal.report.session import examination_table
 
     if edit:
-        from legcal.viewer.address import Address, check_address
-        from legcal.viewer.click_server import HOST
+        from legcal.viewer.server import LOCAL, Address, check_address
 
-        check_address(Address(HOST, port))
+        check_address(Address(LOCAL, port))
     examination = job.doctor(
         load_dataset(dataset, check_clicks=False) if edit else dataset,
         output=output,
