@@ -110,7 +110,7 @@ def test_nominal_and_calibrated_stand_at_the_same_readings(result: Source) -> No
         for (A, B), machine in zip(shown, (result.nominal, result.machine), strict=True):
             lengths = np.linalg.norm(B - A, axis=1)
             np.testing.assert_allclose(lengths, machine.lengths_at(q), atol=1e-6)
-        assert 1e-4 < np.abs(np.subtract(*shown)).max() < 1e-2
+        assert 1e-4 < np.abs(np.subtract(shown[0], shown[1])).max() < 1e-2
         far = move(server, "q0", 1e4)
         assert any("q0" in problem or "leg1" in problem for problem in far["problems"])
         assert "At the end" not in " ".join(move(server, "home", 0.0)["problems"])
@@ -125,6 +125,7 @@ def test_photographs_come_with_their_outlines_and_say_where_they_are_missing(
         kind, content = server.content(f"/{shown['file']}") or ("", b"")
         assert kind == "image/jpeg"
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None
         assert picture.shape[1] / picture.shape[0] == pytest.approx(np.divide(*shown["size"]))
         used = [line for kind, line in shown["lines"] if kind == "measured"]
         assert len(used) >= 8

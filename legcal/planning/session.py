@@ -127,7 +127,7 @@ def _dataset(plan: Plan, model: str) -> dict[str, str]:
         for name, image, label, v, k in images_of(plan)
     ]
     board = {} if plan.board is None else {"board": board_document(plan.board.board)}
-    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), **board)
+    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), board)
 
 
 def rough_view(
@@ -149,8 +149,8 @@ def dataset_texts(
     views: Mapping[str, Any],
     rows: Iterable[Sequence[Any]],  # of *columns* and readings
     encoder_sigma: float | dict[str, float],
+    blocks: Mapping[str, Any],
     columns: Sequence[str] = ("view", "image", "pose"),
-    **blocks: Any,
 ) -> dict[str, str]:
     """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
     document = {

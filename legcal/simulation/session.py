@@ -383,7 +383,7 @@ def _recorded(
         if any(a.turns for a in truth.actuators)
         else {},
         pose_labels=tuple(labels[p] for p in visible_poses),
-        time=_SECONDS_A_POSE * images.pose + images.repeat,
+        time=np.asarray(_SECONDS_A_POSE * images.pose + images.repeat, dtype=np.float64),
     )
 
 

@@ -137,7 +137,7 @@ class ViewServer(PageServer):
                     label,
                     leg.reading_unit,
                     ranges[j],
-                    lambda j=j: float(motion.posture.q[j]),
+                    partial(self._reading, j),
                     partial(motion.read, j),
                 )
         for k, ends in enumerate(motion.ranges_of_coordinates()):
@@ -146,10 +146,16 @@ class ViewServer(PageServer):
                 COORDINATES[which],
                 "m" if which < 3 else "rad",
                 ends,
-                lambda k=k: float(motion.coordinates[k]),
+                partial(self._coordinate, k),
                 partial(motion.place, k),
             )
         return sliders
+
+    def _reading(self, leg: int) -> float:
+        return float(self.motion.posture.q[leg])
+
+    def _coordinate(self, k: int) -> float:
+        return float(self.motion.coordinates[k])
 
     def _show_pose(self, value: float) -> None:
         """Move to a pose of the session."""
@@ -165,7 +171,8 @@ class ViewServer(PageServer):
             modes = self._modes()
         except LegcalError as error:
             problems += error.problems
-            modes = [(printable(self.source.name), ("", "machine"), *[self._here()] * 2)]
+            here = self._here()
+            modes = [(printable(self.source.name), ("", "machine"), here, here)]
         machine = self.source.machine
         ends = dict.fromkeys(
             machine.legs[j].motor_label for j in np.flatnonzero(self.motion.at_end).tolist()
