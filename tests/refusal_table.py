@@ -264,12 +264,8 @@ def _use() -> Iterable[Refusal]:
         ("folder", "inspect {in}", ("{in}", "robot.yaml")),
         ("empty-output", "simulate hexapod -o ''", ("-o",)),
         ("empty-value", "simulate hexapod -o {out} --poses=", ("--poses",)),
-        ("empty-model", "simulate '' -o {out}", ("simulate",)),
-        ("empty-study", "study paper -o ''", ("-o",)),
         ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
         ("transformation", "calibrate x -o {out} --transformation q", ("--transformation",)),
-        ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
-        ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
         ("identify-nothing", "identify", ("MODEL|DATASET",)),
         ("two-datasets", "calibrate a b -o out", ("Expected one dataset", "docs/python.md")),
     ]
@@ -315,7 +311,6 @@ def _options() -> Iterable[Refusal]:
 
     simulate: list[tuple[str, str, tuple[str, ...]]] = [
         ("poses", "--poses 0", ("0",)),
-        ("negative-poses", "--poses -3", ("-3",)),
         ("poses-file", "--poses none.csv", ("none.csv",)),
         ("seed", "--seed -1", ("-1",)),
         ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
@@ -396,10 +391,8 @@ def _datasets() -> Iterable[Refusal]:
     rows: Rows = [
         ("version", entry(legcal_dataset=2), ("legcal_dataset", "2", "1")),
         ("no-version", entry(legcal_dataset=GONE), ("legcal_dataset",)),
-        ("sigma-0", entry(encoder_sigma=0.0), ("encoder_sigma", "0.0")),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
         ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
-        ("sigma-text", entry(encoder_sigma="small"), ("encoder_sigma", "'small'")),
         ("no-views", entry(views={}), ("views",)),
         ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
         ("no-mechanism", entry(mechanism=None), ("mechanism",)),
@@ -407,7 +400,6 @@ def _datasets() -> Iterable[Refusal]:
         ("key", entry(measurement="x"), ("measurement", "'measurements'")),
         ("outside", entry(measurements="../m.csv"), ("measurements", "../m.csv")),
         ("no-table", entry(measurements="none.csv"), ("none.csv",)),
-        ("no-camera", entry(views__c1__camera=GONE), ("views.c1.camera",)),
         ("camera", entry(views__c1__camera="none.yaml"), ("none.yaml",)),
         ("gamma", entry(views__c1__gamma=0), ("views.c1.gamma", "0.2")),
         ("gamma-large", entry(views__c1__gamma=100), ("views.c1.gamma", "100", "5")),
@@ -420,15 +412,9 @@ def _datasets() -> Iterable[Refusal]:
         ),
         ("norm-0", entry(views__c1__T_base_camera__quat_xyzw=[0, 0, 0, 0]), ("norm 0", "0.001")),
         ("norm", entry(views__c1__T_base_camera__quat_xyzw=[0, 0, 0, 1.002]), ("1.002",)),
-        (
-            "pose-nan",
-            entry(views__c1__T_base_camera__xyz=[1, 2, float("nan")]),
-            ("T_base_camera.xyz.2", "nan"),
-        ),
         ("no-legs", entry(views__c1__legs=[]), ("views.c1.legs",)),
         ("legs-twice", entry(views__c1__legs=["leg1", "leg1"]), ("c1", "leg1")),
         ("leg", entry(views__c1__legs=["leg1", "leg7"]), ("c1", "'leg7'")),
-        ("legs-text", entry(views__c1__legs="leg1"), ("views.c1.legs", "'leg1'")),
         ("hand-held", entry(views__c1__hand_held=True), ("c1", "board")),
         (
             "all-at-once",
@@ -463,13 +449,10 @@ def _datasets() -> Iterable[Refusal]:
     april = {"kind": "aprilgrid", "tags_x": 6, "tags_y": 6, "tag_size": 0.088, "tag_spacing": 0.3}
     boards: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
         ("square", {**chess, "square": 30}, ("board.square", "30 m", "0.03")),
-        ("square-nan", {**chess, "square": float("nan")}, ("board.square",)),
         ("kind", {**chess, "kind": "chess"}, ("board.kind", "'chess'")),
         ("half-turn", {**chess, "squares_x": 8}, ("8 x 6",)),
         ("few", {**chess, "squares_x": 3}, ("3 x 6", "4")),
-        ("fraction", {**chess, "squares_x": 9.5}, ("board.squares_x",)),
         ("key", {**chess, "columns": 9}, ("board.columns",)),
-        ("pose", {**chess, "T_base_board": {"xyz": [0, 0, 0]}}, ("T_base_board.quat_xyzw",)),
         ("marker", {**char, "marker": 0.05}, ("0.05 m", "0.04 m")),
         ("no-marker", {k: v for k, v in char.items() if k != "marker"}, ("board.marker",)),
         ("dictionary", {**char, "dictionary": "4X4"}, ("board.dictionary", "'4X4'")),
@@ -544,12 +527,10 @@ def _measurements() -> Iterable[Refusal]:
         ("nothing", text(table, ""), ("no row",)),
         ("short", swap(table, "c1,images/c1_2.png", "images/c1_2.png"), ("row 2", "7", "8")),
         ("long", swap(table, "c1,images/c1_2.png", "c1,,images/c1_2.png"), ("row 2", "9", "8")),
-        ("nan", readings(3, "nan"), ("row 3 (line 4)", joint, "'nan'")),
         ("blank", readings(3, ""), ("row 3 (line 4)", joint)),
         ("underscore", readings(3, "1_0"), ("row 3 (line 4)", joint, "'1_0'")),
         ("travel", readings(2, "0.15288"), (joint, "0.15288 m", "row 2", "-0.004", "0.144")),
         ("millimetres", readings(None, "70"), (joint, "millimetres")),
-        ("view", cell(table, 3, view="c3"), ("row 3", "view", "'c3'")),
         ("same-image", image("images/c1_1.png"), ("row 3", "images/c1_1.png", "row 1")),
         ("same-path", image("images/../images/c1_1.png"), ("row 3", "row 1")),
         ("outside", image("../other.png"), ("row 3", "../other.png")),
@@ -571,13 +552,11 @@ def _measurements() -> Iterable[Refusal]:
         ),
         ("gif", text("images/c1_1.png", b"GIF89a"), ("row 1", "c1_1.png", "PNG")),
         ("empty-image", text("images/c1_1.png", b""), ("row 1", "c1_1.png")),
-        ("cut-image", cut("images/c1_2.png", 30), ("row 2", "c1_2.png")),
         (
             "float-image",
             (floating("images/c1_2.png"), remove("images/c1_1.png")),
             ("row 1", "row 2", "c1_2.png", "8 or 16"),
         ),
-        ("image-size", picture("images/c2_1.png", 63, 48), ("row 3", "63 x 48", "64 x 48")),
         (
             "images-at-once",
             (remove("images/c1_1.png"), cut("images/c1_2.png", 30),
@@ -620,9 +599,6 @@ def _cameras() -> Iterable[Refusal]:
         ("few-numbers", content(camera_matrix__data=K[:6]), ("camera_matrix", "6", "9")),
         ("text", content(distortion_coefficients__data__0="a"), ("data.0", "'a'")),
         ("nan", content(distortion_coefficients__data__0=float("nan")), ("data.0", "nan")),
-        ("singular", matrix((0, 0.0)), ("fx = 0",)),
-        ("negative", matrix((4, -3.0)), ("fy = -3",)),
-        ("centre", matrix((5, 900.0)), ("cy = 900", "64 x 48")),
         ("last-row", matrix((8, 2.0)), ("[0, 0, 1]",)),
         ("mapping", content(camera_matrix=7), ("camera_matrix", "7")),
         (
@@ -635,10 +611,6 @@ def _cameras() -> Iterable[Refusal]:
         ("kalibr-few", kalibr(distortion_coeffs=[0.1]), ("1", "4", "radtan")),
         ("kalibr-intrinsics", kalibr(intrinsics=[1, 2, 3]), ("cam0.intrinsics", "3")),
         ("keys", text(file, "fx: 1\nfy: 2\n"), ("fx", "fy")),
-        ("list", text(file, "[1, 2]"), (file,)),
-        ("broken", text(file, "a: [1, 2"), ("line 1",)),
-        ("repeated", text(file, "a: 1\nb: 2\na: 3"), ("line 3", "'a'")),
-        ("python", text(file, "a: !!python/object/apply:os.system [ls]"), (file,)),
         ("centre-negative", matrix((2, -1.0)), ("cx = -1", "64 x 48")),
         ("kalibr-none", kalibr(distortion_model="none", distortion_coeffs=[0.1, 0.0, 0.0, 0.0]),
          ("4", "0 for none")),
@@ -699,15 +671,10 @@ def _two_cameras(folder: Path) -> None:
 def _tables() -> Iterable[Refusal]:
     o = "observations.csv"
     outlines: Rows = [
-        ("view", cell(o, 1, view="up"), ("row 1", "view", "'up'")),
         ("image", cell(o, 1, image="i.png"), ("row 1", "image", "'i.png'")),
-        ("leg", cell(o, 1, leg="leg9"), ("row 1", "leg", "'leg9'")),
         ("part", cell(o, 1, part="leg2_rod"), ("row 1", "part", "'leg2_rod'", "leg1")),
-        ("edge", cell(o, 1, edge="3"), ("row 1", "edge", "'3'", "1", "2")),
         ("verdict", cell(o, 1, verdict="yes"), ("verdict", "'yes'", "used", "rejected")),
         ("source", cell(o, 1, source="me"), ("source", "'me'", "detected", "edited")),
-        ("number", cell(o, 1, a="0.1x"), ("column a", "'0.1x'")),
-        ("blank", cell(o, 1, u0=""), ("column u0",)),
         ("nan", cell(o, 1, v1="nan"), ("column v1", "'nan'")),
         ("zero", cell(o, 1, a="0", b="0", c="0"), ("norm 0",)),
         ("point", cell(o, 1, u0="5", u1="5", v0="7", v1="7"), ("u0", "v1")),
@@ -752,13 +719,10 @@ def _tables() -> Iterable[Refusal]:
         ("number", "c1,images/c1_2.png,1.0,1,2,0.1,used,,detected", ("corner", "'1.0'")),
         ("many", "c1,images/c1_2.png,99,1,2,0.1,used,,detected", ("corner", "99")),
         ("u", "c1,images/c1_2.png,3,x,2,0.1,used,,detected", ("column u", "'x'")),
-        ("v", "c1,images/c1_2.png,3,1,,0.1,used,,detected", ("column v",)),
         ("outside", "c1,images/c1_2.png,3,470,2,0.1,used,,detected", ("column u", "470 px")),
         ("sigma", "c1,images/c1_2.png,3,1,2,0,used,,detected", ("column sigma", "0")),
         ("verdict", "c1,images/c1_2.png,3,1,2,0.1,good,,detected", ("verdict", "used")),
         ("source", "c1,images/c1_2.png,3,1,2,0.1,used,,me", ("source", "edited")),
-        ("short", "c1,images/c1_2.png,3,1,2,0.1,used", ("7", "9")),
-        ("view", "c8,images/c1_2.png,3,1,2,0.1,used,,detected", ("view", "'c8'")),
         ("twice", good.strip(), ("row 2", "row 1")),
         ("image", "c2,images/c1_2.png,3,1,2,0.1,used,,detected", ("column image", "c1_2.png")),
     ]
@@ -788,15 +752,11 @@ def _landmarks() -> Iterable[Refusal]:
     """Joints clicked in pictures."""
     c = "landmarks.csv"
     rows: Rows = [
-        ("joint", cell(c, 3, joint="leg9.base"), ("row 3", "'leg9.base'", "leg1.base")),
-        ("view", cell(c, 2, view="c8"), ("row 2", "'c8'")),
         ("image", cell(c, 2, image="images/c2_1.png"), ("row 2", "column image", "c2_1.png")),
         ("outside", cell(c, 2, u="470"), ("row 2", "column u", "470 px", "63.5 px")),
-        ("number", cell(c, 2, v="x"), ("row 2", "column v", "'x'")),
         ("sigma", cell(c, 2, sigma="0"), ("row 2", "column sigma", "0.01")),
         ("twice", doubled(c), ("row 13", "row 1", "the same image and joint")),
         ("column", header(c, "joint", "leg"), ("'joint'",)),
-        ("none", kept(c, 0), ("no row",)),
         ("few", kept(c, 3), ("view c1", "3 clicks", "4 or more, better 6")),
         ("wrong-joint", (clicks("leg4.platform"), cell(c, 1, joint="leg4.platform")),
          ("the click on leg4.platform in images/c1_1.png", "perhaps it shows leg1.base")),
@@ -827,11 +787,9 @@ def _overrides() -> Iterable[Refusal]:
         ("metres", "leg1.offset=350±1", ("350 m", "leg1.offset")),
         ("radius", "leg1.radius.leg1_tube=0±0.001", ("0 m", "leg1.radius.leg1_tube")),
         ("focal", "c1.fx=10±1", ("10 px", "c1.fx")),
-        ("centre", "c1.cx=1024±1", ("1024 px", "c1.cx")),
         ("name", "leg1.ofset=0.35±0.1", ("'leg1.offset'",)),
         ("pattern", "*.ofset=0.35±0.1", ("*.ofset",)),
         ("frame", "leg1.base.x=0±0.1", ("leg1.base.x", "R_b")),
-        ("platform-frame", "leg5.platform.z=0±0.1", ("leg5.platform.z", "R_e")),
         ("length", "leg1.length=0.3±0.1", ("leg1.length", "leg1.offset")),
         ("twist", "leg1.twist=0±0.1", ("leg1.twist", "SPU")),
         ("two", "leg1.offset=0.35±0.1' --set 'leg1.offset=0.36±0.1", ("leg1.offset",)),
@@ -875,7 +833,6 @@ def _models() -> Iterable[Refusal]:
         '<joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
     )
     rows: Rows = [
-        ("frame", swap(y, "- - leg1_end", "- - leg1_ned"), ("closed_loop.0.0", "'leg1_end'")),
         ("frame-twice", swap(y, "  - leg1_seat", "  - leg1_end"), ("'leg1_end'",)),
         ("frame-of-another", swap(y, "  - leg5_seat", "  - leg2_seat"),
          ("closed_loop.4", "'leg2_seat'", "closed_loop.1", "write 'leg5_seat'")),
@@ -885,19 +842,15 @@ def _models() -> Iterable[Refusal]:
          ("'leg2_prismatic'",)),
         ("types", swap(y, "- 3d\n", ""), ("6", "5", "closed_loop", "type")),
         ("type", swap(y, "- 3d\n", "- 2d\n"), ("type.0", "'2d'", "'3d'")),
-        ("base", swap(y, "base: base\n", "base: bass\n"), ("legcal.base", "'bass'")),
         ("platform", swap(y, "platform: platform\n", "platform: plate\n"), ("legcal.platform",)),
         ("both", swap(y, "platform: platform\n", "platform: base\n"), ("base", "platform")),
         ("joint", swap(y, "platform_free", "platform_fee"), ("legcal.platform_joint",)),
-        ("leg", swap(y, "leg1: leg1_prismatic", "leg1: lost"), ("legcal.legs.leg1",)),
         ("leg-name", swap(y, "leg2: leg2", '"leg 2": leg2'), ("legs", "leg 2")),
         ("frame-leg", swap(y, "  - leg1\n", "  - leg8\n"), ("legcal.base_frame", "'leg8'")),
         ("frame-legs", swap(y, "  - leg1\n", ""), ("2", "3")),
         ("frame-leg-twice", swap(y, "  - leg1\n", "  - leg3\n"), ("'leg3'",)),
-        ("home-nan", swap(y, "0.38274", ".nan"), ("legcal.home.xyz.2",)),
         ("home-norm", swap(y, "0.951057", "0.7"), ("0.765",)),
         ("home-far", swap(y, "0.38274", "0.9"), ("legcal.home",)),
-        ("version", swap(y, "  version: 1", "  version: 2"), ("legcal.version", "2")),
         ("key", swap(y, "  base: base\n", "  bse: base\n"), ("'base'",)),
         ("key-name", swap(y, "name_mot:", "name_motor:"), ("name_mot",)),
         ("urdf", swap(y, "../urdf/hexapod.urdf", "../urdf/none.urdf"), ("none.urdf",)),
@@ -911,7 +864,6 @@ def _models() -> Iterable[Refusal]:
         ("python", swap(y, "type:", "x: !!python/object/apply:os.system [touch trace]\ntype:"),
          ("python/object/apply",)),
         ("turning-motor", swap(y, "- leg2_prismatic\n", "- leg2_b1\n"), ("'leg2_b1'",)),
-        ("xyz-nan", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 nan 0.0"'), ("line", "nan")),
         ("xyz-two", swap(u, 'xyz="0.0 0.195 0.0"', 'xyz="0.0 0.195"'), ("line", "3")),
         ("xyz-huge", swap(u, "0.195", "1e300"), ("1e300",)),
         ("axis-0", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 0"'), ("line", "axis")),
@@ -997,13 +949,12 @@ def _models() -> Iterable[Refusal]:
           swap(u, 'type="floating"', 'type="ball"')), (", line 35: joint 'platform_free'",)),
         ("yaml-twice", (swap(y, "0.38274", ".nan"), swap(y, "version: 1", "version: 3")),
          ("legcal.home", "legcal.version")),
-        *((f"doctype-{name}-{k}",
-           (swap(u, '<link name="base"/>', link),
+        *((f"doctype-{name}",
+           (swap(u, '<link name="base"/>', '<link name="base">&a;</link>'),
             swap(u, "<robot", f"<!DOCTYPE robot {kind}><robot")), (u,))
           for name, kind in (("system", 'SYSTEM "http://localhost:9/robot.dtd"'),
                              ("file", '[<!ENTITY a SYSTEM "file:///etc/hostname">]'),
-                             ("many", '[<!ENTITY a "1"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]'))
-          for k, link in enumerate(('<link name="base"/>', '<link name="base">&a;</link>'))),
+                             ("many", '[<!ENTITY a "1"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]'))),
         ("cycle", text(u, cycle), ("in a cycle",)),
         ("xacro", text(u, '<robot name="r" xmlns:xacro="http://ros.org/wiki/xacro">'
                           "<xacro:include/></robot>"), ("xacro",)),
@@ -1073,7 +1024,6 @@ def _formats() -> Iterable[Refusal]:
         ("element", added('<bdy name="x"/>'), ("no element of a body",)),
         ("geom", added('<geom type="cilinder"/>'), ("'cilinder'",)),
         ("motor", (motor, motor + "<motor/>"), ("names no joint",)),
-        ("motor-joint", (motor, '<position joint="leg1"/>'), ("'leg1'", "not in the file")),
         ("motor-tendon", (motor, '<motor tendon="t"/>'), ("tendon",)),
         ("motor-free", (motor, '<motor joint="platform_free"/>'), ("free joint 'platform_free'",)),
         ("joint", (slide, slide.replace("slide", "screw")), ("'screw'", "needed free")),
@@ -1195,8 +1145,6 @@ def _new() -> Iterable[Refusal]:
 
     rows: Rows = [
         ("no-unit", entry(unit=GONE), ("unit",)),
-        ("unit", entry(unit="Zoll"), ("unit", "'Zoll'", "mm")),
-        ("version", entry(legcal_table=2), ("legcal_table", "2", "1")),
         ("key", entry(ofsets=380), ("ofsets", "'offsets'")),
         ("name", entry(name="a/b"), ("name", "'a/b'")),
         ("no-type", entry(type=GONE), ("type", "types")),
@@ -1209,12 +1157,10 @@ def _new() -> Iterable[Refusal]:
         ("lengths", entry(lengths=455), ("lengths", "leg1")),
         ("joints-row", entry(base_joints=[[1, 2, "x"]] * 3), ("base_joints.0", "'x'")),
         ("platform", entry(platform_joints=[[1, 2, 3]]), ("platform_joints", "1", "3")),
-        ("offsets", entry(offsets="long"), ("offsets", "'long'")),
         ("offsets-two", entry(offsets=[380, 380]), ("offsets", "2", "3")),
         ("no-offsets", entry(offsets=GONE), ("leg1", "offset")),
         ("no-travel", entry(travel=GONE), ("leg1", "travel")),
         ("travel", entry(travel=[150, 0]), ("travel", "150")),
-        ("radius", entry(radius=-4), ("radius", "-4")),
         ("pipe", entry(radius={"pipe": 4}), ("radius", "pipe")),
         ("no-radius", entry(radius={}), ("radius", "{tube: ..., rod: ...}")),
         ("kinds", entry(kinds="loose"), ("kinds", "'loose'")),
@@ -1247,7 +1193,6 @@ def _new() -> Iterable[Refusal]:
         ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
         ("no-type", f"{head}\n{row}\n,1,2,3,4\n", "--unit mm", ("types.1",)),
         ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
-        ("nan", f"{head}\nRPS,nan,2,3,4\n{row}\n", "--unit mm", ("line 2", "base_x", "'nan'")),
         ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
         ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
         (
@@ -1307,7 +1252,6 @@ def _described() -> Iterable[Refusal]:
         ("no-version", {"legcal_table": None}, ("legcal_table", "needed 1", "legcal_table: 1")),
         ("version-key", {"legcal_table": None, "version": 1},
          ("version could not", "unknown key", "add 'legcal_table: 1'")),
-        ("version-true", {"legcal_table": True}, ("legcal_table", "true", "needed 1")),
         ("type-number", {"type": 3}, ("type", "found 3", "6-UPS")),
         ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),
         ("long-name", {"name": "x" * 101}, ("name", "at most 100")),
@@ -1347,7 +1291,7 @@ def _described() -> Iterable[Refusal]:
         ("plane-home", planar | {"home": turned, "offsets": 50}, ("home",)),
     ]  # fmt: skip
     for name, changed, named in changes:
-        edits = (text("table.yaml", yaml.safe_dump(_without_none(TRIPOD | changed))),)
+        edits = (text("table.yaml", json.dumps(_without_none(TRIPOD | changed))),)
         yield Refusal(f"tripod-{name}", command, ("{in}/table.yaml", *named), "", edits)
     arms: dict[str, Any] = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
     below = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
@@ -1385,7 +1329,7 @@ def _described() -> Iterable[Refusal]:
         ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
     ]  # fmt: skip
     for name, changed, named in of_motors:
-        edits = (text("table.yaml", yaml.safe_dump(_without_none(arms | changed))),)
+        edits = (text("table.yaml", json.dumps(_without_none(arms | changed))),)
         yield Refusal(f"arms-{name}", command, named, "", edits)
 
 
@@ -1404,7 +1348,6 @@ def _poses() -> Iterable[Refusal]:
         ("angle", header(p, "qx", "rx"), ("'rx'",)),
         ("column", swap(p, "leg1_prismatic,", "quality,leg1_prismatic,"), ("'quality'",)),
         ("nan", cell(p, 2, x="nan"), ("row 2 (line 3)", "x", "'nan'")),
-        ("blank", cell(p, 2, z=""), ("row 2 (line 3)", "z")),
         ("far", cell(p, 2, z="2e9"), ("2e9", "1e+06 m")),
         ("reading", cell(p, 2, **{joint: "none"}), ("row 2", joint, "'none'")),
         ("travel", cell(p, 2, **{joint: "0.4"}), (joint, "0.4")),
@@ -1413,10 +1356,7 @@ def _poses() -> Iterable[Refusal]:
         ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
         ("angle-sigma", (sigma, swap(p, "0.5", "angle_sigma")), ("angle_sigma", "0.5")),
         ("twice", doubled(p), ("row 25", "row 1")),
-        ("empty", text(p, ""), ("no row",)),
         ("no-rows", kept(p, 0), ("no row",)),
-        ("semicolons", text(p, "x;y;z\n1;2;3\n"), ("commas",)),
-        ("short", swap(p, "\n", "\n1,2\n"), ("row 1", "2", "13")),
         ("two-poses", kept(p, 2), ("2", "3")),
         ("gone", remove(p), (p,)),
     ]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,12 @@ def fitted(seen: BoardImages, model: DistortionModel = "plumb_bob") -> RobustFit
     return found
 
 
+@cache
+def fit_of(model: DistortionModel) -> RobustFit:
+    """Return the fit of twelve images of a camera with a lens of a model."""
+    return fitted(seen_corners(CAMERAS[model], 12, 3), model)
+
+
 def sigmas(found: RobustFit) -> Array:
     return np.sqrt(np.diag(found.covariance))
 
@@ -70,7 +77,7 @@ def pulls(found: RobustFit, model: DistortionModel = "plumb_bob") -> Array:
 @pytest.mark.parametrize("model", MODELS)
 def test_every_number_of_the_camera_is_recovered_within_its_sigma(model: DistortionModel) -> None:
     truth = CAMERAS[model]
-    found = fitted(seen_corners(truth, 12, 3), model)
+    found = fit_of(model)
     assert np.abs(pulls(found, model)).max() < 3.0
     assert sigmas(found)[:4].max() < 0.3
     assert 0.8 < found.ratio < 1.7
@@ -80,7 +87,7 @@ def test_every_number_of_the_camera_is_recovered_within_its_sigma(model: Distort
     assert np.abs(again - corners).max() < 3.0
 
 
-@pytest.mark.parametrize(("n_images", "seed"), [(5, 31), (10, 36)])
+@pytest.mark.parametrize(("n_images", "seed"), thinned([(5, 31), (10, 36)], [(5, 31)]))
 def test_boards_that_all_lean_alike_give_the_camera_within_its_sigma(
     n_images: int, seed: int
 ) -> None:
@@ -280,11 +287,11 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     assert "leave out --model" in " ".join(given.warnings)
 
 
-@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+@pytest.mark.parametrize("model", thinned(["plumb_bob", "equidistant"], ["plumb_bob"]))
 def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     model: DistortionModel,
 ) -> None:
-    fit = fitted(seen_corners(CAMERAS[model], 12, 3), model)
+    fit = fit_of(model)
     camera = replace(fit.adjusted.camera, covariance=fit.covariance)
     values, names = intrinsic_values(camera), intrinsic_names(camera)
     rng = np.random.default_rng(0)

@@ -77,6 +77,7 @@ def test_calibrate_prints_one_screen_and_all_parameters_with_verbose(
     assert "Calibrated:" in captured.out
 
 
+@pytest.mark.usefixtures("without_steps")
 def test_a_model_that_was_right_already_is_not_called_an_improvement(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -112,7 +112,7 @@ def module_at(path: Path) -> ModuleType:
     "name",
     thinned(
         KINEMATICS,
-        ["3-upu", "delta"],
+        ["delta"],
     ),
 )
 def test_kinematics_in_python_are_those_of_the_model(
@@ -244,7 +244,7 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
 # --- models of other programs -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-upu", "delta"]))
+@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-upu"]))
 def test_a_urdf_with_its_loops_is_the_same_machine_without_a_yaml(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:
@@ -342,7 +342,7 @@ def test_genhexkins_has_the_readings_of_the_model(
         assert (joints >= limits).all()
 
 
-@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-rpr", "3-upu"]))
+@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-rpr"]))
 def test_corrected_commands_bring_the_machine_where_it_should_be(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:

@@ -116,11 +116,6 @@ def _runs(pid: int) -> bool:
     return listed != "" and not listed.startswith("Z")
 
 
-def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
-    with pytest.raises(OutOfResources, match="ended from outside"), worker_pool(2) as run:
-        list(run(os._exit, [1, 1]))
-
-
 @pytest.fixture(scope="module")
 def two_processes() -> Iterator[Run]:
     """A pool that was started where libraries may have three threads."""
@@ -153,7 +148,7 @@ def test_libraries_have_one_thread_in_each_process_and_as_many_as_before_in_this
     assert (os.getenv("OMP_NUM_THREADS"), os.getenv("OPENCV_FOR_THREADS_NUM")) == ("3", None)
 
 
-def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_free(
+def test_results_come_as_they_are_finished_and_a_process_that_is_ended_is_said(
     two_processes: Run, tmp_path: Path
 ) -> None:
     taken = []
@@ -164,11 +159,13 @@ def test_results_come_as_they_are_finished_and_rows_are_taken_as_processes_get_f
             yield row
 
     work = partial(row_zero_after_row_five, tmp_path / "done")
-    with worker_pool(2, in_order=False) as run:
+    ended = pytest.raises(OutOfResources, match="ended from outside")
+    with ended, worker_pool(2, in_order=False) as run:
         found = iter(run(work, rows()))
         first = next(found)
         assert len(taken) == 4
         rest = list(found)
+        list(run(os._exit, [1, 1]))
     assert first != 0
     assert sorted([first, *rest]) == taken == list(range(40))
     (tmp_path / "done").unlink()

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
 from outline_sessions import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
+from thinned import thinned
 
 import legcal
 from legcal.calibration.identify.session import REACHED, recorded_session
@@ -74,7 +76,12 @@ def without_motors(machine: Path, *left: str) -> Path:
     return machine
 
 
-@pytest.mark.parametrize(("kind", "layout"), [(kind, name) for kind in KINDS for name in LAYOUTS])
+def _usual(kind: str, layout: str) -> bool:
+    """Say whether a kind is tried in a layout: each in one, each layout with one at least."""
+    return [*KINDS].index(kind) % len(LAYOUTS) == [*LAYOUTS].index(layout)
+
+
+@pytest.mark.parametrize(("kind", "layout"), thinned(product(KINDS, LAYOUTS), _usual))
 def test_what_moves_freely_is_said_of_every_layout(kind: str, layout: str, tmp_path: Path) -> None:
     types, kinds, mobility = KINDS[kind]
     machine = load_mechanism(write_machine(tmp_path, drawn(kind), LAYOUTS[layout]))
@@ -147,7 +154,10 @@ def dense_rank(machine: Machine, n_views: int, n_images: int) -> int:
 
 @pytest.mark.parametrize(
     ("kind", "n_views", "n_images"),
-    [("3-SPS + passive UPS", 2, 6), ("5-SPS", 1, 1), ("6-UPS by hand", 2, 6)],
+    thinned(
+        [("3-SPS + passive UPS", 2, 6), ("5-SPS", 1, 1), ("6-UPS by hand", 2, 6)],
+        lambda kind, *_: kind != "6-UPS by hand",
+    ),
 )
 def test_ranks_are_those_of_all_equations_written_out(
     kind: str, n_views: int, n_images: int, tmp_path: Path

@@ -26,6 +26,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, platform_pose, readings_at
 
 machine_of = cache(load_mechanism)
+LIKE_OTHERS = ("6-sps", "nategh-agheli", "3-upu-tilted", "orthoglide", "servo-hexapod")
 CARRIED = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0) for k in range(6)]))
 
 
@@ -44,7 +45,7 @@ def check_closed(machine: Machine) -> None:
     assert np.abs(constraints(machine, machine.home)[0]).max(initial=0.0) < 2e-13
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", thinned(SHIPPED, lambda name: name not in LIKE_OTHERS))
 def test_a_slightly_wrong_home_is_projected_onto_all_constraints(name: str, tmp_path: Path) -> None:
     nominal = machine_of(name)
     off = displaced(nominal.home, np.random.default_rng(3).normal(0.0, 5e-4, 6))
@@ -59,7 +60,7 @@ def test_a_slightly_wrong_home_is_projected_onto_all_constraints(name: str, tmp_
     ("description", "carried"),
     thinned(
         [(description, carried) for description in MACHINES for carried in (False, True)],
-        lambda description, carried: not carried or description in ("3-UPU", "Tricept", "6-UPS"),
+        lambda description, carried: carried == (description in ("3-UPU", "Tricept", "6-UPS")),
     ),
 )
 def test_a_rounded_home_closes_in_every_class(

@@ -87,9 +87,9 @@ def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
 @pytest.mark.parametrize(
     ("views", "images", "ranks", "needed"),
     [
-        ("weak joint", 15, (30, 30), ()),
+        ("weak joint", 6, (30, 30), ()),
         ("halves", 15, (30, 30), ("eq12",)),
-        ("paper", 15, (30, 30), ()),
+        ("paper", 6, (30, 30), ()),
         ("weak joint", 1, (26, 30), ("full",)),
     ],
 )

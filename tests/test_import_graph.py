@@ -91,7 +91,7 @@ PUBLIC: dict[str, set[str]] = {
         "readings_sheet",
         "reasons",
     },
-    "recordings": {"importing"},
+    "recordings": {"arrivals", "importing"},
     "estimation": {
         "clusters",
         "loss",
@@ -138,6 +138,7 @@ PUBLIC: dict[str, set[str]] = {
         "link_joints",
         "location.document",
         "location.locate",
+        "ordered_dataset",
         "pipeline",
         "quantities",
         "result",
@@ -146,7 +147,7 @@ PUBLIC: dict[str, set[str]] = {
         "verification",
         "workspace_errors",
     },
-    "planning": {"places", "request", "session"},
+    "planning": {"places", "request", "session", "shooting"},
     "exports": {"formats", "subject"},
     "scene": {"motions"},
     "report": {
@@ -158,7 +159,7 @@ PUBLIC: dict[str, set[str]] = {
         "render",
         "session",
     },
-    "viewer": {"click_server", "server", "source", "view_server"},
+    "viewer": {"click_server", "server", "shooting", "source", "view_server"},
     "cli": set(),
     "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }

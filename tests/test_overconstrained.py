@@ -77,7 +77,7 @@ def keeps_its_plane(legs: tuple[Leg, ...]) -> float:
     thinned(
         product(KINDS, LAYOUTS),
         lambda kind, layout: kind == "exechon" and layout is LAYOUTS[-1],
-        "system",
+        system=[("2-UPR + 2-SPS", LAYOUTS[0])],
     ),
 )
 def test_what_is_tied_is_what_keeps_the_mobility(kind: str, layout: Layout, tmp_path: Path) -> None:

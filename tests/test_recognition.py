@@ -47,7 +47,6 @@ from legcal.perception.pair_matching import (
     segment_equations,
 )
 from legcal.perception.placement import Group, Search, group_views
-from legcal.perception.radii import MIN_CHANGE, RadiusFactors, estimate_radii
 from legcal.perception.view_fit import (
     ViewFit,
     fit_view,
@@ -259,43 +258,6 @@ def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
     assert np.median(distances(own, _pose(T), matches)[0, 0, good]) < 2e-4
     off = distances(own, _pose(away), matches)[0, 0, good]
     assert 2e-3 < off.max() < 6e-3
-
-
-@pytest.mark.parametrize(("factor", "legs"), [(1.25, [1]), (0.8, [1]), (1.25, [0, 1, 2, 3, 4, 5])])
-def test_radii_that_pictures_contradict_are_estimated(factor: float, legs: list[int]) -> None:
-    pictures, T = _scene(2, n=8)
-    stated = []  # the model has the radii of some legs wrong
-    for p in pictures:
-        wrong = np.where(np.isin(p.targets.leg, legs), 1.0 / factor, 1.0)
-        stated.append(replace(p, targets=replace(p.targets, radius=wrong * p.targets.radius)))
-    radii = estimate_radii([(0, stated, _pose(T))])
-    assert radii.factor
-    assert {leg for leg, _ in radii.factor} <= set(legs)
-    assert list(radii.factor.values()) == pytest.approx([factor] * len(radii.factor), rel=0.03)
-    assert (radii.common > 0.0) == (len(legs) == 6)
-    assert not estimate_radii([(0, pictures, _pose(T))]).factor
-
-
-@pytest.mark.parametrize(("factor", "legs"), [(0.9, [0, 1, 2, 3, 4, 5]), (0.98, [1])])
-def test_a_leg_that_is_as_thin_as_all_or_hardly_thinner_keeps_its_radius(
-    factor: float, legs: list[int]
-) -> None:
-    """Light and optics make the edges of thin legs thinner: that is no radius of one of them."""
-    pictures, T = _scene(2, n=8)
-    stated = []
-    for p in pictures:
-        wrong = np.where(np.isin(p.targets.leg, legs), 1.0 / factor, 1.0)
-        stated.append(replace(p, targets=replace(p.targets, radius=wrong * p.targets.radius)))
-    radii = estimate_radii([(0, stated, _pose(T))])
-    assert (radii.common > 0.0) == (len(legs) == 6)
-    suspects = {part for part in radii.factor if part[0] == 1}
-    assert not radii.only(suspects).factor
-
-
-def test_corrections_that_lead_back_to_the_model_leave_its_radius() -> None:
-    first, back = RadiusFactors({(5, 3e-3): 0.9}), RadiusFactors({(5, 2.7e-3): 1.09})
-    assert not first.then(back).beyond(MIN_CHANGE).factor
-    assert first.beyond(MIN_CHANGE).factor == first.factor
 
 
 # The camera of a view.

@@ -120,7 +120,7 @@ def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> N
 def test_poses_for_plans_of_redundant_machines_are_those_of_least_squares(name: str) -> None:
     machine = machine_of(name)
     legs = fitted_legs(machine)
-    drawn = feasible_poses(machine, 40, np.random.default_rng(0), extreme=False)
+    drawn = feasible_poses(machine, 12, np.random.default_rng(0), extreme=False)
     assert surely_reached(machine, legs, default_setting(machine.size), drawn).mean() > 0.5
 
 
@@ -132,7 +132,9 @@ def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() 
         Follower(machine)
 
 
-@pytest.mark.parametrize("name", ["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"])
+@pytest.mark.parametrize(
+    "name", thinned(["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"], ["4-RPR", "2-RPS + 2-SPS + rod"])
+)
 def test_poses_are_those_of_least_squares(name: str) -> None:
     machine = machine_of(name)
     rng, motors = np.random.default_rng(1), list(machine.motors)
@@ -211,9 +213,9 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
 
 
 def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(tmp_path: Path) -> None:
-    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=12)
+    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=8)
     m, slip = session.measurements, 3e-4
-    later = m.pose >= 6
+    later = m.pose >= 4
     slipped = dataclasses.replace(m, q=m.q + slip * np.outer(later, np.arange(7) == 3))
     found = refine(session.legs, slipped, session.outlines, session.start)
     first = session_tests(found.posterior, slipped, image_sequences(slipped, {})).findings[0]

@@ -162,8 +162,8 @@ def test_repeated_photographs_differ_and_what_to_do_with_them_is_said(tmp_path: 
     document = summary_document(one)
     console.print(simulation_table(document))
     printed = console.export_text()
-    assert f"calibrate with: legcal calibrate {one.folder} -o OUT\n" in printed
-    assert f"judge with: legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
+    assert f"\n  legcal calibrate {one.folder} -o OUT\n" in printed
+    assert f"  legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
     document["views"]["c1"]["legs"]["leg2"] = 0
     console.print(simulation_table(document))
     assert "Few of the 2 images show these legs: leg2 in 0." in console.export_text()

@@ -40,7 +40,12 @@ def _parts(machine: Machine, poses: Configurations) -> Array:
     return np.asarray((poses.readings[:, motors] - lower) / (upper - lower))
 
 
-@pytest.mark.parametrize("name", thinned(SHIPPED, ["hexapod", "tricept", "delta"], "system"))
+OF_EACH_CLASS = ("hexapod", "hexapod-rod", "3-rps", "3-upu", "3-prs", "hexaglide")
+
+
+@pytest.mark.parametrize(
+    "name", thinned(SHIPPED, ["3-rpr", "tricept", "delta"], system=OF_EACH_CLASS)
+)
 def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> None:
     machine = load_mechanism(name)
     poses = _drawn(machine, 4)

@@ -294,19 +294,28 @@ def _w_first(rotation: Rotation) -> Rotation:
     return Rotation.from_quat(np.roll(rotation.as_quat(), 1))
 
 
-@pytest.mark.system
-def test_radii_that_are_all_wrong_by_a_fifth_are_found(tmp_path: Path) -> None:
-    """Those of single legs are found in test_recognition.py."""
+@pytest.mark.parametrize(
+    ("factor", "leg", "words"),
+    [
+        pytest.param(
+            1.2, "leg", r"All legs appear 1[2-9] % thinner than in the model; the radii",
+            marks=pytest.mark.system,
+        ),
+        pytest.param(0.8, "leg2", r"leg2 may be 2[2-8] % thicker than in the model: its radius is"),
+    ],
+)  # fmt: skip
+def test_radii_that_are_wrong_by_a_fifth_are_found(
+    tmp_path: Path, factor: float, leg: str, words: str
+) -> None:
     made = spoiled(tmp_path / "radii", 3, ("c1", "c2"))
-    made.scale_radii(1.2, "leg")
+    made.scale_radii(factor, leg)
     observed = _observed(made)
     found = observed.placement
     assert found.unplaced == {}
     assert len(found.notes) == 1
-    words = r"All legs appear 1[2-9] % thinner than in the model; the radii"
     assert re.match(words, found.notes[0]), found.notes
-    wrong = [c.radius for of_leg in observed.photographs.cylinders for c in of_leg]
-    assert np.allclose(wrong, 0.01, rtol=0.06)
+    radii = [c.radius for of_leg in observed.photographs.cylinders for c in of_leg]
+    assert np.allclose(radii, 0.01, rtol=0.06)
 
 
 def test_blur_is_measured_whatever_the_light() -> None:

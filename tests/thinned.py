@@ -7,17 +7,23 @@ import pytest
 
 
 def thinned(
-    values: Iterable[Any], usual: Callable[..., bool] | Iterable[Any], mark: str = "slow"
+    values: Iterable[Any],
+    usual: Callable[..., bool] | Iterable[Any],
+    mark: str = "slow",
+    *,
+    system: Iterable[Any] = (),
 ) -> list[Any]:
     """Return parameters with those marked slow, or system, that are not among the usual ones.
 
-    Tuples are the parameters of several names; *usual* may be a question that takes them.
+    Tuples are the parameters of several names; *usual* may be a question that takes them. Those of
+    *system* are marked so in any case.
     """
-    kept = usual if callable(usual) else _one_of(list(usual))
+    kept, further = usual if callable(usual) else _one_of(list(usual)), _one_of(list(system))
     found = []
     for value in values:
         several = value if isinstance(value, tuple) else (value,)
-        marks = () if kept(*several) else (getattr(pytest.mark, mark),)
+        name = "system" if further(*several) else mark
+        marks = () if kept(*several) else (getattr(pytest.mark, name),)
         found.append(pytest.param(*several, marks=marks))
     return found
 

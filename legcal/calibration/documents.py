@@ -431,6 +431,17 @@ class Overlay(Document):
     file: str
 
 
+class MotorZero(Document):
+    """How much further a motor stands than it reads [m or rad]."""
+
+    motor: str
+    value: Number
+    sigma: Number
+    tolerance: Number
+    unit: Literal["m", "rad"]
+    teeth: StrictInt  # of its spline by which its horn is off; 0 where it is no whole number
+
+
 class Result(Legs, Heading, SparseDocument):
     """``result.json``: the heading, the calibrated legs, and how well they are known."""
 
@@ -456,6 +467,8 @@ class Result(Legs, Heading, SparseDocument):
     notes: list[str]
     details: list[str] = Field(default_factory=list)  # how the fit went, for those who ask
     diagnosis: list[DiagnosisBlock] | None = None  # left out where nothing looks wrong
+    only: Literal["zeros", "lengths", "all"] | None = None  # the group, where one was asked for
+    zeros: list[MotorZero] | None = None  # of the motors, likewise
     overlays: list[Overlay] | None = None  # left out where none were asked for
 
     def nominal_actuator(self, calibrated: Actuator | None) -> Actuator | None:

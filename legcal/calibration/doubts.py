@@ -55,6 +55,7 @@ from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
+TOLERANCE = "tolerance"  # code of the doubt in parameters that moved far
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
 MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
@@ -517,7 +518,7 @@ class _Evidence:
             "look at the worst outlines of these legs and at the model there; if the machine may "
             "be that far off its model, state so (tolerance in dataset.yaml)"
         )
-        return [Doubt("tolerance", what, remedy, *_mean(error))]
+        return [Doubt(TOLERANCE, what, remedy, *_mean(error))]
 
     def noise(self) -> list[Doubt]:
         """Return whether outlines scatter more than they claim: all, of a view, leg or period.

@@ -147,6 +147,17 @@ class OrderedDataset:
         """Return T_Rb_Re of every pose by the readings and other legs, in R_b and R_e."""
         return start_from(legs, self.measurements, self.fitted_legs, (), self.T_Rb_Re, "").T_Rb_Re
 
+    def turned(self, zeros: Mapping[str, float]) -> OrderedDataset:
+        """Return the dataset with the readings of motors that stand further than they read.
+
+        *zeros* are by motor [m or rad]: with readings corrected, the nominal model holds.
+        """
+        further = np.array([zeros.get(leg.motor_label, 0.0) for leg in self.machine.legs])
+        if not further.any():
+            return self
+        corrected = replace(self.measurements, q=self.measurements.q + further)
+        return replace(self, measurements=corrected)
+
     def rows_of(self, file_rows: IntArray) -> IntArray:
         """Return the rows of images in canonical order, given their rows in the files."""
         return np.sort(inverse(self.order.rows)[file_rows])

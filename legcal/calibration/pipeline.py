@@ -17,7 +17,7 @@ Held-out images are searched like the others, and not fitted. Phases 2 to 5 work
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,7 +25,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.board import board_notes, rough_placement
-from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose, notes_beside
+from legcal.calibration.diagnosis.diagnosis import (
+    Diagnosis,
+    agreement_with_zeros,
+    diagnose,
+    notes_beside,
+)
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import (
     TRIAL,
@@ -39,8 +44,10 @@ from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior, known_parameters, resolve
+from legcal.calibration.joint_fit.part_errors import Group
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
+from legcal.calibration.only import RARE, built_of, estimate_group, likely_teeth
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -60,6 +67,7 @@ from legcal.data.outlines import reject_unused_legs
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
+    LegcalError,
     NotIdentifiable,
     NotVisible,
     Problem,
@@ -82,6 +90,9 @@ from legcal.progress import Progress, shown_progress
 from legcal.vision.camera import shared_cameras, stated_covariances
 from legcal.workers import Workers, worker_pool
 
+_TEETH, _UNLIKELY = 5, 60.0  # hypotheses that are fitted, and evidence against them at most
+_GUESSES = 3  # horns on another tooth at which images are measured, if those before show no legs
+
 
 def calibrate(
     source: str | Path | Dataset,
@@ -98,6 +109,7 @@ def calibrate(
     leave_out: str = "",
     split: Sequence[str] = (),
     overlays: bool = False,
+    only: Group | None = None,
     beside: Beside | None = None,
 ) -> Calibration:
     """Compute joint positions and offsets of a mechanism from a dataset.
@@ -139,6 +151,9 @@ def calibrate(
         others, whose zero the model has.
     overlays : bool
         Draw the outlines over every photograph, into ``overlays`` of the result folder.
+    only : {"zeros", "lengths", "all"}, optional
+        Tolerances of the model or dataset are priors of all parameters, so that few photographs are
+        enough for what is worst. This group is estimated; the model keeps nominal values elsewhere.
     beside : callable, optional
         Called as ``beside(calibration, folder)`` when all other files are in the folder that
         becomes the result folder: what it writes there appears with them, or nothing does.
@@ -170,6 +185,8 @@ def calibrate(
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides)
+    if only is not None:
+        choices = replace(choices, built=built_of(dataset.machine))
     left_out = chosen_images(dataset, leave_out) if leave_out else None
     if zeros := own_zeros(dataset, listed(split), left_out):
         dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
@@ -180,12 +197,15 @@ def calibrate(
     key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
-        estimate = estimate_parameters(data, fitted, Options(choices, criteria))
+        options = Options(choices, None if only else criteria)
+        estimate, turned = estimate_teeth(data, fitted, options)
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None
 
     # 6. Judge and write.
-    found = estimate.in_file_order()
+    found, group = estimate.in_file_order(), None
+    if only is not None and choices.built is not None:
+        group = estimate_group(dataset.machine, found.solution, choices.built, turned, only)
     on_images = notes_beside(
         found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
     )
@@ -212,6 +232,7 @@ def calibrate(
         corners=None if found.corners is None else found.corners.at(fitted),
         held_out=prediction,
         diagnosis=found.diagnosis,
+        group=group,
     )
     if output is not None:
         drawing = worker_pool(workers if overlays else 1)
@@ -224,6 +245,69 @@ def calibrate(
                 beside=beside,
             )
     return calibration
+
+
+def estimate_teeth(
+    data: OrderedDataset, file_rows: IntArray, options: Options
+) -> tuple[Estimate, dict[str, float]]:
+    """Estimate as :func:`estimate_parameters`, with horns on other teeth where images say so.
+
+    With tolerances as priors, and a spline that the model states. A first estimate leaves the zeros
+    open by a tooth and says which horns may be on others. Each of these is fitted with readings
+    corrected, so that zeros have their tolerance as prior about there, and the likeliest wins;
+    images are searched again. If the first finds no legs, motors are tried a tooth further and
+    back, those first with which images agree best.
+
+    Return also by how much motors stand further than they read [rad].
+    """
+    machine, built = data.machine, options.choices.built
+    if built is None or machine.spline_teeth is None:
+        return estimate_parameters(data, file_rows, options), {}
+    step = 2.0 * np.pi / machine.spline_teeth
+    wide = replace(built, angles_at_zero=max(step, built.angles_at_zero or 0.0))
+    first = replace(options, choices=replace(options.choices, built=wide))
+    failure: LegcalError | None = None
+    for guess in _guesses(data, step):
+        try:
+            near = estimate_parameters(data.turned(guess), file_rows, first)
+        except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
+            failure = failure or error
+            continue
+        ranked = likely_teeth(machine, near.solution, built, wide, step)
+        likely = [teeth for against, teeth in ranked[:_TEETH] if against < _UNLIKELY]
+        fits = list[tuple[float, dict[str, float], Estimate]]()
+        for teeth in likely:
+            turned = {m: teeth.get(m, 0.0) + guess.get(m, 0.0) for m in {**guess, **teeth}}
+            turned = {m: angle for m, angle in turned.items() if angle}
+            fitted = data.turned(turned).at(data.rows_of(file_rows))
+            placement, board = rough_placement(fitted)
+            cameras = near.solution.cameras_in_base(machine.T_base_Rb)
+            placement = replace(placement, T_base_camera=cameras)
+            try:
+                fit = fit_outlines(fitted, near.outlines, placement, board, options)
+            except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
+                failure = failure or error
+                continue
+            fits.append((fit.solution.quality.cost + 0.5 * RARE * len(turned), turned, fit))
+        if not fits:
+            continue
+        _, turned, fit = min(fits, key=lambda one: one[0])
+        if turned != guess and len(data.photographs.detect):
+            return estimate_parameters(data.turned(turned), file_rows, options), turned
+        return replace(near, fitted=fit.fitted, solution=fit.solution, steps=fit.steps), turned
+    assert failure is not None
+    raise failure
+
+
+def _guesses(data: OrderedDataset, step: float) -> Iterator[dict[str, float]]:
+    """Yield the horns as they should be, then a few with one a tooth off that images agree with."""
+    yield {}
+    machine = data.machine
+    motors = [machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle]
+    tried = [{motor: side * step} for motor in motors for side in (1.0, -1.0)]
+    if len(data.photographs.detect):
+        shown = agreement_with_zeros(data, tried)
+        yield from (tried[k] for k in np.argsort(-np.array(shown), kind="stable")[:_GUESSES])
 
 
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
@@ -291,7 +375,7 @@ def _estimate(
         photographs, placement, data.progress, T_board_camera, method=measure_in_brief
     )
     seen.placement.require_one()
-    other_radii = bool(seen.placement.radii.factor)
+    other_radii = seen.photographs.machine is not photographs.machine
     if other_radii:
         data = replace(data, machine=seen.photographs.machine)
     data = data.with_poses(seen.free_poses)

@@ -44,6 +44,7 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformErro
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.link_joints import joints_in_links, weak_in_links
+from legcal.calibration.only import GroupEstimate
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
@@ -146,6 +147,8 @@ class Calibration(Summarised):
         What looks wrong with the session, the likeliest first; empty where nothing does.
     overlays : dict
         The overlays beside the result, relative to its folder, by row of the measurements.
+    group : GroupEstimate or None
+        The zeros, the lengths or all parts, with tolerances as priors; None where not asked for.
     """
 
     dataset: Dataset
@@ -158,6 +161,7 @@ class Calibration(Summarised):
     corners: Corners | None = None
     diagnosis: tuple[Diagnosis, ...] = ()
     overlays: Mapping[int, str] = field(default_factory=dict)
+    group: GroupEstimate | None = None
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
@@ -243,6 +247,8 @@ def _result_of(calibration: Calibration) -> Result:
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
+        only=None if calibration.group is None else calibration.group.group,
+        zeros=None if calibration.group is None else calibration.group.zeros,
         overlays=_overlays(calibration),
     )
 

@@ -53,6 +53,7 @@ from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml,
 from legcal.machine.parameters import (
     calibrated_axis,
     geometries,
+    in_joint_frames,
     nominal_axes,
     parametrization_of,
     turns_between,
@@ -102,7 +103,9 @@ def write_result(
     stale += [REPORT_NAME] * PAGE.is_at(destination / REPORT_NAME)
     old = [*map(Path, stale), *earlier_overlays(destination)]
     with result_folder(destination, stale=old) as folder:
-        _write_model(machine, solution.legs, folder / RESULT_YAML)
+        group = calibration.group
+        legs = solution.legs if group is None else group.written
+        _write_model(machine, legs, folder / RESULT_YAML)
         if steps.legs is not None:
             try:
                 _write_model(machine, steps.legs, folder / STAGED_NAME)
@@ -154,8 +157,9 @@ def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
     write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved, legs)
     written = reload_and_check(yaml)
     parametrization = parametrization_of(written, twists=True)
-    difference = vector_of(parametrization, geometries(written), legs) - vector_of(
-        parametrization, legs, legs
+    wanted = in_joint_frames(legs, machine.frame_legs)
+    difference = vector_of(parametrization, geometries(written), wanted) - vector_of(
+        parametrization, wanted, wanted
     )
     unit = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
     error = float(np.abs(difference / unit).max())

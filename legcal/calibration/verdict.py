@@ -12,6 +12,7 @@ from legcal.calibration.clicks import click_notes
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.doubts import (
     CAMERA,
+    TOLERANCE,
     Doubt,
     doubts_of,
     model_error,
@@ -26,6 +27,7 @@ from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.only import GroupEstimate
 from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
@@ -57,8 +59,9 @@ def judge(
     corners: Corners | None = None,
     held_out: HeldOut | None = None,
     diagnosis: Sequence[Diagnosis] = (),
+    group: GroupEstimate | None = None,
 ) -> Calibration:
-    """Return the calibration with its verdict.
+    """Return the calibration with its verdict; of a *group* of its parameters, if given.
 
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
@@ -76,18 +79,19 @@ def judge(
         measurements.own_zeros, solution.posterior.state.own_zeros.tolist(), strict=True
     ):
         q[np.ix_(of.rows[measurements.first_rows], motors == of.motor)] -= zero
+    reported = solution if group is None else group.solution
     platform = platform_accuracy(
         machine,
-        solution.legs,
-        solution.kinematic.parametrization,
-        solution.kinematic.total_covariance,
+        reported.legs,
+        reported.kinematic.parametrization,
+        reported.kinematic.total_covariance,
         q,
-        solution.T_Rb_Re,
-        solution.sensitivities,
+        reported.T_Rb_Re,
+        reported.sensitivities,
     )
     remedy = ""
     if platform is None:
-        change, sigma, found = _change_of_parameters(dataset, solution)
+        change, sigma, found = _change_of_parameters(dataset, reported)
     else:
         change, sigma, found = _change_of_platform(platform)
         by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
@@ -97,6 +101,10 @@ def judge(
     sequences = sequences_of(dataset)
     session = session_tests(solution.posterior, measurements, sequences)
     doubts = doubts_of(dataset, solution, platform, held_out, diagnosis, corners, session)
+    if group is not None:
+        found = f"{group.sentence}; {found}"
+        others = (doubt for doubt in doubts if doubt.code != TOLERANCE)
+        doubts = (*others, *group.doubts)
     displacement, rotation = model_error(doubts)
     if displacement > 0.0:
         found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"
@@ -113,7 +121,7 @@ def judge(
         notes = [*notes, *camera_file_notes(dataset, solution)]
     return Calibration(
         dataset,
-        solution,
+        reported,
         steps,
         platform,
         verdict,
@@ -129,6 +137,7 @@ def judge(
         held_out,
         corners,
         tuple(diagnosis),
+        group=group,
     )
 
 

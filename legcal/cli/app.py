@@ -28,7 +28,7 @@ from legcal.cli.machines import (
     view,
 )
 from legcal.cli.options import print_failure
-from legcal.cli.sessions import camera, detect, doctor, import_, init, plan
+from legcal.cli.sessions import camera, detect, doctor, import_, init, plan, shoot
 from legcal.cli.simulated import simulate, study
 from legcal.errors import LegcalError, UsageError, printable
 from legcal.signals import INTERRUPTED, raise_if_stopped
@@ -65,7 +65,7 @@ def _root(
 
 PANELS: dict[str, Sequence[Callable[..., None]]] = {
     "Your machine": (new, inspect, identify),
-    "Photographs": (camera, plan, init, import_, doctor, detect),
+    "Photographs": (camera, plan, shoot, init, import_, doctor, detect),
     "Calibrate": (calibrate,),
     "Results": (evaluate, locate, export, view),
     "No machine yet": (example, simulate),

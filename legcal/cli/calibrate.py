@@ -11,6 +11,7 @@ import typer
 from legcal.cli.options import (
     ClusterOption,
     JsonOption,
+    OnlyOption,
     PageOfResult,
     QuietOption,
     WorkersOption,
@@ -75,6 +76,7 @@ def calibrate(
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
+    only: OnlyOption = None,
     holdout: Annotated[
         float | None,
         typer.Option(
@@ -145,6 +147,7 @@ def calibrate(
         others = {
             "--set": settings or None,
             "--length": length,
+            "--only": only,
             "--holdout": holdout,
             "--leave-out": leave_out or None,
             "--split": split,
@@ -187,6 +190,7 @@ def calibrate(
         "leave_out": leave_out,
         "split": split or (),
         "overlays": overlays,
+        "only": only,
     }
     arguments |= overrides_of_settings(settings or ())
     arguments["priors"] += _lengths(length or ())

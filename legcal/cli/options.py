@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -45,6 +45,14 @@ LengthsOption = Annotated[
 HandHeldOption = Annotated[
     bool,
     typer.Option("--hand-held", help="Hand-held camera: a new pose for every image; with --board."),
+]
+OnlyOption = Annotated[
+    Literal["zeros", "lengths", "all"] | None,
+    typer.Option(
+        "--only",
+        help="Take the tolerances of the model or dataset (tolerance, machine_kind) as priors, and "
+        "tell this group from few photographs; the model keeps nominal values elsewhere.",
+    ),
 ]
 NoiseOption = Annotated[
     Path | None,

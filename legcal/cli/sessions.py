@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -212,6 +213,89 @@ def plan(
             text = f"The session was written to {output}, with the best plan found before the stop."
             sys.stderr.write(f"legcal: {printable(text)}\n")
     show(as_json, session.document, lambda: plan_table(session, output))
+
+
+def shoot(
+    session: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SESSION", help="The folder of legcal plan, or a dataset to add photographs to."
+        ),
+    ],
+    watch: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Take new photographs from this folder, such as one that a phone synchronises; "
+            "they are copied.",
+        ),
+    ] = None,
+    camera: Annotated[
+        int | None,
+        typer.Option(metavar="NUMBER", help="Take them with this camera of the computer: 0."),
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LENGTH",
+            help="Go on, beyond the plan if need be, until this platform error is predicted, "
+            "0.05mm.",
+        ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Serve the same as a page on this port; 0 for any that is free."
+        ),
+    ] = None,
+) -> None:
+    """Guide a session: name the next pose, check each photograph, and predict the error so far.
+
+    Type readings in mm or deg where they differ from the pose that is asked.
+    """
+    import threading
+
+    from legcal.files.quantity import LENGTH, parse_quantity
+    from legcal.planning.shooting import GuidedSession
+    from legcal.recordings.arrivals import LiveCamera, WatchedFolder
+    from legcal.viewer.server import LOCAL, Address, check_address
+    from legcal.viewer.shooting import WORDS, Dialogue, DialogueServer
+
+    if (watch is None) == (camera is None):
+        raise UsageError(
+            f"No photograph could arrive: found {'neither' if watch is None else 'both'} of "
+            "--watch and --camera, needed one; give --watch FOLDER, or --camera 0."
+        )
+    guided = GuidedSession(
+        session,
+        target=None if target is None else parse_quantity(target, LENGTH, "--target"),
+    )
+    lens = guided.dataset.measurements.views[0].camera
+    source = (
+        LiveCamera(camera or 0, lens.width, lens.height) if watch is None else WatchedFolder(watch)
+    )
+    dialogue = Dialogue(guided, source, typer.echo)
+
+    def listen() -> None:
+        with suppress(OSError, ValueError):  # there may be no terminal
+            for line in sys.stdin or ():
+                dialogue.words.put(line)
+
+    typer.echo(f"Type readings in mm or deg where they differ from those asked; or {WORDS}.")
+    threading.Thread(target=listen, daemon=True).start()
+    if port is not None:
+        check_address(Address(LOCAL, port))
+        server = DialogueServer(dialogue, port)
+        threading.Thread(target=server.run, daemon=True).start()
+        typer.echo(f"The same as a page: {server.address}")
+        open_browser(str(server.address))
+    try:
+        is_complete = dialogue.run()
+    finally:
+        if isinstance(source, LiveCamera):
+            source.close()
+    if is_complete:
+        typer.echo(f"legcal calibrate {shlex.quote(str(session))} -o calibrated")
 
 
 def _previews(plan: Plan) -> dict[str, bytes]:

@@ -329,7 +329,11 @@ def load_dataset(
         yaml_path=yaml_path,
         table_path=table_path,
         camera_paths=tuple(camera_paths[v] for v in origin),
-        machine=replace(machine, tolerance=entry.built or machine.tolerance),
+        machine=replace(
+            machine,
+            tolerance=entry.built or machine.tolerance,
+            spline_teeth=entry.spline_teeth or machine.spline_teeth,
+        ),
         measurements=measurements,
         observations=read_outlines(folder, machine, measurements),
         table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),

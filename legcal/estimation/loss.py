@@ -2,7 +2,8 @@
 
 The pseudo-Huber loss of width k^-1/2 is s / (1 + sqrt(1 + k s)): s / 2 for small s, linear in the
 residual norm for large s, convex, and least squares for k = 0. Huber's loss switches at the width.
-In both, the influence of a residual is bounded by the width.
+In both, the influence of a residual is bounded by the width. Weights of losses that are not convex
+are for iteratively reweighted least squares from a good start.
 """
 
 from __future__ import annotations
@@ -99,6 +100,16 @@ class Huber:
 
 
 LEAST_SQUARES = PseudoHuber()
+
+
+def cauchy_weights(s: Array) -> Array:
+    """Return the weights of Cauchy's loss for squares s of residuals in units of its width."""
+    return np.asarray(1.0 / (1.0 + s))
+
+
+def biweights(s: Array) -> Array:
+    """Return Tukey's weights for squares s of residuals in units of the width: zero beyond it."""
+    return np.asarray(np.maximum(1.0 - s, 0.0) ** 2)
 
 
 @cache

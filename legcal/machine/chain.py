@@ -205,6 +205,17 @@ class ClosedChain:
                 columns.append(start)
         return np.array(columns, dtype=np.intp)
 
+    def row_weights(self, metre: float) -> Array:
+        """Return the weights (n_rows,) that make residuals dimensionless: lengths in *metre*."""
+        weights = [[1.0 / metre] * 3 + [1.0] * (closure.rows - 3) for closure in self.closures]
+        return np.concatenate([*weights, np.zeros(0)])
+
+    def column_units(self, metre: float) -> Array:
+        """Return the units (nv,) of dimensionless tangent steps: *metre* [m], and 1 for angles."""
+        units = np.full(self.nv, metre)
+        units[self.rotation_columns()] = 1.0
+        return units
+
     def with_platform(
         self,
         configuration: Array,

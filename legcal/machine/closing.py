@@ -161,17 +161,14 @@ def closure_equations(
     """
     chain = machine.chain
     weld = T if machine.platform_joint is None else None
-    weights = np.ones(chain.n_rows + 6 * (weld is not None))
-    row = 0
-    for rows in [closure.rows for closure in chain.closures] + [6]:
-        weights[row : row + 3] = 1.0 / metre
-        row += rows
+    of_weld = [1.0 / metre] * 3 + [1.0] * 3
+    weights = np.append(chain.row_weights(metre), of_weld if weld is not None else [])
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
         if weld is not None:
-            of_weld, by_joints = chain.welded(machine.base, machine.platform, weld)
-            residual = np.concatenate([residual, of_weld])
+            of_pose, by_joints = chain.welded(machine.base, machine.platform, weld)
+            residual = np.concatenate([residual, of_pose])
             jacobian = np.concatenate([jacobian, by_joints])
         return (residual * weights)[None], (jacobian[:, free] * weights[:, None])[None]
 

@@ -47,7 +47,7 @@ def shipped_names() -> list[str]:
 def find_model(model: str | Path) -> Path:
     """Return the file of a mechanism, from a path or the name of a shipped model.
 
-    A result folder gives its calibrated model.
+    A result folder gives its calibrated model, a folder with a single model in ``models`` that.
     """
     path = Path(model)
     names = shipped_names()
@@ -83,8 +83,12 @@ def find_model(model: str | Path) -> Path:
         )
     if (path / DATASET_YAML).is_file():
         raise ModelError(what_a_dataset_is_for(path))
-    needed = "a folder with it, a result folder, or a YAML, URDF or MJCF file"
-    raise ModelError(refused, f"a folder without {FOLDER_YAML}", needed, "give the file", path)
+    written = sorted((path / "models").glob("*.yaml"))  # by new, inspect and locate
+    if len(written) == 1:
+        return written[0]
+    needed = "a folder with one model, a result folder, or a YAML, URDF or MJCF file"
+    found = f"a folder without {FOLDER_YAML} and with {len(written) or 'no'} models/*.yaml"
+    raise ModelError(refused, found, needed, "give the file", path)
 
 
 def dimensions_alone(kind: str, path: Path) -> ModelError:
@@ -274,13 +278,19 @@ def mechanism_yaml(
     loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
 ) -> str:
     """Return the YAML of a mechanism from closures (two frames, kind), motors and block."""
-    document = {
-        "closed_loop": [[first, second] for first, second, _ in loops],
-        "type": [kind for *_, kind in loops],
-        "name_mot": motors,
-        "joint_name": [],
-        "joint_type": [],
-        "legcal": {"version": 1, **legcal},
-    }
+    return yaml_text(
+        {
+            "closed_loop": [[first, second] for first, second, _ in loops],
+            "type": [kind for *_, kind in loops],
+            "name_mot": motors,
+            "joint_name": [],
+            "joint_type": [],
+            "legcal": {"version": 1, **legcal},
+        }
+    )
+
+
+def yaml_text(document: dict[str, Any]) -> str:
+    """Return a mechanism YAML from its entries."""
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
     return with_schema("mechanism", text)

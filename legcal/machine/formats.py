@@ -400,8 +400,7 @@ def completed(source: Source) -> Source:
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
     drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
-    unit = np.full(chain.nv, float(np.ptp(drawn_at, axis=0).max()) or 1.0)
-    unit[chain.rotation_columns()] = 1.0
+    unit = chain.column_units(float(np.ptp(drawn_at, axis=0).max()) or 1.0)
     closed = closed_near(chain, start, source.urdf.links, unit)
     configuration = start if closed is None else closed
     urdf = source.urdf

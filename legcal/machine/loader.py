@@ -268,6 +268,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         platform_normal=platform_normal,
         occluders=occluders,
         tolerance=block.built or NOT_STATED,
+        spline_teeth=block.spline_teeth,
     )
     _check_frames(machine)
     return machine

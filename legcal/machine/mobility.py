@@ -88,7 +88,7 @@ def generic_configurations(machine: Machine, count: int) -> list[Array]:
     """Return home, then up to ``count - 1`` closed ones nearby in seeded directions."""
     chain, configurations = machine.chain, [machine.home_configuration]
     rng = np.random.default_rng(1965)
-    unit = _column_units(machine)
+    unit = chain.column_units(machine.size)
     jacobian = chain.linearize(machine.home_configuration)[1] * unit
     inverse = np.linalg.pinv(jacobian, rcond=RANK_TOLERANCE)
     for _ in range(count - 1):
@@ -106,7 +106,8 @@ def generic_configurations(machine: Machine, count: int) -> list[Array]:
 
 def project(machine: Machine, configuration: Array) -> Array | None:
     """Return the closed configuration nearest to an almost closed one, None if there is none."""
-    chain, weights = machine.chain, _row_weights(machine)
+    chain = machine.chain
+    weights = chain.row_weights(machine.size)
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
@@ -117,7 +118,7 @@ def project(machine: Machine, configuration: Array) -> Array | None:
         lambda points, step: chain.integrate(points[0], step[0])[None],
         configuration[None],
         tolerance=0.01 * CLOSED,
-        unit=_column_units(machine),
+        unit=chain.column_units(machine.size),
         steps=15,
     )
     return solution.points[0] if solution.worst[0] < CLOSED else None
@@ -128,28 +129,13 @@ def free_motions(machine: Machine, configuration: Array) -> Array:
 
     It is orthonormal, with lengths in leg lengths.
     """
-    units = _column_units(machine)
-    jacobian = machine.chain.linearize(configuration)[1] * units
-    jacobian *= _row_weights(machine)[:, None]
+    chain = machine.chain
+    units = chain.column_units(machine.size)
+    jacobian = chain.linearize(configuration)[1] * units
+    jacobian *= chain.row_weights(machine.size)[:, None]
     _, values, right = np.linalg.svd(jacobian)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0])) if len(values) else 0
     return np.asarray(units[:, None] * right[rank:].T)
-
-
-def _row_weights(machine: Machine) -> Array:
-    """Return the weights of closure residuals: lengths in leg lengths beside [rad]."""
-    weights, row = np.ones(machine.chain.n_rows), 0
-    for closure in machine.chain.closures:
-        weights[row : row + 3] = 1.0 / machine.size
-        row += closure.rows
-    return weights
-
-
-def _column_units(machine: Machine) -> Array:
-    """Return the units of tangent steps: [m] and [rad] per dimensionless step."""
-    units = np.full(machine.chain.nv, machine.size)
-    units[machine.chain.rotation_columns()] = 1.0
-    return units
 
 
 def singularity(mechanism: Machine, T_base_platform: Pose) -> float:

@@ -27,11 +27,13 @@ from legcal.machine.leg import (
 from legcal.machine.occluders import Occluder, reordered
 from legcal.machine.rods import (
     AT_ZERO,
+    actuator_index,
     actuators_of,
+    ends_at_poses,
     first_rods,
     joints_at,
     reading_legs,
-    reading_of_rod,
+    readings_of_rods,
 )
 from legcal.machine.tolerance import NOT_STATED, Tolerance
 from legcal.machine.urdf import Urdf
@@ -62,6 +64,7 @@ class Machine:
     platform_normal: Array | None = None  # the same in the platform link; both None in space
     occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
     tolerance: Tolerance = NOT_STATED  # how well it is built
+    spline_teeth: int | None = None  # of the shafts that horns of servos sit on
 
     @property
     def upward(self) -> Array:
@@ -296,18 +299,8 @@ def vectors_at(machine: Machine, poses: Array) -> Array:
 
     Moving joints at A are at the position where the first rod of their actuator reaches B.
     """
-    B = B_at(machine, poses)
-    A = machine.A_at(_actuator_readings(machine, B)) if machine.actuators else machine.A_base
+    A, B = ends_at_poses(machine.legs, poses[:, :3, :3], poses[:, :3, 3])
     return np.asarray(B - A)
-
-
-def _actuator_readings(machine: Machine, B: Array) -> Array:
-    """Return the joint values (k, n_legs) of actuators whose rods reach B (k, n_legs, 3)."""
-    q = np.zeros(B.shape[:2])
-    for j, first in enumerate(machine.reads):
-        if machine.legs[j].actuator is not None:
-            q[:, j] = q[:, first] if first < j else reading_of_rod(machine.legs[j], B[:, j])
-    return q
 
 
 def readings_at_poses(machine: Machine, poses: Array) -> Array:
@@ -316,11 +309,12 @@ def readings_at_poses(machine: Machine, poses: Array) -> Array:
     q = sign (|AB| - q0); for rods on an actuator its reading at which the first rod reaches the
     platform.
     """
-    B = B_at(machine, poses)
-    lengths = np.linalg.norm(B - machine.A_base, axis=2)
-    hangs = np.array([leg.actuator is not None for leg in machine.legs])
-    of_sliders = machine.sign * (lengths - machine.q0)
-    return np.asarray(np.where(hangs, _actuator_readings(machine, B), of_sliders))
+    q = machine.sign * (np.linalg.norm(B_at(machine, poses) - machine.A_base, axis=2) - machine.q0)
+    if machine.actuators:
+        on = np.array(actuator_index(machine.legs))
+        rods = readings_of_rods(machine.legs, poses[:, :3, :3], poses[:, :3, 3])
+        q = np.where(on >= 0, rods[:, on], q)
+    return np.asarray(q)
 
 
 def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:

@@ -5,9 +5,7 @@ Written files are loaded again and checked.
 
 from __future__ import annotations
 
-import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +18,16 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.motions import motion_to_xyz_quat
-from legcal.files.schema import content_of
+from legcal.files.schema import read_yaml
 from legcal.geometry.rotations import roll_pitch_yaw
-from legcal.machine.files import FILE_KIND, FOLDER_YAML, is_xml, mechanism_yaml, motor_entries
+from legcal.machine.files import (
+    FILE_KIND,
+    FOLDER_YAML,
+    is_xml,
+    mechanism_yaml,
+    motor_entries,
+    yaml_text,
+)
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -32,7 +37,6 @@ from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
 from legcal.machine.urdf import UrdfPatch, written
 
-_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # strings without quotes in YAML
 CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
 ROUNDING = 1e-15  # displacement that counts as none [mean leg lengths]
 
@@ -152,29 +156,30 @@ def write_calibrated_yaml(
 ) -> None:
     """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
 
-    All else is kept character by character, except the numbers of ``legcal.home`` if home moves;
-    the key is added if it is missing, and the gains of the motors of *legs* if they differ from the
-    model. A mechanism of another format, or without a block ``legcal``, gets a complete YAML.
+    All other entries are kept, except ``legcal.home`` if home moves, and the gains of the motors of
+    *legs* if they differ from the model. A mechanism of another format, or without a block
+    ``legcal``, gets a complete YAML.
     """
     gains = {a.joint: a.gain for a in actuators_of(legs)}
-    if not _is_written_down(machine):
-        there = machine if home is None else replace(machine, home=home)
-        there = replace(there, legs=tuple(_with_gain(leg, gains) for leg in there.legs))
-        destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
-        return
-    text = content_of(machine.yaml_path, FILE_KIND, ModelError).decode("utf-8")
-    if home is not None:
-        text = _with_home(text, home)
-    if any(a.gain != gains.get(a.joint, a.gain) for a in machine.actuators):
-        moved = [leg.actuator for leg in (_with_gain(leg, gains) for leg in machine.legs)]
-        text = _with_motors(text, motor_entries([a for a in moved if a is not None]))
-    value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
-    block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
-    written = None if block is None else _entry(block, "urdf")
-    if written is not None:
-        text = text[: written.start_mark.index] + value + text[written.end_mark.index :]
-    else:
-        text = _with_first(text, block, f"urdf: {value}")
+    there = machine if home is None else replace(machine, home=home)
+    there = replace(there, legs=tuple(_with_gain(leg, gains) for leg in there.legs))
+    text = mechanism_text(there, urdf_name)
+    stated = (
+        {} if is_xml(machine.yaml_path) else read_yaml(machine.yaml_path, FILE_KIND, ModelError)
+    )
+    closures = {(c.frame_1, c.frame_2) for c in machine.chain.closures}
+    if (
+        stated.get("legcal") is not None
+        and not stated.get("joint_name")
+        and {(first, second) for first, second in stated["closed_loop"]} == closures
+    ):
+        block = stated["legcal"]
+        changed = {"urdf"} | ({"home"} & block.keys() if home is not None else set())
+        if any(a.gain != gains.get(a.joint, a.gain) for a in machine.actuators):
+            changed.add("motors")
+        complete = yaml.safe_load(text)["legcal"]
+        stated["legcal"] = block | {key: complete.get(key) for key in changed}
+        text = yaml_text(stated)
     destination.write_bytes(text.encode("utf-8"))
 
 
@@ -184,69 +189,6 @@ def _with_gain(leg: Leg, gains: Mapping[str, float]) -> Leg:
         return leg
     gain = gains.get(leg.actuator.joint, leg.actuator.gain)
     return replace(leg, actuator=replace(leg.actuator, gain=gain))
-
-
-def _with_motors(text: str, entries: dict[str, Any]) -> str:
-    """Return the text of a YAML with these entries in ``legcal.motors``."""
-    value = json.dumps(entries)  # YAML on one line
-    block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
-    written = _entry(block, "motors")
-    if written is not None:
-        end = written.end_mark.index
-        if isinstance(written, yaml.MappingNode) and not written.flow_style:
-            value += "\n" + " " * _indent(block)
-        return text[: written.start_mark.index] + value + text[end:]
-    return _with_first(text, block, f"motors: {value}")
-
-
-def _indent(block: yaml.Node | None) -> int:
-    """Return the column of the keys of a mapping."""
-    return block.value[0][0].start_mark.column if isinstance(block, yaml.MappingNode) else 0
-
-
-def _with_first(text: str, block: yaml.Node | None, entry: str) -> str:
-    """Return a text with an entry inserted as the first of a mapping."""
-    if not isinstance(block, yaml.MappingNode) or not block.value:
-        return text
-    first = block.value[0][0].start_mark
-    separator = ", " if block.flow_style else "\n" + " " * first.column
-    return f"{text[: first.index]}{entry}{separator}{text[first.index :]}"
-
-
-def _with_home(text: str, home: RigidTransform) -> str:
-    """Return the text of a YAML with other numbers in ``legcal.home``, if present."""
-    written = _entry(_entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal"), "home")
-    numbers = []
-    for key, values in motion_to_xyz_quat(home).items():
-        entry = _entry(written, key)
-        if isinstance(entry, yaml.SequenceNode):
-            numbers += list(zip(entry.value, values, strict=True))
-    for node, value in sorted(numbers, key=lambda number: -number[0].start_mark.index):
-        text = text[: node.start_mark.index] + repr(value) + text[node.end_mark.index :]
-    return text
-
-
-def _is_written_down(machine: Machine) -> bool:
-    """Return whether a mechanism has a YAML of our format, for its URDF as it is."""
-    if is_xml(machine.yaml_path):
-        return False
-    content = content_of(machine.yaml_path, FILE_KIND, ModelError).decode("utf-8")
-    document = yaml.compose(content, Loader=yaml.SafeLoader)
-    stand_ins = _entry(document, "joint_name")
-    has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)
-    if not isinstance(_entry(document, "legcal"), yaml.MappingNode) or has_stand_ins:
-        return False
-    loops = _entry(document, "closed_loop")
-    pairs = loops.value if isinstance(loops, yaml.SequenceNode) else []
-    named = {tuple(frame.value for frame in pair.value) for pair in pairs}
-    return named == {(c.frame_1, c.frame_2) for c in machine.chain.closures}
-
-
-def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
-    """Return the value of a key of a mapping, or None."""
-    if not isinstance(node, yaml.MappingNode):
-        return None
-    return next((value for name, value in node.value if name.value == key), None)
 
 
 def check_closes(machine: Machine) -> None:

@@ -228,6 +228,19 @@ def _in_frames(
     )
 
 
+def in_joint_frames(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
+    """Return legs in any frames of base and platform in R_b and R_e, those of a plane of motion z.
+
+    B of frame legs fixed to the platform is moved to the points that define R_e.
+    """
+    legs = with_platform_points(legs, frame_legs)
+    base, platform = (
+        frame_on_points(np.array([end[j] for j in frame_legs])).inv()
+        for end in ([leg.A for leg in legs], [leg.B for leg in legs])
+    )
+    return _in_frames(legs, base, platform)
+
+
 def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
     """Return parameters as one vector [m], passive or not, in the order of :func:`parametrize`."""
     free = free_coordinates(len(parameters.offsets), frame_legs)

@@ -1,17 +1,18 @@
 """How well a machine is built: what its parts may be off their model, stated or assumed.
 
-These are thresholds of doubts and no priors: a fit whose parameters moved far beyond them has
-been led away more likely than the machine was built that badly.
+They are thresholds of doubts: a fit whose parameters moved far beyond them has been led away more
+likely than the machine was built that badly. Where few images are to tell one group of parameters
+(``--only``), they are priors as well (:mod:`legcal.calibration.joint_fit.part_errors`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from legcal.errors import BadValue
 from legcal.files.quantity import Quantity, read_value
@@ -74,6 +75,7 @@ class BuiltEntry(FileSchema):
 
     tolerance: ToleranceEntry | None = None
     machine_kind: MachineKind | None = None
+    spline_teeth: Annotated[int, Field(ge=4, le=200)] | None = None  # of the shafts of all servos
 
     @model_validator(mode="after")
     def _says_it_once(self) -> BuiltEntry:
@@ -119,6 +121,13 @@ class Tolerance:
     zeros: float | None = None  # of motors that read a length
     angles_at_zero: float | None = None  # of motors that turn
 
+    def completed(self, size: float) -> Tolerance:
+        """Return all of them, rough ones where nothing is stated; *size* is the mean leg length."""
+        rough = (_PART_OF_SIZE * size, _ANGLE, _PART_OF_SIZE * size, _PART_OF_ZERO * size)
+        names = [one.name for one in fields(self)]
+        assumed = dict(zip(names, (*rough, _ANGLE_AT_ZERO), strict=True))
+        return Tolerance(**{n: getattr(self, n) or assumed[n] for n in names})
+
     def of_parameters(
         self, names: tuple[str, ...], legs: Mapping[str, Leg], size: float
     ) -> dict[str, float]:
@@ -126,14 +135,10 @@ class Tolerance:
 
         *size* is the mean leg length. Joints on an actuator at reading zero follow its zero too.
         """
-        joints, lengths, zeros = (
-            _PART_OF_SIZE * size if self.joints is None else self.joints,
-            _PART_OF_SIZE * size if self.lengths is None else self.lengths,
-            _PART_OF_ZERO * size if self.zeros is None else self.zeros,
+        full, found = self.completed(size), dict[str, float]()
+        joints, axes, lengths, zeros, turn = (
+            float(getattr(full, one.name) or 0.0) for one in fields(full)
         )
-        axes = _ANGLE if self.axes is None else self.axes
-        turn = _ANGLE_AT_ZERO if self.angles_at_zero is None else self.angles_at_zero
-        found = dict[str, float]()
         for name in names:
             number = ParameterId.parse(name)
             kind, leg = number.kind, legs.get(number.owner)

@@ -62,11 +62,19 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Step:
+    """A thing to do, with a command to copy."""
+
+    what: str
+    command: str = ""
+
+
+@dataclass(frozen=True)
 class Items:
     """A list."""
 
     kind: ClassVar = "items"
-    items: Sequence[str]
+    items: Sequence[str | Step]
     ordered: bool = False
     title: str = ""
 
@@ -251,6 +259,14 @@ class LandmarkEditor:
 
 
 @dataclass(frozen=True)
+class Dialogue:
+    """What a running command asks and says, with a field for answers; the page is served."""
+
+    kind: ClassVar = "dialogue"
+    token: str  # identifies the page to its server
+
+
+@dataclass(frozen=True)
 class Section:
     """A section."""
 
@@ -291,6 +307,7 @@ _SCRIPTS = {
     OutlineEditor: "editor.js",
     LandmarkEditor: "landmarks.js",
     Sliders: "sliders.js",
+    Dialogue: "dialogue.js",
 }
 
 
@@ -325,7 +342,8 @@ def page_html(page: Page) -> str:
                 ),
             ],
             served=any(
-                isinstance(block, LandmarkEditor | Sliders) and block.token for block in blocks
+                isinstance(block, LandmarkEditor | Dialogue | Sliders) and block.token
+                for block in blocks
             ),
             pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
         )

@@ -168,23 +168,17 @@ def compare_assumptions(assumptions: Iterable[Assumption], run: Run) -> list[Agr
     return list(run(_agreement, [_task(one) for one in assumptions]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """The images of a group of views under one assumption, for any process."""
-
-    pictures: list[Picture]  # of the rows at which legs are known
-    known_rows: list[int]
-    rows: Sequence[int]
-    n_legs: int
-    starts: Sequence[int]
-    known: Sequence[RigidTransform]
+_Task = tuple[list[Picture], list[int], Sequence[int], int, Sequence[int], Sequence[RigidTransform]]
 
 
 def _task(one: Assumption) -> _Task:
-    """Return the inputs with which a process judges a hypothesis."""
+    """Return what a process needs: pictures, their rows, all rows, number of legs, starts, known.
+
+    Pictures are of rows at which the legs are known.
+    """
     known = [r for r in one.rows if np.isfinite(one.search.B_base[r]).all()]
     pictures = one.group.pictures({row: _picture(one, row) for row in known}, known)
-    return _Task(pictures, known, one.rows, one.search.n_legs, one.starts, one.known)
+    return pictures, known, one.rows, one.search.n_legs, one.starts, one.known
 
 
 def _picture(one: Assumption, row: int) -> Picture:
@@ -198,16 +192,17 @@ def _picture(one: Assumption, row: int) -> Picture:
 
 def _agreement(task: _Task) -> Agreement:
     """Return the agreement of the images of a group."""
-    row = np.array(task.rows, dtype=np.intp)
-    support, expected = np.zeros(len(row)), np.full(len(row), float(task.n_legs))
+    pictures, known_rows, rows, n_legs, starts, known = task
+    row = np.array(rows, dtype=np.intp)
+    support, expected = np.zeros(len(row)), np.full(len(row), float(n_legs))
     nothing = Agreement(row, support, expected, (None,))
-    if not task.known_rows:
+    if not known_rows:
         return nothing
-    placed = place_camera(task.pictures, task.n_legs, task.starts, task.known)
+    placed = place_camera(pictures, n_legs, starts, known)
     if len(placed.poses) == 0:
         return nothing
-    is_known = np.isin(row, task.known_rows)
-    cost = float(placed.support[0].sum() - placed.score[0]) / len(task.known_rows)
+    is_known = np.isin(row, known_rows)
+    cost = float(placed.support[0].sum() - placed.score[0]) / len(known_rows)
     support[is_known] = np.maximum(placed.support[0] - cost, 0.0)
     expected[is_known] = placed.expected[0]
     return Agreement(row, support, expected, (placed.pose(),))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from legcal.estimation.loss import biweights
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.limb import N_SIMPLE, powers, simple_functions
 from legcal.perception.profiles import (
@@ -448,9 +449,7 @@ def fit_lines(
         if turn < N_SCALES:
             scatter = 1.4826 * _medians(np.where(usable, pull, np.inf), n_usable)
             factor = np.where(fits, np.maximum(1.0, scatter), 1.0)
-        counted = (
-            usable * np.maximum(1.0 - (pull / (BLOCK_SIGMAS * factor[:, None])) ** 2, 0.0) ** 2
-        )
+        counted = usable * biweights((pull / (BLOCK_SIGMAS * factor[:, None])) ** 2)
         a, b, c, p, q = np.einsum("knm,nm->kn", products, counted)
         determinant = a * c - b * b
         singular = (np.count_nonzero(counted, axis=1) < MIN_BLOCKS) | (determinant < 1e-9 * a * c)

@@ -10,7 +10,6 @@ it.
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,17 +17,16 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.measurements import Measurements, images_in_words
+from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, is_edited, join_outlines, merge_edited, no_outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Cylinder, Leg
+from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine, vectors_at
 from legcal.machine.rods import joints_at, measured_readings
 from legcal.perception.candidate_pairs import CandidatePairs, Still, still_picture
 from legcal.perception.diagnostics import (
     find_wrong_images,
-    is_measurable,
     reject_images,
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
@@ -41,7 +39,6 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.radii import LegRadius, RadiusFactors, radius_notes
 from legcal.perception.recognition import PlacedViews, place_views
 from legcal.perception.tuning import WINDOW_PX
 from legcal.perception.view_fit import refine_views
@@ -49,7 +46,6 @@ from legcal.progress import Report
 from legcal.vision.camera import Camera, shared_cameras
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey, shrink
-from legcal.vision.visibility import look_alike
 from legcal.workers import Run
 
 DETECTOR_VERSION = 19  # raise it whenever outlines or notes that are kept come out differently
@@ -61,7 +57,9 @@ FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of pos
 MIN_OUTLINES = 5
 MIN_POSES = 3  # of a view, so that they check its camera
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
-MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
+MIN_CHANGE = 0.08  # of a radius from the model, as a logarithm: less does no harm
+MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
+LegRadius = tuple[int, float]  # leg, and radius in the model [m]
 
 
 def detection_settings() -> dict[str, object]:
@@ -232,18 +230,18 @@ def place_and_measure(
     views = _placed(photographs, search, usable, hints, report, joined)
     placement = views.recognised(photographs.run)
     outlines, blur = _measured(photographs, search, placement, report, method=method)
-    at_nominal = _Measured(photographs, search, placement, outlines, blur)
-    measured = at_nominal
     if not free_poses:  # which would follow wrong radii, and these wrong poses
-        measured = _with_other_radii(at_nominal, views, report, method=method)
-    photographs, search, outlines = measured.photographs, measured.search, measured.outlines
+        photographs, search, outlines, notes = _with_other_radii(
+            photographs, search, placement, outlines, report, method=method
+        )
+        placement = replace(placement, notes=(*placement.notes, *notes))
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
     own, others = outlines.choose(is_own), outlines.choose(~is_own)
     placement, found, _ = refine_views(
         search,
         groups,
-        measured.placement,
+        placement,
         own,
         method=method,
         run=photographs.run,
@@ -255,67 +253,77 @@ def place_and_measure(
     )
     outlines = reject_images(outlines, reasons)
     seen_poses = {pose: choices[0] for pose, choices in free_poses.items()}
-    blur_of_views = measured.blur_of_views
+    blur_of_views = _blur_of_views(photographs.measurements, blur)
     return MeasuredImages(photographs, placement, outlines, reasons, blur_of_views, seen_poses)
 
 
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """Images measured at a placement."""
-
-    photographs: Photographs
-    search: Search
-    placement: Placement
-    outlines: Outlines
-    blur: Array  # (n_rows,) [px]; NaN where none was measured
-
-    @property
-    def blur_of_views(self) -> tuple[float, ...]:
-        """The usual blur of each view [px]; NaN where none was measured."""
-        view, known = self.photographs.measurements.view, ~np.isnan(self.blur)
-        n_views = len(self.photographs.measurements.views)
-        of_views = [self.blur[known & (view == v)] for v in range(n_views)]
-        return tuple(float(np.median(of_view)) if len(of_view) else np.nan for of_view in of_views)
+def _blur_of_views(measurements: Measurements, blur: Array) -> tuple[float, ...]:
+    """Return the usual blur of each view by that of all rows (n_rows,) [px]; NaN of none."""
+    known = ~np.isnan(blur)
+    of_views = [blur[known & (measurements.view == v)] for v in range(len(measurements.views))]
+    return tuple(float(np.median(of_view)) if len(of_view) else np.nan for of_view in of_views)
 
 
 def _with_other_radii(
-    measured: _Measured,
-    views: PlacedViews,
+    photographs: Photographs,
+    search: Search,
+    placement: Placement,
+    outlines: Outlines,
     report: Report,
     *,
     method: Method,
-) -> _Measured:
-    """Return the outlines measured with other radii of parts not found, if these are more.
+) -> tuple[Photographs, Search, Outlines, list[str]]:
+    """Return what is measured with the radii that outlines show, if more of these are used then.
 
-    *views* are where its images were recognised.
+    With notes on these radii. One camera alone may see where light and shade meet on a leg. Where
+    most parts differ alike, so do the others.
     """
-    machine, m = measured.photographs.machine, measured.photographs.measurements
-    suspects = _parts_not_found(machine.legs, measured.outlines)
-    while suspects:
-        placement = views.with_other_radii(suspects, measured.photographs.run)
-        if placement is None:
-            break
-        radii = placement.radii
-        photographs = replace(measured.photographs, machine=machine.with_radii(radii.corrected))
-        search = replace(measured.search, cylinders=photographs.cylinders)
-        stage = f"{MEASURING} with other radii"
-        outlines, blur = _measured(
-            photographs, search, placement, report, method=method, stage=stage
-        )
-        measured = replace(measured, blur=np.where(np.isnan(blur), measured.blur, blur))
-        shown = _images_with_more(machine.legs, radii, m.view, measured.outlines, outlines)
-        of_one = [part for part, rows in shown.items() if len(set(m.view[rows])) < MIN_VIEWS]
-        if of_one and not radii.common:  # one camera alone may see light and shade
-            left = [part for part in suspects if not _is_among(part, of_one)]
-            suspects = left if len(left) < len(suspects) else []
-            continue
-        if outlines.used.sum() > measured.outlines.used.sum():
-            seen_in = {part: images_in_words(m, rows) for part, rows in shown.items() if rows}
-            notes = radius_notes(radii, search.leg_names, seen_in)
-            placement = replace(placement, notes=(*placement.notes, *notes))
-            measured = _Measured(photographs, search, placement, outlines, measured.blur)
-        break
-    return measured
+    machine, view = photographs.machine, photographs.measurements.view
+    shown = _radii_of_outlines(photographs, placement, outlines)
+    factors = {
+        part: radius / part[1]
+        for part, (radius, rows) in shown.items()
+        if len(set(view[rows])) >= MIN_VIEWS and abs(np.log(radius / part[1])) > MIN_CHANGE
+    }
+    if not factors:
+        return photographs, search, outlines, []
+    every = {(j, c.radius) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
+    values, common = list(factors.values()), 0.0
+    if len(every) > 1 and len(factors) >= MIN_SHARE_ALIKE * len(every):
+        common = float(np.median(values)) if np.ptp(np.log(values)) < MIN_CHANGE else 0.0
+    factors = dict.fromkeys(every, common) | factors if common else factors
+    changed = replace(
+        photographs,
+        machine=machine.with_radii(lambda j, c: factors.get((j, c.radius), 1.0) * c.radius),
+    )
+    search_again = replace(search, cylinders=changed.cylinders)
+    stage = f"{MEASURING} with other radii"
+    again, _ = _measured(changed, search_again, placement, report, method=method, stage=stage)
+    if again.used.sum() <= outlines.used.sum():
+        return photographs, search, outlines, []
+    return changed, search_again, again, _radius_notes(machine.leg_names, factors, common)
+
+
+def _radius_notes(
+    legs: Sequence[str], factors: Mapping[LegRadius, float], common: float
+) -> list[str]:
+    """Return notes on radii by their factors, which are alike if there is a common one."""
+
+    def away(factor: float) -> str:
+        return f"{1e2 * abs(factor - 1.0):.0f} % {'thicker' if factor > 1.0 else 'thinner'}"
+
+    if common:
+        return [
+            f"All legs appear {away(common)} than in the model; the radii found in the images were "
+            "used. Correct the radii of the model, or, if these are right, the unit and scale of "
+            "the model and the readings."
+        ]
+    return [
+        f"{legs[leg]} may be {away(factor)} than in the model: its radius is about "
+        f"{1e3 * factor * radius:.1f} mm, not {1e3 * radius:.2f} mm; the measured radius was used; "
+        "measure the leg, and correct the model if confirmed."
+        for (leg, radius), factor in sorted(factors.items())
+    ]
 
 
 def recognise_and_place(photographs: Photographs, nominal: Placement, report: Report) -> Placement:
@@ -440,14 +448,31 @@ def with_measured_radii(
     otherwise have another one: with more care, or with another gamma. Where that is why most
     outlines of a cylinder are at a wrong distance, it speaks against none of them.
     """
-    m, machine = photographs.measurements, photographs.machine
-    wrong = outlines.rejected_for(Reason.WIDTH)
+    machine = photographs.machine
+    radii = {
+        part: radius
+        for part, (radius, _) in _radii_of_outlines(photographs, placement, outlines).items()
+    }
+    if not radii:
+        return None
+    other = machine.with_radii(lambda j, c: radii.get((j, c.radius), c.radius))
+    return replace(photographs, machine=other)
+
+
+def _radii_of_outlines(
+    photographs: Photographs, placement: Placement, outlines: Outlines
+) -> dict[LegRadius, tuple[float, IntArray]]:
+    """Return the radii [m] of cylinders most of whose outlines are at a wrong distance.
+
+    By leg and radius in the model, as the outlines have them; with the rows of these.
+    """
+    m, wrong = photographs.measurements, outlines.rejected_for(Reason.WIDTH)
     judged = (outlines.used | wrong) & np.isfinite(outlines.h).all(axis=1)
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
     }  # of the base before the cameras
-    part, factors = np.array(outlines.part), dict[tuple[int, float], float]()
-    for j, leg in enumerate(machine.legs):
+    part, radii = np.array(outlines.part), dict[LegRadius, tuple[float, IntArray]]()
+    for j, leg in enumerate(photographs.machine.legs):
         for cylinder in leg.cylinders:
             of_cylinder = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
             if 2 * np.count_nonzero(wrong[of_cylinder]) <= len(of_cylinder):
@@ -457,11 +482,8 @@ def with_measured_radii(
             distance = np.sum(outlines.h[of_cylinder] * A, axis=1) * np.array(EPSILON)[edge - 1]
             of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
             if len(of_edges) == len(EPSILON):
-                factors[j, cylinder.radius] = float(np.mean(of_edges))
-    if not factors:
-        return None
-    other = machine.with_radii(lambda j, c: factors.get((j, c.radius), c.radius))
-    return replace(photographs, machine=other)
+                radii[j, cylinder.radius] = float(np.mean(of_edges)), row
+    return radii
 
 
 def _placed(
@@ -556,61 +578,6 @@ def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure,
     image = search.load(row)
     factor = search.reduction(int(search.measurements.view[row]))
     return measure_exposure(image), shrink(image, factor) if row in rows else None
-
-
-def _parts_not_found(legs: Sequence[Leg], outlines: Outlines) -> list[LegRadius]:
-    """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
-
-    One that is used although the width of its part is wrong supports no radius.
-    """
-    visible = is_measurable(outlines)
-    which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
-    wrong_width = outlines.rejected_for(Reason.WIDTH).tolist()
-    of_wrong_width = {one for one, is_wrong in zip(which, wrong_width, strict=True) if is_wrong}
-    used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
-    part = np.array(outlines.part)
-    parts = []
-    for j, leg in enumerate(legs):
-        for link, radius in leg.radius_along.items():
-            of_part = visible & (outlines.leg == j) & (part == link)
-            is_seen = of_part.any() or not visible.any()
-            if is_seen and used[of_part].sum() <= MAX_USED_SHARE * of_part.sum():
-                parts.append((j, radius))
-    return parts
-
-
-def _is_among(part: LegRadius, others: Sequence[LegRadius]) -> bool:
-    """Return whether a part is one of others, whose radii may differ by rounding."""
-    return any(part[0] == leg and look_alike(part[1], radius) for leg, radius in others)
-
-
-def _images_with_more(
-    legs: Sequence[Leg],
-    radii: RadiusFactors,
-    view: IntArray,
-    before: Outlines,
-    after: Outlines,
-) -> dict[LegRadius, list[int]]:
-    """Return the rows that show another radius of each part, of views that do as a whole.
-
-    With a radius that is wrong by as much as light and shade suggest, a part loses its outlines in
-    most images; where it gains some in all together, views that gain speak for that radius.
-    """
-    images = {}
-    for leg, radius in radii.factor:
-        links = [link for link, r in legs[leg].radius_along.items() if look_alike(r, radius)]
-        gain = Counter[int]()
-        for outlines, sign in ((before, -1), (after, 1)):
-            is_part = np.isin(outlines.part, links) & (outlines.leg == leg) & outlines.used
-            for row in outlines.row[is_part].tolist():
-                gain[row] += sign
-        of_view = Counter[int]()
-        for row, more in gain.items():
-            of_view[int(view[row])] += more
-        speaks = {v for v, more in of_view.items() if more > 0} if gain.total() > 0 else set()
-        rows = [row for row, more in gain.items() if more > 0 and int(view[row]) in speaks]
-        images[leg, radius] = sorted(rows)
-    return images
 
 
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:

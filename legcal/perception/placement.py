@@ -33,7 +33,6 @@ from legcal.perception.candidate_pairs import (
 )
 from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
-from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.perception.tuning import WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey, shrink
@@ -121,10 +120,6 @@ class Search:
         """The cylinders by which each leg is recognised, with housings as such."""
         housings = housings_of_legs(self.occluders, self.n_legs)
         return [(*own, *around) for own, around in zip(self.cylinders, housings, strict=True)]
-
-    def retargeted(self, row: int, picture: Picture) -> Picture:
-        """Return the image with the legs predicted by other cylinders."""
-        return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
 def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cylinder]]:
@@ -239,7 +234,6 @@ class Placement:
     polished: frozenset[tuple[int, str]] = frozenset()  # legs and parts with polished surfaces
     # (n_views, n_legs, 2, 3) of A and B in each view from the nominal model [m]; None: not moved
     moved: Array | None = None
-    radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, NotPlaced] = field(default_factory=dict)  # by the names of views
     notes: tuple[str, ...] = ()  # further notes
     # What is said of images that show little or nothing of the legs, by row: near a fit they may

@@ -8,7 +8,7 @@ outlines measured at the best poses decide.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -18,10 +18,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.causes import Cause
 from legcal.data.landmarks import LANDMARKS_NAME
-from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.leg import Cylinder, with_radii
 from legcal.perception.camera_search import (
     SOME_PICTURES,
     START_PICTURES,
@@ -45,21 +43,10 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.radii import (
-    CONVERGED,
-    MAX_ITERATIONS,
-    MIN_CHANGE,
-    NO_RADIUS_FACTORS,
-    LegRadius,
-    RadiusFactors,
-    estimate_radii,
-)
 from legcal.perception.tuning import EVIDENCE_RATIO, JOINT_ERROR
 from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
-MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
-SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 # Lengths are parts of the mean leg length.
@@ -136,72 +123,21 @@ class PlacedViews:
     placed: Sequence[PoseCandidates]  # of each group
 
     def recognised(self, run: Run = in_turn) -> Placement:
-        """Return the cameras of all views and the legs in their images."""
-        return self._decided(NO_RADIUS_FACTORS, run)
+        """Return the cameras of all views and the legs in their images.
 
-    def with_other_radii(
-        self, suspects: Collection[LegRadius], run: Run = in_turn
-    ) -> Placement | None:
-        """Return the recognition with other radii of parts, by leg and radius [m]; None without.
-
-        Their outlines were not found with those of the model.
+        Where pairs are ambiguous, outlines decide.
         """
-        views, radii = _by_other_radii(self, suspects, run)
-        return views._decided(radii, run) if radii.factor else None
-
-    def _decided(self, radii: RadiusFactors, run: Run) -> Placement:
-        """Return the views together, by outlines where pairs are ambiguous."""
         placed = list(run(self.decided_by_outlines, range(len(self.groups))))
         for g, (group, one) in enumerate(zip(self.groups, placed, strict=True)):
             if group.is_placed and group.hint is not None and not one.is_convincing:
                 seen = self.of_group(g, [r for r in group.rows if r in self.pictures])
                 placed[g] = place_at(seen, group.hint, self.search.n_legs)
-        return _gathered(replace(self, placed=placed), radii, run)
+        return _gathered(replace(self, placed=placed), run)
 
     def of_group(self, g: int, rows: Sequence[int] | None = None) -> list[Picture]:
         """Return the images of a group, all of them or of some rows."""
         group = self.groups[g]
         return group.pictures(self.pictures, group.rows if rows is None else rows)
-
-    def by_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> PlacedViews:
-        """Return images with the legs predicted by other cylinders."""
-        search = replace(self.search, cylinders=cylinders)
-        pictures = {row: search.retargeted(row, one) for row, one in self.pictures.items()}
-        return replace(self, search=search, pictures=pictures)
-
-    def placed_anywhere(self, which: Sequence[int], run: Run) -> PlacedViews:
-        """Return some groups placed anew, by all of their pictures."""
-        placed = list(self.placed)
-        of_groups = [self.of_group(g) for g in which]
-        anywhere = _anywhere(of_groups, self.search.n_legs, START_PICTURES, run)
-        for g, one in zip(which, anywhere, strict=True):
-            placed[g] = one
-        return replace(self, placed=placed)
-
-    def placed_again(self, run: Run) -> PlacedViews:
-        """Return the groups placed near where they were, or anywhere if they were not."""
-        views = self.placed_anywhere(
-            [g for g, one in enumerate(self.placed) if not one.is_convincing], run
-        )
-        placed = list(views.placed)
-        for g, one in enumerate(self.placed):
-            if one.is_convincing:
-                some = self.of_group(g, self.groups[g].some)
-                near = place_near(some, one.pose(), self.search.n_legs)
-                placed[g] = near if near.is_convincing else one
-        return replace(views, placed=placed)
-
-    def for_radii(self) -> Iterator[tuple[int, list[Picture], CameraPoses]]:
-        """Return a few pictures of each group that was placed, one of each pose."""
-        for g, (group, one) in enumerate(zip(self.groups, self.placed, strict=True)):
-            if one.is_convincing:
-                rows = one_of_each_pose(self.search.measurements, group.some)
-                yield g, self.of_group(g, rows), one.poses
-
-    @property
-    def support(self) -> float:
-        """Number of legs that agree in an image, over all placed groups."""
-        return sum(float(one.support[0].mean()) for one in self.placed if one.is_convincing)
 
     def decided_by_outlines(self, g: int) -> PoseCandidates:
         """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
@@ -288,56 +224,6 @@ def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
     return anywhere if mean[1] > 1.1 * mean[0] else near
 
 
-def _by_other_radii(
-    views: PlacedViews, suspects: Collection[LegRadius], run: Run
-) -> tuple[PlacedViews, RadiusFactors]:
-    """Return the views by the radii that images show of suspect parts, corrected in turns."""
-    as_given, given = views, views.search.cylinders
-    radii = step = _first_radii(views, run).only(suspects)
-    for _ in range(MAX_ITERATIONS):
-        if not step.factor:
-            break
-        views = views.by_cylinders(with_radii(given, radii.corrected)).placed_again(run)
-        few = views.for_radii()
-        step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
-        radii = radii.then(step)
-    if radii.common and views.support < MIN_RADII_GAIN * as_given.support:
-        return as_given, NO_RADIUS_FACTORS  # the scale is not known well
-    lasting = radii.beyond(MIN_CHANGE)  # corrections may lead back to the model
-    if len(lasting.factor) < len(radii.factor):
-        views = views.by_cylinders(with_radii(given, lasting.corrected))
-    return views, lasting
-
-
-def _first_radii(views: PlacedViews, run: Run) -> RadiusFactors:
-    """Return the radii that the images contradict, as far as the views can be placed."""
-    if any(one.is_convincing for one in views.placed):
-        return estimate_radii(views.for_radii())
-
-    def scaled(factor: float) -> PlacedViews:
-        cylinders = with_radii(views.search.cylinders, lambda _, c: factor * c.radius)
-        return views.by_cylinders(cylinders)
-
-    others = views
-    for factor in SCALED:
-        others = scaled(factor).placed_anywhere(range(len(views.groups)), run)
-        if any(one.is_clear for one in others.placed):
-            break
-    return estimate_radii(replace(views, placed=others.placed).for_radii())
-
-
-def one_of_each_pose(measurements: Measurements, rows: Sequence[int]) -> list[int]:
-    """Return the first of the rows of each view and pose, in their order.
-
-    Light and shade lie alike on a leg in all images of one pose: they agree on a wrong radius.
-    """
-    same = zip(measurements.view[rows].tolist(), measurements.pose[rows].tolist(), strict=True)
-    first: dict[tuple[int, int], int] = {}
-    for row, key in zip(rows, same, strict=True):
-        first.setdefault(key, row)
-    return list(first.values())
-
-
 @dataclass(frozen=True, eq=False)
 class _Trial:
     """A pose with the outlines that were measured at it, and their fit."""
@@ -415,7 +301,7 @@ def _gap(one: Array, other: Array) -> float:
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))
 
 
-def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
+def _gathered(found: PlacedViews, run: Run) -> Placement:
     """Assemble the placement of all views, with the causes of unplaced ones."""
     search, groups, placed = found.search, found.groups, found.placed
     views = search.measurements.views
@@ -448,7 +334,7 @@ def _gathered(found: PlacedViews, radii: RadiusFactors, run: Run) -> Placement:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
             error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, JOINT_ERROR)
-    placement = Placement(search.A_base, search.B_base, tuple(T), error, radii=radii)
+    placement = Placement(search.A_base, search.B_base, tuple(T), error)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 
 
@@ -473,7 +359,8 @@ def _why_not_placed(placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) 
             f"its camera could not be placed: no pose {where} explains its images: the best one "
             "matches {:.1f} of {:.0f} legs per image, and {:.1f} are needed; check that the images "
             "belong to this machine and to their readings, that they are not mirrored, the camera "
-            f"file, and the legs of the view if dataset.yaml lists them{clicked}.",
+            "file, the radii of the model, and the legs of the view if dataset.yaml lists them"
+            f"{clicked}.",
             (legs, n, float(placed.needed)),
         )
     if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):

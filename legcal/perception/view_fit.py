@@ -24,6 +24,7 @@ from legcal.causes import Cause
 from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
 from legcal.errors import NotVisible
+from legcal.estimation.loss import cauchy_weights
 from legcal.estimation.problem import (
     EstimationProblem,
     Factor,
@@ -165,7 +166,7 @@ def fit_view(
             linear = linearize(problem, state)
             rows = linear["outlines"]
             square, offset_square = _squared_distances(lines, rows, state.offset, image_sigma)
-            weight = 1.0 / (1.0 + square / (lines.size * CAUCHY_WIDTH**2))
+            weight = cauchy_weights(square / (lines.size * CAUCHY_WIDTH**2))
             if iteration >= FIXED_ITERATIONS:  # most legs and images are alike
                 variance = np.diag(normal.kept_covariance())[6:].reshape(state.shift.shape)
                 of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]

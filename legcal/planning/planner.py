@@ -186,6 +186,7 @@ class Scene:
         surely: bool = True,
         is_shot: bool = False,
         is_fit: bool = False,
+        found: BoolArray | None = None,  # (n_images, n_legs) legs whose outlines count
     ) -> Contributions | None:
         """Return the information of images at poses T_Rb_Re; None if they show nothing.
 
@@ -197,6 +198,8 @@ class Scene:
             return None
         predictor = self.task.predictor
         outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp), predictor.noise)
+        if found is not None:
+            outlines = outlines.choose(found[outlines.row, outlines.leg])
         view = np.zeros(n, dtype=np.intp)
         added = predictor.contributions(
             {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit

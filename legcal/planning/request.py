@@ -154,7 +154,7 @@ def plan(
         sigma_q = shot.measurements.sigma_q
         sigma_by_joint = dict(shot.measurements.sigma_by_joint)
     predicted_noise = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
-    lengths, scale_notes = _measured_length(machine, board=board is not None)
+    lengths, scale_notes = measured_length(machine, board=board is not None)
     task = Task(
         Predictor(machine, selected_camera, predicted_noise, sigma_q, lengths, sigma_by_joint),
         n_images,
@@ -177,7 +177,7 @@ def plan(
         return replace(result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(shot)))
 
 
-def _measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
+def measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[str, ...]]:
     """Assume a measured length where readings carry none; return it with a note."""
     rod_and_ends = machine.rod_for_scale(has_length=board)
     if rod_and_ends is None:

@@ -45,6 +45,7 @@ from legcal.pages.document import (
     Row,
     Scene,
     Section,
+    Step,
     Table,
     Text,
     Verdict,
@@ -172,45 +173,60 @@ def _written_beside(command: str) -> str:
     return shlex.join(words)
 
 
-def next_steps(calibration: Calibration, folder: str, command: str) -> list[str]:
+def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step]:
     """Return what to do next, the first thing first; *command* has made the result, if any has."""
-    result, steps = calibration.result, list[str]()
+    result, steps = calibration.result, list[Step]()
     dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
     for doubt in calibration.doubts:
         what, remedy = (f"{text[0].upper()}{text[1:]}" for text in (doubt.what, doubt.remedy))
-        steps.append(f"{what}. {remedy}, and calibrate again.")
+        steps.append(Step(f"{what}. {remedy}, and calibrate again."))
     remedy = calibration.verdict.remedy
     if remedy and all(remedy != doubt.remedy for doubt in calibration.doubts):
-        steps.append(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again.")
+        steps.append(Step(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again."))
     if calibration.verdict.trustworthy:
         steps.append(
-            "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
-            "move to a few poses whose place you can measure."
+            Step(
+                "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
+                "move to a few poses whose place you can measure."
+            )
         )
         if result.holdout is None and calibration.dataset.machine.is_determined:
+            again = _written_beside(command or f"legcal calibrate {dataset} -o {out}")
             steps.append(
-                "See how well it predicts images that it has not seen: "
-                f"{_written_beside(command or f'legcal calibrate {dataset} -o {out}')} "
-                "--holdout 0.2."
+                Step(
+                    "See how well it predicts images that it has not seen:",
+                    f"{again} --holdout 0.2",
+                )
             )
         steps.append(
-            "Where the base stands in the cell and the tool on the platform is not seen in "
-            f"photographs of legs: legcal locate {out}/calibrated.yaml POSES -o located.yaml."
+            Step(
+                "Where the base stands in the cell and the tool on the platform is not seen in "
+                "photographs of legs; with measured POSES of the tool:",
+                f"legcal locate {out}/calibrated.yaml POSES -o located.yaml",
+            )
         )
         steps.append(
-            "In some months, or after a collision, photograph a few poses and ask whether anything "
-            f"moved: legcal calibrate NEW --check {out}."
+            Step(
+                "In some months, or after a collision, photograph a few poses (NEW) and ask "
+                "whether anything moved:",
+                f"legcal calibrate NEW --check {out}",
+            )
         )
     elif not result.diagnosis:
         if result.weakest:
-            steps.append(f"More images help where least is known: {result.weakest[0].in_words}.")
+            steps.append(
+                Step(f"More images help where least is known: {result.weakest[0].in_words}.")
+            )
         steps.append(
-            "Look at the worst outlines below: blur, reflections and wrong edges show there."
+            Step("Look at the worst outlines below: blur, reflections and wrong edges show there.")
         )
     if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
         steps.append(
-            "Calibrate the camera with legcal camera: its file then states how well it is known, "
-            "which belongs into the uncertainty of the result."
+            Step(
+                "Calibrate the camera, with the board that you have: its file then states how well "
+                "it is known, which belongs into the uncertainty of the result.",
+                "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
+            )
         )
     return steps
 

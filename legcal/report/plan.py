@@ -85,9 +85,9 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         [] if output is None else [
             printable(f"written: {output}"),
             *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
-            printable(
-                f"calibrate with: legcal calibrate {plan.given or output} -o OUT{length}"
-            ),
+            "photograph it, and calibrate:",
+            printable(f"  legcal shoot {output} --watch FOLDER"),
+            printable(f"  legcal calibrate {plan.given or output} -o OUT{length}"),
         ],
     )  # fmt: skip
 

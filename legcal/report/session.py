@@ -95,7 +95,8 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
     return report(
         [
             Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),
-            Text(printable(f"Next: legcal calibrate {folder} -o OUT{length}"), overflow="ignore"),
+            "Calibrate it:",
+            Text(printable(f"  legcal calibrate {folder} -o OUT{length}"), overflow="ignore"),
         ]
     )
 
@@ -200,9 +201,9 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Repor
             for line in (
                 f"written: {document['dataset']}",
                 f"the true model: {document['truth']}",
-                f"calibrate with: legcal calibrate {folder} -o OUT"
-                + (f" {length}" if to_measure else ""),
-                f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
+                "calibrate it, and compare with the truth:",
+                f"  legcal calibrate {folder} -o OUT" + (f" {length}" if to_measure else ""),
+                f"  legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
             )
         ],
     )

@@ -23,8 +23,9 @@ from legcal.data.landmarks import (
     joints_at_readings,
     read_landmarks,
 )
+from legcal.errors import DatasetError
 from legcal.files.folder import write_atomically
-from legcal.viewer.server import LOCAL, Address, PageServer
+from legcal.viewer.server import HTML, LOCAL, Address, PageServer
 
 
 class ClickServer(PageServer):
@@ -35,6 +36,7 @@ class ClickServer(PageServer):
     ) -> None:
         super().__init__(Address(LOCAL, port))
         self.detection = detection
+        self.folder = folder
         self._page = examination_page(examination, detection, self.token).encode()
         files = (*detection.photograph_files.values(), *detection.overlay_files.values())
         self._files = {f"/{name}": folder / name for name in files}
@@ -42,17 +44,19 @@ class ClickServer(PageServer):
     def content(self, path: str) -> tuple[str, bytes] | None:
         """Return type and content of a path of the page; None for other paths."""
         if path in ("/", f"/{DETECTION_PAGE}"):
-            return "text/html; charset=utf-8", self._page
+            return HTML, self._page
         file = self._files.get(path)
         return None if file is None or not file.is_file() else ("image/jpeg", file.read_bytes())
 
-    def answer(self, path: str, query: dict[str, str], posted: bytes) -> dict[str, Any] | None:
+    def answer(self, path: str, query: dict[str, list[str]], text: bytes) -> dict[str, Any] | None:
         """Return the camera of an image by posted clicks, or the file they are saved in."""
-        image = query.get("image", "0")
-        n_images = len(self.detection.photograph_files)
-        if path == "/clicks" and image.isdecimal() and int(image) < n_images:
-            return self.placed(posted, int(image))
-        return self.save(posted) if path == "/save" else None
+        image, n_images = query.get("image", ["0"])[0], len(self.detection.photograph_files)
+        try:
+            if path == "/clicks" and image.isdecimal() and int(image) < n_images:
+                return self.placed(text, int(image))
+            return self.save(text) if path == "/save" else None
+        except DatasetError as error:
+            return {"problems": list(error.problems), "notes": [], "legs": [], "joints": {}}
 
     def read(self, table: bytes) -> Landmarks:
         """Return the clicks of a posted table; raise DatasetError as for a file."""

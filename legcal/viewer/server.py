@@ -13,11 +13,12 @@ from functools import partial
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import UsageError
 
 TOKEN_HEADER = "X-Legcal-Token"
 LOCAL = "127.0.0.1"  # this machine alone
 MAX_POST = 2**20  # largest posted content [bytes]
+HTML = "text/html; charset=utf-8"
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,8 @@ class PageServer:
         """Return type and content of a path of the page; None for other paths."""
         raise NotImplementedError
 
-    def answer(self, path: str, query: dict[str, str], posted: bytes) -> dict[str, Any] | None:
-        """Return the answer to posted content; None for other paths, DatasetError for problems."""
+    def answer(self, path: str, query: dict[str, list[str]], text: bytes) -> dict[str, Any] | None:
+        """Return the answer to a posted text; None for other paths."""
         raise NotImplementedError
 
     def is_for(self, host: str) -> bool:
@@ -165,11 +166,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.send_error(413)
             return
         place, posted = urlsplit(self.path), self.rfile.read(int(length))
-        query = {name: values[0] for name, values in parse_qs(place.query).items()}
-        try:
-            answer = self.page.answer(place.path, query, posted)
-        except DatasetError as error:
-            answer = {"problems": list(error.problems), "notes": [], "legs": [], "joints": {}}
+        answer = self.page.answer(place.path, parse_qs(place.query), posted)
         if answer is None:
             self.send_error(404)
             return

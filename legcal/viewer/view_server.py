@@ -24,7 +24,7 @@ from legcal.machine.parameters import geometries
 from legcal.pages.document import Page, Scene, Section, Sliders, page_html, time_of_page
 from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, pyramid, scene_content
 from legcal.viewer.motion import Motion
-from legcal.viewer.server import Address, PageServer
+from legcal.viewer.server import HTML, Address, PageServer
 from legcal.viewer.source import Photographs, Source
 
 _SCENE = "machine-scene"
@@ -90,7 +90,7 @@ class ViewServer(PageServer):
     def content(self, path: str) -> tuple[str, bytes] | None:
         """Return the page or a photograph; None for other paths."""
         if path == "/":
-            return "text/html; charset=utf-8", self._page
+            return HTML, self._page
         name = path.removeprefix("/photographs/")
         row = int(name) if name != path and name.isdecimal() else -1
         if not 0 <= row < len(self._photographs.names):
@@ -101,12 +101,12 @@ class ViewServer(PageServer):
         data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
         return "image/jpeg", data.tobytes()
 
-    def answer(self, path: str, query: dict[str, str], posted: bytes) -> dict[str, Any] | None:
+    def answer(self, path: str, query: dict[str, list[str]], text: bytes) -> dict[str, Any] | None:
         """Move the machine by a posted ``{"slider": NAME, "value": NUMBER}``; return its state."""
         if path != "/move":
             return None
         try:
-            asked = json.loads(posted)
+            asked = json.loads(text)
             name, value = str(asked["slider"]), float(asked["value"])
         except (ValueError, KeyError, TypeError):
             return None

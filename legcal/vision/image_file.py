@@ -303,7 +303,7 @@ CONVERT_HEIC = f"install what reads HEIC (pip install 'legcal[heic]'), or {CONVE
 _FOREIGN_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}
 
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
-_AGAIN = "copy it again or remove the row"
+COPY_AGAIN = "copy it again or remove the row"  # the remedy of a file that may be incomplete
 _LEVELS = "8 or 16 bit grey levels or colours"
 NOWHERE = Place()
 
@@ -311,7 +311,9 @@ NOWHERE = Place()
 class BadImage(BadValue):
     """A problem with the bytes of an image file."""
 
-    def __init__(self, found: str | Cause, needed: str = _COMPLETE, remedy: str = _AGAIN) -> None:
+    def __init__(
+        self, found: str | Cause, needed: str = _COMPLETE, remedy: str = COPY_AGAIN
+    ) -> None:
         super().__init__(found, needed, remedy)
 
 
@@ -515,7 +517,7 @@ def _problem(
     named: Place,
     found: str | Cause,
     needed: str,
-    remedy: str = _AGAIN,
+    remedy: str = COPY_AGAIN,
     code: Code = Code.UNREADABLE_FILE,
 ) -> Problem:
     """Return the problem of an image that cannot be read."""

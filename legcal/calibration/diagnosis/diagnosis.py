@@ -9,7 +9,7 @@ far more images agree; those that images cannot tell from it are named with it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -183,6 +183,20 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     return (_diagnosis(first, likeliest[0][1], judge.own, by_hints=by_hints),)
 
 
+def agreement_with_zeros(data: OrderedDataset, zeros: Sequence[Mapping[str, float]]) -> list[float]:
+    """Return how many legs all images show where motors stand further than they read by *zeros*.
+
+    Of each hypothesis, by motor [m or rad]; all are 0 where there is no image.
+    """
+    rows = _rows_seen(data)
+    groups = _groups(data, rows, 1) if len(rows) else []
+    if not groups:
+        return [0.0] * len(zeros)
+    judge = _Judge(data, groups)
+    assumed = (replace(judge.given, q=data.turned(one).measurements.q) for one in zeros)
+    return [_total(judge.all(one)) for one in assumed]
+
+
 def notes_beside(diagnosis: Sequence[Diagnosis], notes: Sequence[str], job: str) -> list[str]:
     """Return notes on images; only their number beside a diagnosis, from which most follow.
 
@@ -213,7 +227,7 @@ def _rows_seen(data: OrderedDataset) -> IntArray:
     return np.array(shown, dtype=np.intp)
 
 
-def _groups(data: OrderedDataset, rows: IntArray) -> list[Group]:
+def _groups(data: OrderedDataset, rows: IntArray, least: int = MIN_IMAGES) -> list[Group]:
     """Return groups of views with enough images; views of the board on the base form one."""
     try:
         board = observe_board(data)
@@ -222,7 +236,7 @@ def _groups(data: OrderedDataset, rows: IntArray) -> list[Group]:
     hints = [view.T_base_camera for view in data.measurements.views]
     joined = None if board is None else board.T_board_camera
     groups = group_views(data.measurements, rows, hints, joined)
-    return [group for group in groups if len(group.rows) >= MIN_IMAGES]
+    return [group for group in groups if len(group.rows) >= least]
 
 
 class _Judge:

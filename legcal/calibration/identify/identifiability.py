@@ -56,7 +56,7 @@ from legcal.machine.inspection import singularity_note
 from legcal.machine.leg import JointType
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.parameters import geometries, is_held_by_default, legs_in_words
+from legcal.machine.parameters import geometries, is_held_by_default, leg_labels, legs_in_words
 from legcal.machine.ties import ties_in_words
 from legcal.paper.conditions import (
     Condition,
@@ -375,7 +375,8 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
 
 
 def read_views(
-    views: Sequence[Sequence[str]],  # names of the legs visible from each camera position
+    # Names of the legs visible from each camera position, or their numbers as reports show them
+    views: Sequence[Sequence[str]],
     leg_names: Sequence[str],
     images: int,  # number of images a view
 ) -> tuple[tuple[int, ...], ...]:
@@ -383,7 +384,8 @@ def read_views(
 
     Raises UsageError with one sentence for each problem.
     """
-    problems = []
+    problems, known = [], list[list[str]]()
+    name_of = {label: name for name, label in leg_labels(leg_names).items()}
     if images < 1:
         problems.append(
             f"The views could not be judged: found {images} images a view, needed at least 1; "
@@ -407,6 +409,8 @@ def read_views(
             )
             continue
         names = [str(name).strip() for name in view]
+        names = [name if name in leg_names else name_of.get(name, name) for name in names]
+        known.append(names)
         if not any(names):
             problems.append(
                 f"View {v} could not be used: found no leg, needed at least one; name its legs, "
@@ -426,7 +430,7 @@ def read_views(
                 )
     if problems:
         raise UsageError(problems)
-    return tuple(tuple(sorted(leg_names.index(name.strip()) for name in view)) for view in views)
+    return tuple(tuple(sorted(leg_names.index(name) for name in view)) for view in known)
 
 
 def _refusal(dataset: Dataset, report: Identifiability) -> str:

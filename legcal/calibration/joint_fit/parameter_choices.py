@@ -23,6 +23,7 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
+from legcal.machine.tolerance import Tolerance
 from legcal.vision.board import LINKS, FixedBoard, Link, board_name
 from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
 
@@ -60,6 +61,8 @@ class Choices:
     least_shared_px: Mapping[str, float] = field(default_factory=dict)  # by edge_biases.KINDS
     # by the representative view of a camera, in place of the covariance of its file
     cameras: Mapping[str, KnownIntrinsics] = field(default_factory=dict)
+    # complete tolerances that are priors of all kinematic parameters, beside those above
+    built: Tolerance | None = None
 
     def holds(self, name: str, *, by_default: bool = False) -> bool:
         """Whether a parameter is fixed; *by_default*: whether it is without a choice."""
@@ -79,6 +82,7 @@ class Choices:
                 for name, intrinsics in sorted(self.cameras.items())
             },
             "least_shared_px": dict(sorted(self.least_shared_px.items())),
+            "built": None if self.built is None else vars(self.built),
         }
         return {key: value for key, value in document.items() if value}
 

@@ -278,7 +278,7 @@ def information_of_images(
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
     """Add the priors of a calibration: of twists, and of lines of arms, also of those not seen."""
     seen = [j for j, leg in enumerate(legs.nominal) if leg.arm is not None]
-    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen)
+    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen) if choices.built is None else {}
     twist = float(np.radians(TWIST_SIGMA_DEG))
     names = legs.parametrization.names
     sigmas |= {name: twist for name in names if ParameterId.parse(name).kind == "twist"}

@@ -39,6 +39,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     Prior,
     board_scale,
 )
+from legcal.calibration.joint_fit.part_errors import part_errors
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
@@ -403,6 +404,13 @@ def _kinematic(given: _FitInputs, choices: Choices) -> tuple[LegParameters, Vari
         parameters = LegParameters(legs, free, choices.values)
     unknown = tuple(n for n, is_free in zip(names, free, strict=True) if is_free)
     units = zip(legs.parametrization.units, free, strict=True)
+    prior = GaussianPrior(
+        np.array([unknown.index(name) for name in arms], dtype=np.intp),
+        np.zeros(len(arms)),
+        np.array(list(arms.values())),
+    )
+    if choices.built is not None:
+        prior = part_errors(legs, choices.built).prior(free)
     block = Variables(
         "legs",
         parameters.unknown,
@@ -411,11 +419,7 @@ def _kinematic(given: _FitInputs, choices: Choices) -> tuple[LegParameters, Vari
         tuple(u for u, is_free in units if is_free),
         parameters.coordinates,
         parameters.jacobian if parameters.turns else None,
-        prior=GaussianPrior(
-            np.array([unknown.index(name) for name in arms], dtype=np.intp),
-            np.zeros(len(arms)),
-            np.array(list(arms.values())),
-        ),
+        prior=prior,
     )
     return parameters, block
 

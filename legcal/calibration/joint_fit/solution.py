@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -129,6 +129,37 @@ class Estimates:
     def with_values(self, values: Mapping[str, float]) -> Estimates:
         """Replace the values of named parameters."""
         return replace(self, values={**self.values, **values})
+
+    def transformed(
+        self, values: Mapping[str, float], free: Collection[str], C: Array, by_fit: Array
+    ) -> Estimates:
+        """Return other kinematic parameters, of which *free* ones are estimated.
+
+        *values* are all of them by name, C (p, p) their covariance, *by_fit* (p, p) their
+        derivative by those of the fit.
+        """
+        kinematic = list(values)
+        names = tuple(n for n in self.values if n in free or (n in self.names and n not in values))
+        M = np.zeros((len(names), len(self.names)))
+        for i, name in enumerate(names):
+            for k, of_fit in enumerate(self.names):
+                if name in values and of_fit in values:
+                    M[i, k] = by_fit[kinematic.index(name), kinematic.index(of_fit)]
+                elif name == of_fit:
+                    M[i, k] = 1.0
+        covariance = M @ self.covariance @ M.T
+        own = [i for i, name in enumerate(names) if name in values]
+        indices = [kinematic.index(names[i]) for i in own]
+        covariance[np.ix_(own, own)] = C[np.ix_(indices, indices)]
+        status: dict[str, ParameterStatus] = dict.fromkeys(values, "fixed")
+        status |= dict.fromkeys(free, "estimated")
+        return replace(
+            self,
+            values={**self.values, **values},
+            status={**self.status, **status},
+            names=names,
+            covariance=covariance,
+        )
 
     def in_order(self, names: Sequence[str]) -> Estimates:
         """Reorder by *names*, which may have further names."""

@@ -1,0 +1,156 @@
+"""Tolerances as priors: what the parts of a machine may be off, and what that does to parameters.
+
+Parts err independently of each other, in the links: a joint centre in each direction, an axis, a
+rod, and the zero of each motor, by which its arm, carriage or leg stands further than it reads.
+R_b and R_e are defined by joint centres that err as well, so that parameters err together: with
+errors e of variances S, their change is J e, and its prior the covariance J S J^T.
+
+After a fit with covariance C of the parameters x, the errors of the parts are
+e = K (x - x_0), K = S J^T (J S J^T)^-1, with the covariance S + K (C - J S J^T) K^T. That is their
+posterior with all else marginalised: what several parts explain alike is shared by their variances.
+
+A horn on the wrong tooth of its spline is no small error: it is another nominal machine, with x_0
+and J there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from legcal.calibration.joint_fit.variables import FittedLegs
+from legcal.calibration.tuning import ARM_AXIS_SIGMA, ARM_POINT_SIGMA
+from legcal.estimation.problem import GaussianPrior
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.actuator import ActuatorColumns, Line
+from legcal.machine.leg import Leg, LegColumns, LegKind
+from legcal.machine.parameters import in_joint_frames, moved_legs, vector_of
+from legcal.machine.rods import reading_legs
+from legcal.machine.tolerance import Tolerance
+
+Group = Literal["zeros", "lengths", "all"]  # what is reported, and written into the model
+Kind = Literal["joints", "axes", "lengths", "zeros", "arms"]
+
+_STEP = 1e-6  # of derivatives [rad], and relative to the size of the machine
+_RANK = 1e-12  # of the largest eigenvalue of correlations
+
+
+@dataclass(frozen=True, eq=False)
+class PartErrors:
+    """The m errors of parts, and the prior of the p kinematic parameters that follows from them.
+
+    Parameters whose row of J is zero (gains, twists) have no prior by parts.
+    """
+
+    names: tuple[str, ...]  # the motor of a zero, else the leg
+    kinds: tuple[Kind, ...]
+    sigma: Array  # (m,) [m or rad]
+    J: Array  # (p, m) change of the parameters by each error
+    centre: Array  # (p,) the parameters without errors, [m or rad]
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Prior covariance (p, p) of the parameters."""
+        return np.asarray((self.J * self.sigma**2) @ self.J.T)
+
+    def prior(self, free: BoolArray) -> GaussianPrior:
+        """Return the prior of the free parameters (p,), by their numbers among these."""
+        C = self.covariance
+        some = free & (np.diagonal(C) > 0.0)
+        return GaussianPrior.from_covariance(
+            (np.cumsum(free) - 1)[some], self.centre[some], C[np.ix_(some, some)]
+        )
+
+    @cached_property
+    def gain(self) -> Array:
+        """K (m, p): the errors by a change of the parameters, 0 for those without a prior."""
+        scale, K = np.sqrt(np.diagonal(self.covariance)), np.zeros(self.J.T.shape)
+        some = scale > 0.0
+        J = self.J[some] / scale[some, None]
+        prior = np.linalg.pinv((J * self.sigma**2) @ J.T, rcond=_RANK, hermitian=True)
+        K[:, some] = self.sigma[:, None] ** 2 * J.T @ prior / scale[some]
+        return K
+
+    def posterior(self, x: Array, C: Array) -> tuple[Array, Array]:
+        """Return the errors (m,) and their covariance (m, m) by a fit x (p,), C (p, p)."""
+        K = self.gain
+        return K @ (x - self.centre), np.diag(self.sigma**2) + K @ (C - self.covariance) @ K.T
+
+    def of(self, kind: Kind) -> IntArray:
+        """Return the indices of the errors of a kind."""
+        return np.flatnonzero(np.equal(self.kinds, kind))
+
+
+def part_errors(
+    legs: FittedLegs, tolerance: Tolerance, turned: Mapping[str, float] | None = None
+) -> PartErrors:
+    """Return the errors of the parts of a machine with all tolerances stated.
+
+    *turned* [m or rad] are motors whose zero is known to be elsewhere, by their labels.
+    """
+    columns, nominal, first = LegColumns, legs.nominal, reading_legs(legs.nominal)
+    base = with_zeros(nominal, turned or {})
+    place = np.arange(legs.n_legs * columns.COUNT, dtype=np.intp).reshape(legs.n_legs, -1)
+    place[:, columns.ACTUATOR] = place[list(first)][:, columns.ACTUATOR]  # rods share their motor
+    rods = [leg.q0 for leg in nominal if leg.actuator is not None]
+    size = legs.length_at_home or float(np.mean([leg.q0 for leg in nominal]))
+
+    def vector(moved: Sequence[Leg]) -> Array:
+        framed = in_joint_frames(moved, legs.frame_legs)
+        return vector_of(legs.parametrization, framed, nominal)
+
+    errors = list[tuple[str, Kind, float, list[tuple[Leg, ...]], float]]()
+    for j, leg in enumerate(nominal):
+        own = first[j] == j and leg.actuator is not None
+        arm = own and leg.actuator is not None and leg.actuator.arm is not None
+        kind: Kind
+        for part, kind, sigma, exists in (
+            (columns.A, "joints", tolerance.joints, True),
+            (columns.B, "joints", tolerance.joints, True),
+            (columns.LENGTH, "lengths", tolerance.lengths, leg.kind is LegKind.CONSTANT),
+            (columns.BASE_AXIS, "axes", tolerance.axes, leg.base_axis is not None),
+            (columns.PLATFORM_AXIS, "axes", tolerance.axes, leg.platform_axis is not None),
+            (ActuatorColumns.AXIS, "axes", tolerance.axes, own),
+            (ActuatorColumns.POINT, "joints", tolerance.joints, own and leg.reads_angle),
+            (ActuatorColumns.ARM_AXIS, "arms", ARM_AXIS_SIGMA, arm),
+            (ActuatorColumns.ARM_POINT, "arms", ARM_POINT_SIGMA * float(np.mean(rods or 0)), arm),
+        ):
+            for at in np.atleast_1d(place[j, part]).tolist() if exists else ():
+                step = np.zeros(place.size)
+                step[at] = h = _STEP * (size if kind in ("joints", "lengths") else 1.0)
+                moved = [moved_legs(base, place, side * step) for side in (1.0, -1.0)]
+                errors.append((leg.name, kind, float(sigma or 0.0), moved, h))
+        if leg.is_motor and first[j] == j:
+            sigma = tolerance.angles_at_zero if leg.reads_angle else tolerance.zeros
+            h = leg.reading_of(_STEP * size)
+            moved = [with_zeros(base, {leg.motor_label: side * h}) for side in (1.0, -1.0)]
+            errors.append((leg.motor_label, "zeros", float(sigma or 0.0), moved, h))
+    J = [(vector(plus) - vector(minus)) / (2.0 * h) for *_, (plus, minus), h in errors]
+    names, kinds, sigmas = zip(*(one[:3] for one in errors), strict=True)
+    return PartErrors(names, kinds, np.array(sigmas), np.array(J).T, vector(base))
+
+
+def with_zeros(legs: Sequence[Leg], zeros: Mapping[str, float]) -> tuple[Leg, ...]:
+    """Return legs whose motors stand further by *zeros* [m or rad] than they read, by labels."""
+    return tuple(
+        _with_zero(leg, zeros[leg.motor_label]) if zeros.get(leg.motor_label) else leg
+        for leg in legs
+    )
+
+
+def _with_zero(leg: Leg, zero: float) -> Leg:
+    actuator = leg.actuator
+    if actuator is None:
+        return replace(leg, q0=leg.q0 + leg.sign * zero) if leg.kind is LegKind.ACTUATED else leg
+    q = np.array([zero])
+    moved = replace(leg, A=actuator.at(leg.A, q)[0])
+    if actuator.arm is None:
+        return moved
+    line = actuator.arm.line
+    axis = actuator.rotations(q)[0] @ line.axis if actuator.turns else line.axis
+    turned = replace(actuator.arm, line=Line(actuator.at(line.point, q)[0], axis))
+    return replace(moved, actuator=replace(actuator, arm=turned))
