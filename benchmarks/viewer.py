@@ -3,31 +3,30 @@
     python benchmarks/viewer.py [--model hexapod] [--starts 5] [--seconds 5]
 
 The start is from the command to the first page served, with its bytes; the time of the processor
-beside it does not count what else the computer does. The drag is scripted: 200 values a second of
-one reading after the other, as a hand would, through the loop of the viewer; a frame is one posture
-sent, and counted only if the platform has moved. With --result and --dataset the session of a
+beside it does not count what else the computer does. The drag is scripted: one reading after the
+other, each value as soon as the last one is answered, as the page asks; a frame is one answer, and
+counted only if the platform has moved. With --result and --dataset the session of a
 calibration is shown instead of a model.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import resource
 import subprocess
 import sys
-import threading
 import time
 import urllib.request
-from functools import partial
 
 import numpy as np
 
-from legcal.viewer.address import Address
+from legcal.files.quantity import SHOWN_IN
+from legcal.viewer.server import Address
 from legcal.viewer.source import open_source
-from legcal.viewer.window import Window
+from legcal.viewer.view_server import ViewServer
 
-HAND = 200.0  # values a second
 AMPLITUDE = 0.2  # of the travel
 
 
@@ -49,34 +48,25 @@ def start(words: list[str]) -> tuple[float, float]:
 
 
 def drag(words: list[str], seconds: float) -> tuple[float, float, float]:
-    """Return frames a second, and median and 95 % of the time of a frame's kinematics [s]."""
-    window = Window(open_source(*words), Address("127.0.0.1", 0))
-    motion, took = window.motion, []
-    frames: set[bytes] = set()
-    read = motion.read
-
-    def timed(leg: int, value: float) -> None:
-        begun = time.perf_counter()
-        posture = read(leg, value)
-        took.append(time.perf_counter() - begun)
-        assert not posture.problem
-        frames.add(posture.T.as_matrix().tobytes())
-
-    loop = threading.Thread(target=window.run, daemon=True)
-    loop.start()
+    """Return frames a second, and median and 95 % of the time of an answer [s]."""
+    server = ViewServer(open_source(*words), Address("127.0.0.1", 0))
+    motion, took = server.motion, list[float]()
     ranges, first = motion.ranges_of_readings(), motion.posture.q.copy()
-    motors = window.source.machine.motors
+    machine, frames = server.source.machine, set[bytes]()
     begun = time.perf_counter()
     while (now := time.perf_counter() - begun) < seconds:
-        j = motors[int(now / seconds * len(motors))]
+        j = machine.motors[int(now / seconds * len(machine.motors))]
         room = AMPLITUDE * float(np.ptp(ranges[j]))
         middle = np.clip(first[j], ranges[j, 0] + room, ranges[j, 1] - room)
         wanted = middle + room * np.sin(2.0 * np.pi * now)
-        window.ask(("leg", j), partial(timed, j, float(wanted)))
-        time.sleep(1.0 / HAND)
+        size = SHOWN_IN[machine.legs[j].reading_unit][0]
+        answer = server.answer(
+            "/move", {}, json.dumps({"slider": f"q{j}", "value": size * wanted}).encode()
+        )
+        assert answer is not None
+        took.append(time.perf_counter() - begun - now)
+        frames.add(motion.posture.T.as_matrix().tobytes())
     rate = len(frames) / (time.perf_counter() - begun)
-    window.close()
-    loop.join()
     return rate, float(np.median(took)), float(np.quantile(took, 0.95))
 
 

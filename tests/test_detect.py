@@ -31,7 +31,7 @@ from legcal.perception.overlays import (
     marks_of_image,
 )
 from legcal.viewer.click_server import ClickServer
-from legcal.viewer.local_server import TOKEN_HEADER
+from legcal.viewer.server import TOKEN_HEADER
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import PredictedLeg, predict_legs

@@ -159,7 +159,7 @@ PUBLIC: dict[str, set[str]] = {
         "render",
         "session",
     },
-    "viewer": {"address", "click_server", "local_server", "shooting", "source", "window"},
+    "viewer": {"click_server", "server", "shooting", "source", "view_server"},
     "cli": set(),
     "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
 }

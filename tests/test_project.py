@@ -135,7 +135,7 @@ def test_the_shipped_schemas_are_those_of_the_models() -> None:
 def test_the_package_holds_all_that_pages_are_made_of() -> None:
     assets = {one.name for one in (files("legcal.pages") / "assets").iterdir()}
     assert assets == {
-        *("dialogue.js", "editor.js", "landmarks.js"),
+        *("dialogue.js", "editor.js", "landmarks.js", "sliders.js"),
         *("page.css", "page.html", "page.js", "scene.js"),
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())

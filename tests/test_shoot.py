@@ -26,7 +26,7 @@ from legcal.planning.shooting import GuidedSession
 from legcal.recordings import arrivals
 from legcal.recordings.arrivals import LiveCamera, WatchedFolder
 from legcal.viewer import shooting as dialogues
-from legcal.viewer.local_server import TOKEN_HEADER
+from legcal.viewer.server import TOKEN_HEADER
 from legcal.viewer.shooting import Dialogue, DialogueServer
 
 PATIENCE = 60.0  # [s]

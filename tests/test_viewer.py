@@ -1,24 +1,28 @@
-"""What the viewer shows for sliders: kinematics, exaggeration, photographs; without a browser."""
+"""What the viewer shows for sliders: kinematics, models, photographs; without a browser."""
 
+import json
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from command_line import run
 from hexapod_example import HEXAPOD, Run
 from layouts import Layout, write_machine
 from machines import of_types
-from scipy.ndimage import map_coordinates
 
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.viewer.motion import Motion
+from legcal.viewer.server import Address
 from legcal.viewer.source import Photographs, Source, open_source
-from legcal.viewer.stage import Stage
+from legcal.viewer.view_server import ViewServer
 
 MODELS = [name for name in shipped_names() if "hexapod-" not in name or name == "hexapod-rod"]
 
@@ -69,89 +73,72 @@ def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def hexapod() -> Machine:
-    return load_mechanism("hexapod")
-
-
-@pytest.fixture(scope="module")
 def result(example_run: Run) -> Source:
     return open_source(example_run.output, example_run.folder)
 
 
+@contextmanager
+def served(source: Source) -> Iterator[ViewServer]:
+    server = ViewServer(source, Address("127.0.0.1", 0))
+    try:
+        yield server
+    finally:
+        server._server.server_close()
+
+
+def move(server: ViewServer, slider: str, value: float) -> dict[str, Any]:
+    posted = json.dumps({"slider": slider, "value": value}).encode()
+    answer = server.answer("/move", {}, posted)
+    assert answer is not None
+    return answer
+
+
 def test_nominal_and_calibrated_stand_at_the_same_readings(result: Source) -> None:
-    stage, motion = Stage(result), Motion(result.machine)
-    motion.read(0, motion.posture.q[0] + 0.01)
-    seen = {f: stage.seen(motion.posture, factor=f) for f in (0.0, 1.0, 10.0)}
-    nominal = seen[1.0].beside
-    assert nominal is not None
     assert result.nominal is not None
-    for A, B, machine in (
-        (*nominal, result.nominal),
-        (seen[1.0].A, seen[1.0].B, result.machine),
-    ):
-        lengths = np.linalg.norm(B - A, axis=1)
-        np.testing.assert_allclose(lengths, machine.lengths_at(motion.posture.q), atol=1e-9)
-    np.testing.assert_allclose(seen[0.0].B, nominal[1], atol=1e-15)
-    np.testing.assert_allclose(
-        seen[10.0].B - nominal[1], 10.0 * (seen[1.0].B - nominal[1]), atol=1e-12
-    )
-    assert 1e-4 < seen[1.0].apart < 1e-2
+    with served(result) as server:
+        before = move(server, "pose", 2)["values"]
+        answer = move(server, "q0", before["q0"] + 10.0)
+        q = server.motion.posture.q
+        assert answer["values"]["q0"] == pytest.approx(before["q0"] + 10.0, abs=0.011)
+        assert [answer["values"][f"q{j}"] for j in range(1, 6)] == [
+            pytest.approx(before[f"q{j}"], abs=1e-9) for j in range(1, 6)
+        ]
+        change, *directions = answer["scene"]["modes"]
+        assert change["legend"] == ("nominal", "calibrated")
+        assert len(directions) == len(server.scene.directions) > 0
+        shown = [(np.array(model["A"][0]), np.array(model["B"][0])) for model in change["models"]]
+        for (A, B), machine in zip(shown, (result.nominal, result.machine), strict=True):
+            lengths = np.linalg.norm(B - A, axis=1)
+            np.testing.assert_allclose(lengths, machine.lengths_at(q), atol=1e-6)
+        assert 1e-4 < np.abs(np.subtract(shown[0], shown[1])).max() < 1e-2
+        far = move(server, "q0", 1e4)
+        assert any("q0" in problem or "leg1" in problem for problem in far["problems"])
+        assert "At the end" not in " ".join(move(server, "home", 0.0)["problems"])
 
 
-def test_outlines_lie_on_the_legs_as_their_camera_sees_them(result: Source) -> None:
-    photographs, motion = Photographs(result), Motion(result.machine)
-    assert len(photographs.poses) == 45
-    stage, near = Stage(result), []
-    for pose in range(0, 45, 5):
-        seen = stage.seen(motion.show(photographs.q[pose]))
-        for place in photographs.places:
-            row = photographs.row(place, pose)
-            if row is None:
-                continue
-            ends, used = photographs.outlines(place, row, 0.3)
-            assert used.sum() >= 4
-            centre = place.T_base_camera.translation
-            u = (seen.B - seen.A) / np.linalg.norm(seen.B - seen.A, axis=1)[:, None]
-            for end in ends[used].reshape(-1, 3):  # how near its ray passes to the legs
-                ray = (end - centre) / np.linalg.norm(end - centre)
-                across = np.cross(ray, u)
-                gap = np.abs(np.sum((seen.A - centre) * across, axis=1))
-                near.append(float((gap / np.linalg.norm(across, axis=1)).min()))
-    radii = [c.radius for leg in result.machine.legs for c in leg.cylinders]
-    assert len(near) > 50
-    assert np.median(near) < 1.1 * max(radii)
-
-
-def test_photographs_come_without_distortion_and_say_where_they_are_missing(
+def test_photographs_come_with_their_outlines_and_say_where_they_are_missing(
     result: Source, tmp_path: Path
 ) -> None:
-    photographs = Photographs(result)
-    place = photographs.places[0]
-    row = next(r for p in range(45) if (r := photographs.row(place, p)) is not None)
-    picture, problem = photographs.picture(place, row)
-    assert not problem
-    assert picture is not None
-    assert abs(picture.shape[1] / picture.shape[0] - place.aspect) < 0.01
     assert result.dataset is not None
-    grey = result.dataset.image_reader([row])(0)
-    barrel = replace(
-        place, view=-1, camera=replace(place.camera, distortion=np.array([-0.2, 0.05, 1e-3, 0, 0]))
-    )
-    straight, _ = photographs.picture(barrel, row)
-    assert straight is not None
-    pixels = np.random.default_rng(3).uniform([60, 60], [960, 700], (300, 2))
-    for seen_by, shown in ((place, picture), (barrel, straight)):
-        xy = seen_by.camera.undistort(pixels)  # lines of sight of both must show the same
-        at = 0.5 * (xy / seen_by.half + 1.0) * shown.shape[1::-1] - 0.5
-        levels = [
-            map_coordinates(of, where.T[::-1], order=1)
-            for of, where in ((grey, pixels), (shown[..., 0].astype(float), at))
-        ]
-        assert np.corrcoef(levels)[0, 1] > 0.99
+    with served(result) as server:
+        (shown,) = move(server, "pose", 2)["photographs"]
+        kind, content = server.content(f"/{shown['file']}") or ("", b"")
+        assert kind == "image/jpeg"
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None
+        assert picture.shape[1] / picture.shape[0] == pytest.approx(np.divide(*shown["size"]))
+        used = [line for kind, line in shown["lines"] if kind == "measured"]
+        assert len(used) >= 8
+        size = np.array(shown["size"])
+        assert np.all((np.array(used) >= -0.5) & (np.array(used) <= size))
+        for path in ("/photographs/45", "/photographs/-1", "/photographs/../x", "/other"):
+            assert server.content(path) is None
+        for posted in (b"", b"{}", b'{"slider": "q9", "value": 1}', b'{"slider": "q0"}'):
+            assert server.answer("/move", {}, posted) is None
     elsewhere = replace(result, dataset=replace(result.dataset, folder=tmp_path))
-    nothing, problem = Photographs(elsewhere).picture(place, row)
-    assert nothing is None
-    assert "could not be read" in problem
+    (missing,) = Photographs(elsewhere).at(1)
+    assert missing["file"] == ""
+    assert "could not be read" in missing["caption"]
 
 
 def _port_in_use() -> tuple[socket.socket, str]:
@@ -181,7 +168,6 @@ def test_what_cannot_be_shown_is_refused_in_a_sentence(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("legcal.viewer.window.find_spec", lambda name: name)
     taken, port = _port_in_use()
     with taken:
         filled = [word.format(tmp=tmp_path, port=port) for word in words]
@@ -189,11 +175,3 @@ def test_what_cannot_be_shown_is_refused_in_a_sentence(
     found = capsys.readouterr().err
     assert said in found
     assert found.count("\n") == 1
-
-
-def test_without_viser_the_command_that_installs_it_is_said(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("legcal.viewer.window.find_spec", lambda name: None)
-    assert run(monkeypatch, "view", "hexapod") == 2
-    assert "pip install 'legcal[view]'" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -462,22 +463,19 @@ def view(
     """Show a machine in the browser, moved by sliders: readings, pose, photographs, uncertainty."""
     from rich.text import Text
 
-    from legcal.viewer.address import Address, check_address
+    from legcal.viewer.server import Address, check_address
     from legcal.viewer.source import open_source
-    from legcal.viewer.window import Window, require_viser
+    from legcal.viewer.view_server import ViewServer
 
-    require_viser()
     address = Address(host, port)
     check_address(address)
-    window = Window(open_source(source, dataset), address)
-    name = printable(window.source.name)
-    print_table(Text(f"{window.address} shows {name}; Ctrl-C ends it.", overflow="fold"))
+    server = ViewServer(open_source(source, dataset), address)
+    name = printable(server.source.name)
+    print_table(Text(f"{server.address} shows {name}; Ctrl-C ends it.", overflow="fold"))
     if browser:
-        open_browser(str(window.address))
-    try:
-        window.run()
-    except KeyboardInterrupt:  # the way to end it
-        window.close()
+        open_browser(str(server.address))
+    with suppress(KeyboardInterrupt):  # the way to end it
+        server.run()
 
 
 def example(

@@ -272,8 +272,7 @@ def shoot(
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning.shooting import GuidedSession
     from legcal.recordings.arrivals import LiveCamera, WatchedFolder
-    from legcal.viewer.address import Address, check_address
-    from legcal.viewer.local_server import HOST
+    from legcal.viewer.server import LOCAL, Address, check_address
     from legcal.viewer.shooting import WORDS, Dialogue, DialogueServer
 
     if (watch is None) == (camera is None):
@@ -299,7 +298,7 @@ def shoot(
     typer.echo(f"Type readings in mm or deg where they differ from those asked; or {WORDS}.")
     threading.Thread(target=listen, daemon=True).start()
     if port is not None:
-        check_address(Address(HOST, port))
+        check_address(Address(LOCAL, port))
         server = DialogueServer(dialogue, port)
         threading.Thread(target=server.run, daemon=True).start()
         typer.echo(f"The same as a page: {server.address}")
@@ -511,10 +510,9 @@ def detect(
     from legcal.report.session import examination_table
 
     if edit:
-        from legcal.viewer.address import Address, check_address
-        from legcal.viewer.local_server import HOST
+        from legcal.viewer.server import LOCAL, Address, check_address
 
-        check_address(Address(HOST, port))
+        check_address(Address(LOCAL, port))
     examination = job.doctor(
         load_dataset(dataset, check_clicks=False) if edit else dataset,
         output=output,

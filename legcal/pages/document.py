@@ -156,6 +156,22 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Sliders:
+    """Sliders that move the machine of a scene by its server, and photographs of its poses.
+
+    A slider has ``name``, ``label``, ``low``, ``high`` and ``step``, or is a ``button``; posts of
+    its value are answered by a state: ``values`` of sliders, ``problems``, the content of the
+    ``scene``, and ``photographs`` with ``file``, ``size``, ``caption`` and ``lines``.
+    """
+
+    kind: ClassVar = "sliders"
+    scene: str  # the name of the scene
+    sliders: Sequence[Mapping[str, Any]]
+    state: Mapping[str, Any]
+    token: str  # identifies the page to its server
+
+
+@dataclass(frozen=True)
 class Crop:
     """A piece of an image with lines over it."""
 
@@ -290,6 +306,7 @@ _SCRIPTS = {
     Scene: "scene.js",
     OutlineEditor: "editor.js",
     LandmarkEditor: "landmarks.js",
+    Sliders: "sliders.js",
     Dialogue: "dialogue.js",
 }
 
@@ -325,7 +342,8 @@ def page_html(page: Page) -> str:
                 ),
             ],
             served=any(
-                isinstance(block, LandmarkEditor | Dialogue) and block.token for block in blocks
+                isinstance(block, LandmarkEditor | Dialogue | Sliders) and block.token
+                for block in blocks
             ),
             pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
         )

@@ -127,10 +127,8 @@ def _dataset(plan: Plan, model: str) -> dict[str, str]:
         [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
         for name, image, label, v, k in images_of(plan)
     ]
-    board: dict[str, Any] = (
-        {} if plan.board is None else {"board": board_document(plan.board.board)}
-    )
-    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), **board)
+    board = {} if plan.board is None else {"board": board_document(plan.board.board)}
+    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), board)
 
 
 def rough_view(
@@ -152,8 +150,8 @@ def dataset_texts(
     views: Mapping[str, Any],
     rows: Iterable[Sequence[Any]],  # of *columns* and readings
     encoder_sigma: float | dict[str, float],
+    blocks: Mapping[str, Any],
     columns: Sequence[str] = ("view", "image", "pose"),
-    **blocks: Any,
 ) -> dict[str, str]:
     """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
     document = {

@@ -28,7 +28,6 @@ from legcal.calibration.workspace_errors import PlatformMap, platform_map
 from legcal.data.measurements import row_names
 from legcal.errors import LegcalError, printable
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.loader import load_mechanism
@@ -58,12 +57,11 @@ from legcal.pages.svg import Bars, log_bars, number_grid
 from legcal.report.calibration import platform_table
 from legcal.report.identify import conditions_table
 from legcal.report.residuals import outline_crops, residual_charts
-from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, enlargement, pyramid
+from legcal.scene.motions import MachineScene, PlacedModel, pyramid, scene_content
 from legcal.version import __version__
 
 MAX_POSES = 60  # largest number of poses of the slider
 MAX_CAMERAS = 60
-_RING = 0.06  # size of the median ellipsoid, relative to the machine
 _DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
 _WORDS: dict[Light, str] = {
     "good": "Use it",
@@ -391,30 +389,10 @@ def machine_scene(calibration: Calibration) -> Scene:
         for k, (words, _) in enumerate(scene.directions)
     ]
     images = row_names(measurements)
-    turn_base = machine.T_base_Rb.rotation.as_matrix()
-    turn_platform = machine.T_platform_Re.rotation.as_matrix().T
-    factor = enlargement(scene.ellipsoids, _RING * scene.size)
-    content = {
-        "unit": "m",
-        "flat": not machine.spatial,
-        "factors": FACTORS,
+    platform = [machine.T_base_Rb * pose * machine.T_platform_Re.inv() for pose in T]
+    content = scene_content(scene, pairs, np.array([pose.as_matrix() for pose in platform]))
+    content |= {
         "poses": [printable(images[row]) for row in measurements.first_rows[chosen].tolist()],
-        "modes": [
-            {
-                "name": printable(name),
-                "legend": legend,
-                "step": scene.first_step(before, after),
-                "models": [_model(before), _model(after)],
-            }
-            for name, legend, before, after in pairs
-        ],
-        "names": [printable(name) for name in machine.leg_names],
-        "rims": scene.rims,
-        "rings": {
-            "name": f"1 sigma, {factor:g} times as large",
-            "turns": _rounded(turn_base @ components(T)[0] @ turn_platform, 6),
-            **{side: _rounded(factor * axes, 6) for side, axes in scene.ellipsoids.items()},
-        },
         "cameras": _cameras(calibration, _DEPTH * scene.size),
     }
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
@@ -426,13 +404,6 @@ def machine_scene(calibration: Calibration) -> Scene:
         f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
     return Scene("machine-scene", content, 560, caption)
-
-
-def _model(model: PlacedModel) -> dict[str, Any]:
-    """Return the geometry of a model; joints at A that no motor moves are included once."""
-    is_fixed = np.ptp(model.A, axis=0).max() == 0.0
-    once = model._replace(A=model.A[:1], moving=model.moving[:1]) if is_fixed else model
-    return {name: _rounded(values, 7) for name, values in once._asdict().items()}
 
 
 def _cameras(calibration: Calibration, depth: float) -> list[dict[str, Any]]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.errors import printable
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # default displayed size of the largest change, relative to the machine
+_RING = 0.06  # size of the median ellipsoid, relative to the machine
 _HELD = 0.0025  # length of a step along a held direction, in leg lengths
 
 
@@ -175,3 +177,48 @@ def pyramid(camera: Camera, T_base_camera: RigidTransform, depth: float) -> Arra
     corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
     rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
     return np.asarray(T_base_camera.apply(np.concatenate([np.zeros((1, 3)), rays])))
+
+
+def scene_content(
+    scene: MachineScene,
+    modes: Sequence[tuple[str, tuple[str, str], PlacedModel, PlacedModel]],
+    T_base_platform: Array,
+    *,
+    factors: Sequence[int] = FACTORS,
+) -> dict[str, Any]:
+    """Return the content of ``scene.js`` at k poses (k, 4, 4) of the platform.
+
+    *modes* are the pairs of models that can be chosen: name, legend of both, and both. Without
+    *factors* their difference is not exaggerated.
+    """
+    factor = enlargement(scene.ellipsoids, _RING * scene.size)
+    return {
+        "unit": "m",
+        "flat": not scene.machine.spatial,
+        "factors": factors or (1,),
+        "modes": [
+            {
+                "name": printable(name),
+                "legend": legend,
+                "step": scene.first_step(before, after) if factors else 0,
+                "models": [_model(before), _model(after)],
+            }
+            for name, legend, before, after in modes
+        ],
+        "names": [printable(name) for name in scene.machine.leg_names],
+        "rims": scene.rims,
+        "rings": {
+            "name": f"1 sigma, {factor:g} times as large",
+            "turns": np.round(T_base_platform[:, :3, :3], 6).tolist(),
+            **{
+                side: np.round(factor * axes, 6).tolist() for side, axes in scene.ellipsoids.items()
+            },
+        },
+    }
+
+
+def _model(model: PlacedModel) -> dict[str, Any]:
+    """Return the geometry of a model; joints at A that no motor moves are included once."""
+    is_fixed = np.ptp(model.A, axis=0).max() == 0.0
+    once = model._replace(A=model.A[:1], moving=model.moving[:1]) if is_fixed else model
+    return {name: np.round(values, 7).tolist() for name, values in once._asdict().items()}

@@ -334,7 +334,7 @@ def write_session(
     if lengths:
         blocks["parameters"] = {"lengths": dict(lengths)}
     sigma = dict(m.sigma_by_joint) or m.sigma_q
-    for name, text in dataset_texts(machine, model, views, rows, sigma, columns, **blocks).items():
+    for name, text in dataset_texts(machine, model, views, rows, sigma, blocks, columns).items():
         (folder / name).write_text(text, encoding="utf-8")
 
 

@@ -25,16 +25,16 @@ from legcal.data.landmarks import (
 )
 from legcal.errors import DatasetError
 from legcal.files.folder import write_atomically
-from legcal.viewer.local_server import HTML, LocalServer
+from legcal.viewer.server import HTML, LOCAL, Address, PageServer
 
 
-class ClickServer(LocalServer):
-    """A server of the folder of a detection, until it is closed."""
+class ClickServer(PageServer):
+    """A server of the folder of a detection, to this machine alone: its posts write a table."""
 
     def __init__(
         self, examination: Examination, detection: Detection, folder: Path, port: int = 0
     ) -> None:
-        super().__init__(port)
+        super().__init__(Address(LOCAL, port))
         self.detection = detection
         self.folder = folder
         self._page = examination_page(examination, detection, self.token).encode()
@@ -49,7 +49,7 @@ class ClickServer(LocalServer):
         return None if file is None or not file.is_file() else ("image/jpeg", file.read_bytes())
 
     def answer(self, path: str, query: dict[str, list[str]], text: bytes) -> dict[str, Any] | None:
-        """Return what posted clicks give, or where they were saved."""
+        """Return the camera of an image by posted clicks, or the file they are saved in."""
         image, n_images = query.get("image", ["0"])[0], len(self.detection.photograph_files)
         try:
             if path == "/clicks" and image.isdecimal() and int(image) < n_images:

@@ -14,7 +14,7 @@ from legcal.pages.document import Dialogue as DialogueBlock
 from legcal.pages.document import Page, Section, page_html
 from legcal.planning.shooting import Asked, Checked, GuidedSession
 from legcal.recordings.arrivals import LiveCamera, WatchedFolder
-from legcal.viewer.local_server import HTML, LocalServer
+from legcal.viewer.server import HTML, LOCAL, Address, PageServer
 
 WORDS = "keep (take the refused one), skip (leave the pose out), undo (take the last one out), quit"
 PAUSE = 0.5  # between two looks for photographs [s]
@@ -161,11 +161,11 @@ class Dialogue:
         return {**self._shown, "lines": self.lines[-12:]}
 
 
-class DialogueServer(LocalServer):
+class DialogueServer(PageServer):
     """The page of a dialogue, which shows what is asked and takes the same words."""
 
     def __init__(self, dialogue: Dialogue, port: int = 0) -> None:
-        super().__init__(port)
+        super().__init__(Address(LOCAL, port))
         self.dialogue = dialogue
         folder = str(dialogue.session.folder)
         blocks = [DialogueBlock(self.token)]

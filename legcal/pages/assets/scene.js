@@ -206,6 +206,7 @@
       if ("+-".includes(key)) zoom(key === "+" ? 0.9 : 1.1);
     });
     new ResizeObserver(draw).observe(canvas);
+    canvas.show = (changes) => { Object.assign(content, changes); update(); };
     update();
   };
   for (const script of document.querySelectorAll("script[data-scene]")) {
