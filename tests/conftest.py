@@ -158,7 +158,7 @@ def without_steps() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def without_remedies() -> Iterator[None]:
     """Refuse what is not identifiable without trying what would mend it, which takes seconds."""
     with pytest.MonkeyPatch.context() as patch:

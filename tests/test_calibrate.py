@@ -410,7 +410,7 @@ def test_errors_from_photographs_are_as_large_as_their_sigmas(example_run: Run) 
 def test_a_second_run_searches_no_image(example_run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     stages: list[str] = []
 
-    def stopped(*_: object) -> None:
+    def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("legcal.calibration.pipeline.fit_outlines", stopped)

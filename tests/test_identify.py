@@ -172,11 +172,11 @@ def test_tables_fit_80_columns_and_say_the_verdict(
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:
-    views: list[Any] = [["leg7"], [], ["leg1", "leg1"], ["leg1", 2], "leg1"]
+    views: list[Any] = [["leg7"], [], ["leg1", "leg1"], ["leg1", 9], "leg1"]
     with pytest.raises(UsageError) as refused:
         legcal.identifiability(loaded("hexapod"), views, images=-1)
     assert len(refused.value.problems) == 6
-    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found '2'", "'leg1'")
+    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found '9'", "'leg1'")
     assert all(word in problem for word, problem in zip(named, refused.value.problems, strict=True))
 
 

@@ -133,7 +133,8 @@ def test_wrong_assumptions_count_over_the_workspace_or_at_the_readings(
     longer[-6:] = 1e-3  # all offsets: the platform is lifted
     q = random_configurations(nominal, 2, 0).readings
     if not workspace:
-        monkeypatch.setattr(platform, "workspace", configurations.workspace)  # drawn anew
+        monkeypatch.setattr(platform, "workspace", configurations.workspace.__wrapped__)
+        monkeypatch.setattr(configurations, "WORKSPACE_SEED", 1)  # drawn anew, with no share
         monkeypatch.setattr(configurations, "SHARES", np.zeros(0))
     accuracy = _accuracy(
         nominal, nominal, q, np.zeros((30, 1)), Sensitivity("legs 1 mm longer", longer[:, None])
