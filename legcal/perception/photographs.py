@@ -48,7 +48,7 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey, shrink
 from legcal.workers import Run
 
-DETECTOR_VERSION = 19  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 20  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
@@ -57,6 +57,7 @@ FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of pos
 MIN_OUTLINES = 5
 MIN_POSES = 3  # of a view, so that they check its camera
 MIN_VIEWS = 2  # in which a part must show another radius than the model's
+MIN_WRONG_SHARE = 0.6  # of the outlines of one part alone, before a fit has told more of it
 MIN_CHANGE = 0.08  # of a radius from the model, as a logarithm: less does no harm
 MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
 LegRadius = tuple[int, float]  # leg, and radius in the model [m]
@@ -279,18 +280,22 @@ def _with_other_radii(
     """
     machine, view = photographs.machine, photographs.measurements.view
     shown = _radii_of_outlines(photographs, placement, outlines)
+    surely = _radii_of_outlines(photographs, placement, outlines, least=MIN_WRONG_SHARE)
     factors = {
         part: radius / part[1]
         for part, (radius, rows) in shown.items()
         if len(set(view[rows])) >= MIN_VIEWS and abs(np.log(radius / part[1])) > MIN_CHANGE
     }
-    if not factors:
-        return photographs, search, outlines, []
     every = {(j, c.radius) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
     values, common = list(factors.values()), 0.0
     if len(every) > 1 and len(factors) >= MIN_SHARE_ALIKE * len(every):
         common = float(np.median(values)) if np.ptp(np.log(values)) < MIN_CHANGE else 0.0
-    factors = dict.fromkeys(every, common) | factors if common else factors
+    if common:
+        factors = dict.fromkeys(every, common) | factors
+    else:
+        factors = {part: factor for part, factor in factors.items() if part in surely}
+    if not factors:
+        return photographs, search, outlines, []
     changed = replace(
         photographs,
         machine=machine.with_radii(lambda j, c: factors.get((j, c.radius), 1.0) * c.radius),
@@ -450,9 +455,9 @@ def with_measured_radii(
 
 
 def _radii_of_outlines(
-    photographs: Photographs, placement: Placement, outlines: Outlines
+    photographs: Photographs, placement: Placement, outlines: Outlines, *, least: float = 0.5
 ) -> dict[LegRadius, tuple[float, IntArray]]:
-    """Return the radii [m] of cylinders most of whose outlines are at a wrong distance.
+    """Return the radii [m] of cylinders of whose outlines a share is at a wrong distance.
 
     By leg and radius in the model, as the outlines have them; with the rows of these.
     """
@@ -465,7 +470,7 @@ def _radii_of_outlines(
     for j, leg in enumerate(photographs.machine.legs):
         for cylinder in leg.cylinders:
             of_cylinder = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
-            if 2 * np.count_nonzero(wrong[of_cylinder]) <= len(of_cylinder):
+            if np.count_nonzero(wrong[of_cylinder]) <= least * len(of_cylinder):
                 continue
             row, edge = outlines.row[of_cylinder], outlines.edge[of_cylinder]
             A = np.array([places[int(m.view[r])].apply(placement.A_base[r, j]) for r in row])
