@@ -126,7 +126,7 @@ def test_the_posterior_of_parts_is_bayes_rule() -> None:
     np.testing.assert_allclose(covariance, S - G @ J @ S, atol=1e-12)
 
 
-@pytest.mark.parametrize("only", ["zeros", "lengths"])
+@pytest.mark.parametrize("only", ["zeros", pytest.param("lengths", marks=pytest.mark.slow)])
 def test_identify_and_plan_say_how_well_a_group_will_be_known(only: Group) -> None:
     machine = replace(load_mechanism("3-rpr"), tolerance=TYPICAL["bought"])
     setting = replace(default_setting(machine.size), draws=1)
