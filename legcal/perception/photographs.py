@@ -280,10 +280,9 @@ def _with_other_radii(
     """
     machine, view = photographs.machine, photographs.measurements.view
     shown = _radii_of_outlines(photographs, placement, outlines)
-    surely = _radii_of_outlines(photographs, placement, outlines, least=MIN_WRONG_SHARE)
     factors = {
         part: radius / part[1]
-        for part, (radius, rows) in shown.items()
+        for part, (radius, rows, _) in shown.items()
         if len(set(view[rows])) >= MIN_VIEWS and abs(np.log(radius / part[1])) > MIN_CHANGE
     }
     every = {(j, c.radius) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
@@ -293,7 +292,7 @@ def _with_other_radii(
     if common:
         factors = dict.fromkeys(every, common) | factors
     else:
-        factors = {part: factor for part, factor in factors.items() if part in surely}
+        factors = {part: f for part, f in factors.items() if shown[part][2] > MIN_WRONG_SHARE}
     if not factors:
         return photographs, search, outlines, []
     changed = replace(
@@ -446,7 +445,7 @@ def with_measured_radii(
     machine = photographs.machine
     radii = {
         part: radius
-        for part, (radius, _) in _radii_of_outlines(photographs, placement, outlines).items()
+        for part, (radius, _, _) in _radii_of_outlines(photographs, placement, outlines).items()
     }
     if not radii:
         return None
@@ -455,29 +454,32 @@ def with_measured_radii(
 
 
 def _radii_of_outlines(
-    photographs: Photographs, placement: Placement, outlines: Outlines, *, least: float = 0.5
-) -> dict[LegRadius, tuple[float, IntArray]]:
-    """Return the radii [m] of cylinders of whose outlines a share is at a wrong distance.
+    photographs: Photographs, placement: Placement, outlines: Outlines
+) -> dict[LegRadius, tuple[float, IntArray, float]]:
+    """Return the radii [m] of cylinders most of whose outlines are at a wrong distance.
 
-    By leg and radius in the model, as the outlines have them; with the rows of these.
+    By leg and radius in the model, as the outlines have them; with the rows of these, and the share
+    that is at a wrong distance.
     """
     m, wrong = photographs.measurements, outlines.rejected_for(Reason.WIDTH)
     judged = (outlines.used | wrong) & np.isfinite(outlines.h).all(axis=1)
     places = {
         v: T.inv() for v, T in enumerate(placement.T_base_camera) if T is not None
     }  # of the base before the cameras
-    part, radii = np.array(outlines.part), dict[LegRadius, tuple[float, IntArray]]()
+    part, radii = np.array(outlines.part), dict[LegRadius, tuple[float, IntArray, float]]()
     for j, leg in enumerate(photographs.machine.legs):
         for cylinder in leg.cylinders:
             of_cylinder = np.flatnonzero(judged & (outlines.leg == j) & (part == cylinder.link))
-            if np.count_nonzero(wrong[of_cylinder]) <= least * len(of_cylinder):
+            if 2 * np.count_nonzero(wrong[of_cylinder]) <= len(of_cylinder):
                 continue
+            share = float(np.mean(wrong[of_cylinder]))
             row, edge = outlines.row[of_cylinder], outlines.edge[of_cylinder]
             A = np.array([places[int(m.view[r])].apply(placement.A_base[r, j]) for r in row])
             distance = np.sum(outlines.h[of_cylinder] * A, axis=1) * np.array(EPSILON)[edge - 1]
             of_edges = [np.median(distance[edge == e]) for e in np.unique(edge)]
             if len(of_edges) == len(EPSILON):
-                radii[j, cylinder.radius] = float(np.mean(of_edges)), row
+                *_, before = radii.get((j, cylinder.radius), (0.0,))  # of a part as thick
+                radii[j, cylinder.radius] = float(np.mean(of_edges)), row, max(share, before)
     return radii
 
 
