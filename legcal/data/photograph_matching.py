@@ -22,8 +22,10 @@ from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
 from legcal.vision.image_file import (
     CONVERT,
+    CONVERT_HEIC,
     FOREIGN_SUFFIXES,
-    SUFFIXES,
+    HEIC_SUFFIXES,
+    image_suffixes,
     read_facts,
 )
 
@@ -70,6 +72,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
             f"{folder}: the photographs could not be found: found {actual}, needed the folder that "
             "holds them; check the path."
         )
+    suffixes = image_suffixes()
     photographs: list[Photograph] = []
     foreign: list[str] = []
     for above, inside, files in os.walk(folder):
@@ -78,7 +81,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
         for name in (name for name in files if not name.startswith(".")):
             suffix = Path(name).suffix.lower()
             file = Photograph(Path(above) / name, (relative_folder / name).as_posix())
-            if suffix in SUFFIXES:
+            if suffix in suffixes:
                 photographs.append(file)
             elif suffix in FOREIGN_SUFFIXES:
                 foreign.append(file.name)
@@ -91,7 +94,8 @@ def find_photographs(folder: Path) -> list[Photograph]:
         actual, remedy = "none", "check the path"
         if foreign:
             actual = f"{len(foreign)} of another format ({few(foreign)})"
-            remedy = CONVERT
+            are_heic = any(name.lower().endswith(HEIC_SUFFIXES) for name in foreign)
+            remedy = CONVERT_HEIC if are_heic else CONVERT
         raise DatasetError(
             f"{folder}: the photographs could not be found: found {actual}, needed PNG, JPEG or "
             f"TIFF files there or in folders in it; {remedy}."

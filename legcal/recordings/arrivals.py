@@ -16,6 +16,7 @@ from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.image_file import (
     COPY_AGAIN,
+    HEIC_SUFFIXES,
     SUFFIXES,
     BadImage,
     image_size,
@@ -66,7 +67,7 @@ class WatchedFolder:
         """Return size and time of change [ns] of the photographs in the folder."""
         files = {}
         for path in self.folder.iterdir():
-            if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+            if path.suffix.lower() in (*SUFFIXES, *HEIC_SUFFIXES) and not path.name.startswith("."):
                 try:
                     file = path.stat()
                 except FileNotFoundError:  # renamed meanwhile

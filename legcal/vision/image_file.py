@@ -2,6 +2,10 @@
 
 Pillow reads the headers: compression, camera, lens, zoom, time. Damaged or absent metadata are
 ignored. OpenCV decodes the pixels.
+
+HEIC is read by the package pi-heif where it is installed (``legcal[heic]``). Its wheels hold the
+decoders libheif and libde265 (LGPL-3); the wheels of pillow-heif, of which it is a part, hold the
+encoder x265 too (GPL-2). Pixels are rotated according to the file.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
@@ -43,6 +48,9 @@ _MOST_TEXT = 60  # maximum number of characters shown
 _STEPS_AT_50 = 3688.0
 
 
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
+_REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # errors of the package
 FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along diagonals
 # Standard deviations, relative to the focal length: of f (whole millimetres, cropping, focus), and
 # of the difference between fx and fy (pixels are square)
@@ -56,6 +64,10 @@ class ImageSize(NamedTuple):
 
     width: int
     height: int
+
+
+class UnreadableError(ValueError):
+    """A HEIC file that is damaged, or that the package cannot read."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,8 @@ def read_facts(content: bytes) -> ImageFacts:
                 return _facts(software | exif_tags(info.get("exif", b"")))
             if content.startswith(TIFF_SIGNATURES):
                 return _facts(exif_tags(content))
+            if is_heic(content):  # its pixels are decoded upright
+                return _facts(exif_tags(heic_exif(content)) | {Base.Orientation: None})
         except PILLOW_ERRORS:
             pass
     return ImageFacts()
@@ -196,6 +210,53 @@ def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) 
     return Camera(K, width, height, covariance=C)
 
 
+def is_heic(content: bytes) -> bool:
+    """Return whether the bytes of a file look like HEIC."""
+    return content[4:8] == b"ftyp" and content[8:12] in _HEIC_BRANDS
+
+
+def can_read_heic() -> bool:
+    """Return whether the package is installed."""
+    return _package() is not None
+
+
+def heic_pixels(content: bytes) -> NDArray[np.generic]:
+    """Return the pixels (height, width, 3) of 8 or 16 bits, blue first, or grey (height, width)."""
+    try:
+        pixels = np.asarray(_opened(content))
+    except _REFUSALS as error:
+        raise UnreadableError(str(error)) from error
+    return pixels[..., :3] if pixels.ndim == 3 else pixels  # without the alpha channel
+
+
+def heic_exif(content: bytes) -> bytes:
+    """Return the block of EXIF, b"" where there is none, or no package."""
+    try:
+        return bytes(_opened(content).info.get("exif") or b"")
+    except UnreadableError:
+        return b""
+
+
+def _package() -> ModuleType | None:
+    try:
+        import pi_heif
+    except ImportError:
+        return None
+    module: ModuleType = pi_heif
+    return module
+
+
+def _opened(content: bytes) -> Any:
+    """Return the picture of a file, its pixels not yet decoded."""
+    package = _package()
+    if package is None:
+        raise UnreadableError("no package that reads it")
+    try:
+        return package.open_heif(content, convert_hdr_to_8bit=False, bgr_mode=True)
+    except _REFUSALS as error:
+        raise UnreadableError(str(error)) from error
+
+
 _Level = TypeVar("_Level", np.uint8, np.float32)
 Grey = NDArray[np.float32]  # (height, width) grey levels, 0 to 255
 
@@ -238,8 +299,8 @@ CONVERT = (
     "(magick mogrify -format jpg -quality 98 *.HEIC), or set the phone to the most compatible "
     "format"
 )
-_HEIC = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
-_FOREIGN_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3", **dict.fromkeys(_HEIC, "HEIC")}
+CONVERT_HEIC = f"install what reads HEIC (pip install 'legcal[heic]'), or {CONVERT}"
+_FOREIGN_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "CR3"}
 
 _COMPLETE = "a complete PNG, JPEG or TIFF file"
 COPY_AGAIN = "copy it again or remove the row"  # the remedy of a file that may be incomplete
@@ -268,9 +329,12 @@ def decode_image(path: Path, camera: Camera, named: Place = NOWHERE) -> NDArray[
         raise DatasetError(problem)
     pixels: NDArray[np.generic] | None
     try:
-        with quiet_opencv():
-            pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
-    except cv2.error:
+        if is_heic(content):
+            pixels = heic_pixels(content)
+        else:
+            with quiet_opencv():
+                pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
+    except (cv2.error, UnreadableError):
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         actual = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
@@ -315,7 +379,9 @@ def image_size(content: bytes) -> ImageSize:
     """Return the size of an image from the bytes of its file; refuse a truncated file."""
     if not content:
         raise BadImage("an empty file")
-    if content.startswith(JPEG_SIGNATURE):
+    if is_heic(content):
+        size = _heic_size(content)
+    elif content.startswith(JPEG_SIGNATURE):
         size = _size_read("JPEG", _jpeg_size, content)
     elif content.startswith(PNG_SIGNATURE):
         size = _size_read("PNG", _png_size, content)
@@ -377,6 +443,21 @@ def _tiff_size(content: bytes) -> tuple[int, int]:
     if bits > _FULL:
         raise BadImage(f"a TIFF of {bits} bit pixels", _LEVELS)
     return int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])
+
+
+def _heic_size(content: bytes) -> ImageSize:
+    """Return the size of a HEIC photograph, if its package is there."""
+    if not can_read_heic():
+        raise BadImage("a HEIC file, which cannot be read here", remedy=CONVERT_HEIC)
+    try:
+        return ImageSize(*map(int, _opened(content).size))
+    except UnreadableError as error:
+        raise BadImage(f"a HEIC file that cannot be read ({error})") from error
+
+
+def image_suffixes() -> tuple[str, ...]:
+    """Return the endings of image files that can be read here."""
+    return SUFFIXES + HEIC_SUFFIXES if can_read_heic() else SUFFIXES
 
 
 def size_problem(width: int, height: int) -> tuple[str, str] | None:

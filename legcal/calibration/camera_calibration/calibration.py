@@ -51,11 +51,11 @@ from legcal.vision.board import Board, board_of
 from legcal.vision.camera import Camera
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import (
-    SUFFIXES,
     BadImage,
     ImageFacts,
     ImageSize,
     image_size,
+    image_suffixes,
     likely_cause,
     read_facts,
     read_image,
@@ -379,7 +379,7 @@ def _listed_images(named: Sequence[str | Path]) -> list[Path]:
         if not paths:
             problems.append(
                 f"The images {describe(str(name))} could not be read: found no such file, folder "
-                f"with images or pattern that matches one, needed {', '.join(SUFFIXES)}; "
+                f"with images or pattern that matches one, needed {', '.join(image_suffixes())}; "
                 "check the path."
             )
         files |= dict.fromkeys(paths)
@@ -394,7 +394,7 @@ def _matching(name: str) -> list[Path]:
     """Return the images of a file, folder or pattern."""
     if not name:
         return []
-    path, suffixes = Path(name), SUFFIXES
+    path, suffixes = Path(name), image_suffixes()
     if path.is_dir():
         files = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
         return [p for p in files if p.suffix.lower() in suffixes and p.is_file()]
