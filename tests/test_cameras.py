@@ -277,9 +277,19 @@ MESSAGE = {"width": SIZE[0], "height": SIZE[1], "distortion_model": "plumb_bob"}
 MRCAL = "# made by hand\n{{ 'lensmodel': '{}', 'intrinsics': {}, 'imagersize': [1024, 768], }}\n"
 FOUR = [1290.0, 1310.0, 518.3, 379.6]
 AT_CORNER = "1290 1310 518.8 380.1"
+MATLAB = {"RadialDistortion": [-0.25, 0.08, 0.01], "TangentialDistortion": [1e-3, -8e-4]} | {
+    "ImageSize": SIZE[::-1]
+}
 FULL = MESSAGE | {"k": K.ravel().tolist(), "d": PLUMB_BOB}
-
 ROI = {"x_offset": 0, "y_offset": 0, "width": SIZE[0], "height": SIZE[1], "do_rectify": False}
+BY_ONE = [[1290.0, 2.5, 519.3], [0.0, 1310.0, 380.6], [0.0, 0.0, 1.0]]
+
+
+def basalt(lens: str, numbers: dict[str, float]) -> dict[str, Any]:
+    """The content of a calibration of Basalt of one camera."""
+    pinhole = dict(zip(("fx", "fy", "cx", "cy"), FOUR, strict=True))
+    camera = {"camera_type": lens, "intrinsics": pinhole | numbers}
+    return {"value0": {"intrinsics": [camera], "resolution": [list(SIZE)]}}
 
 
 def echoed(*messages: dict[str, Any]) -> str:
@@ -306,6 +316,10 @@ def echoed(*messages: dict[str, Any]) -> str:
         (yaml.safe_dump(ros()) + "note: |\n  1 AB 3 4\n", "plumb_bob", PLUMB_BOB, 2.5),
         (f"3 OPENCV 1024 768 {AT_CORNER} -0.25 0.08 0.001 -0.0008\n", "plumb_bob",
          [*PLUMB_BOB[:4], 0.0], 0.0),
+        (basalt("kb4", dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True))), "equidistant",
+         FISHEYE, 0.0),
+        (MATLAB | {"K": BY_ONE}, "plumb_bob", PLUMB_BOB, 2.5),
+        (MATLAB | {"IntrinsicMatrix": np.transpose(BY_ONE).tolist()}, "plumb_bob", PLUMB_BOB, 2.5),
         ("%YAML:1.0 # OpenCV's\n" + yaml.safe_dump(kalibr()), "plumb_bob", PLUMB_BOB[:4], 0.0),
     ],
 )  # fmt: skip
@@ -324,12 +338,16 @@ def test_files_of_other_programs_are_read(
         (MRCAL.format("LENSMODEL_SPLINED_STEREOGRAPHIC_order=3", FOUR),
          ("SPLINED", "LENSMODEL_OPENCV8", "legcal camera")),
         (MRCAL.format("LENSMODEL_OPENCV8", FOUR), ("4 parameters", "12")),
+        (basalt("ds", {}), ("'ds'", "kb4")),
         (f"1 FOV 1024 768 {AT_CORNER} 0.9\n", ("'FOV'", "OPENCV_FISHEYE")),
         (f"1 PINHOLE 1024 768 {AT_CORNER}\n2 PINHOLE 1024 768 {AT_CORNER}\n", ("2 cameras",)),
         ("1 PINHOLE 1024\n", ("camera 1 could not be read", "'1024'", "width and height")),
         ("1 PINHOLE 1024 768 1.2.3 1 5 5\n", ("'1.2.3'", "parameters of PINHOLE")),
         (f"1 PINHOLE 1024 - {AT_CORNER}\n", ("'-'", "COLMAP's cameras.txt")),
         (f"1 PINHOLE 1e400 768 {AT_CORNER}\n", ("'1e400'", "COLMAP's cameras.txt")),
+        *((MATLAB | {key: rows}, (f"{key} could not be used", "three rows of three numbers"))
+          for key in ("K", "IntrinsicMatrix")
+          for rows in (5, [1, 2, 3], [[1.0, 0.0, 0.0], [0.0, 1.0], [1.0]], 3 * [[1.0, 2.0]])),
         (kalibr(camera_model="omni", intrinsics=[0.8, *FOUR]), ("'omni'", "pinhole-radtan")),
         (kalibr(distortion_model="fov", distortion_coeffs=[0.9]), ("'fov'", "equidistant")),
         (ros(distortion_model="plumb_bob", D=RATIONAL), ("8 coefficients", "name the lens")),

@@ -143,11 +143,17 @@ MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
      [(f"{v}/{i}.png", k) for v in "ab" for k, i in enumerate((3, 1, 2))]),
     (SAME, {"camera": "abba", "name": "1122"}, 4,
      [("a/1.png", 0), ("a/2.png", 3), ("b/1.png", 1), ("b/2.png", 2)]),
+    (FLAT, {"time": ("10:02:00", "10:00", "10:01")}, 3,
+     [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    # clocks an hour apart
+    (FLAT, {"Time": tuple(f"2026-11-23T11:0{i}:03" for i in (1, 0, 2))}, 3,
+     [("IMG_10.JPG", 0), ("IMG_2.JPG", 1), ("IMG_11.JPG", 2)]),
+    (FLAT, {"time": ("10:02:00", "10:00")}, 2, [("IMG_11.JPG", 0), ("IMG_2.JPG", 1)]),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("photographs", "columns", "n", "expected"), MATCHED)
-def test_photographs_are_matched_by_name_or_order(
+def test_photographs_are_matched_by_name_order_or_time(
     photographs: Sequence[str],
     columns: Columns,
     n: int,
@@ -164,6 +170,32 @@ def test_photographs_are_matched_by_name_or_order(
     folders = [Path(name).parent.name or "c1" for name, _ in names]
     assert [view for view, *_ in found] == folders
     load_dataset(tmp_path / "dataset")
+
+
+AT_THE_END = ("002-left.png", "002-right.png", "010-left.png", "010-right.png")
+
+
+def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table(own_folder(tmp_path, AT_THE_END), n=4)
+    assert init(monkeypatch, tmp_path) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Views left, right are taken from the names of the photographs, '*-{view}'" in said
+    table(tmp_path, {"view": ("a", "a", "b", "b")}, n=4)  # or a column says it
+    assert init(monkeypatch, tmp_path, output="other") == 0
+    by_names, by_column = (
+        {Path(row["image"]).name: row["view"] for row in read_rows(tmp_path / name)}
+        for name in ("dataset/measurements.csv", "other/measurements.csv")
+    )
+    assert by_names == {name: name[4:].removesuffix(".png") for name in AT_THE_END}
+    assert by_column == dict(zip(AT_THE_END, "aabb", strict=True))
+    numbered = tmp_path / "numbered"
+    numbered.mkdir()
+    table(own_folder(numbered, ("1_01.png", "1_02.png", "2_01.png", "2_02.png")), n=4)
+    assert init(monkeypatch, numbered) == 0
+    assert "look ('{view}_*'), put those of each" in " ".join(capsys.readouterr().out.split())
+    assert {view for view, *_ in pairs(numbered)} == {"c1"}
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
@@ -243,6 +275,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
     (FLAT, {}, ("--camera", "c1=a.yaml", "--camera", "c1=b.yaml"), ("c1=a.yaml", "c1=b.yaml")),
     (FLAT, {}, ("--camera", str(HEXAPOD / "camera_info.yaml")), ("IMG_2.JPG", "64 x 48", "1024")),
+    (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),
     (FLAT, {}, ("--encoder-sigma", "5m"), ("5 m", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "50mm"), ("50 mm", "20% of the travel", "--encoder-sigma")),
     (FLAT, {}, ("--encoder-sigma", "0um"), ("'0um'", "--encoder-sigma")),

@@ -42,10 +42,33 @@ def test_a_reading_moves_the_platform_and_no_other_motor(name: str) -> None:
         np.testing.assert_allclose(q[list(machine.motors)], wanted[list(machine.motors)], atol=1e-9)
 
 
-def test_a_machine_without_motors_stays_at_home(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", MODELS)
+def test_a_coordinate_of_the_pose_moves_the_legs_and_no_other_coordinate(name: str) -> None:
+    machine = load_mechanism(name)
+    motion = Motion(machine)
+    assert len(motion.columns) == machine.mobility
+    for k, which in enumerate(motion.columns.tolist()):
+        before = motion.coordinates
+        before[k] += 0.004 if which < 3 else 0.02
+        posture = motion.place(k, before[k])
+        assert not posture.problem
+        np.testing.assert_allclose(motion.coordinates, before, atol=1e-9)
+        np.testing.assert_allclose(inverse_kinematics(machine, posture.T), posture.q, atol=1e-9)
+    j = machine.motors[0]
+    there = motion.posture.q
+    motion.read(j, there[j] + 0.002)  # on from there, not from home
+    np.testing.assert_allclose(
+        motion.posture.q[list(machine.motors[1:])], there[list(machine.motors[1:])], atol=1e-9
+    )
+
+
+def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
     spec = of_types(["US"] * 6, ["passive"] * 6)
     motion = Motion(load_mechanism(write_machine(tmp_path, spec, Layout())))
     assert "Readings do not move it" in motion.read(0, 0.1).problem
+    z = motion.posture.T.translation[2]
+    assert not motion.place(2, z + 0.01).problem
+    assert abs(motion.posture.T.translation[2] - z - 0.01) < 1e-9
     assert "Readings do not give the pose" in motion.show(motion.posture.q).problem
 
 

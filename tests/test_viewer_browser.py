@@ -77,6 +77,11 @@ def test_sliders_move_the_machine(browser: Any) -> None:
         there = after.T.apply(server.source.machine.B_platform)
         _wait(lambda: np.allclose([line[1] for line in _drawn(browser)], there, atol=1e-6) or B)
         assert "At the end of the travel: leg2" in browser.find_element("css selector", "body").text
+        _press(browser, "x2", Keys.ARROW_LEFT)
+        _wait(lambda: server.motion.posture.T.translation[2] < after.T.translation[2] - 1e-6)
+        np.testing.assert_allclose(
+            server.motion.posture.T.translation[:2], after.T.translation[:2], atol=1e-9
+        )
         browser.find_element("css selector", "form[data-moves] button").click()
         _wait(lambda: np.allclose(server.motion.posture.q, before.q))
         assert errors(browser) == []

@@ -13,7 +13,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime
+from datetime import date, datetime, time
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -66,12 +66,15 @@ def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | N
     return times if 2 * n_moments > measurements.n_poses else None
 
 
-def moment_of(text: str) -> datetime | None:
-    """Return the time in a text: ISO 8601, or as EXIF writes it."""
+def moment_of(text: str, day: date | None = None) -> datetime | None:
+    """Return the time in a text: ISO 8601, as EXIF writes it, or of the day alone."""
+    text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
     try:
-        return datetime.fromisoformat(_EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)).replace(
-            tzinfo=None
-        )
+        return datetime.fromisoformat(text).replace(tzinfo=None)
+    except ValueError:
+        pass
+    try:
+        return None if day is None else datetime.combine(day, time.fromisoformat(text))
     except ValueError:
         return None
 

@@ -25,7 +25,9 @@ from legcal.data.photograph_matching import (
     Photograph,
     Row,
     find_photographs,
+    likely_pattern,
     match,
+    with_likely_views,
 )
 from legcal.data.reading_units import are_commands, default_unit, sigma_in, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
@@ -60,10 +62,6 @@ _EXAMPLE_FILES = (
 MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 2.5e-6  # [mean leg lengths] minimum default noise of readings
-_ALL_ONE_VIEW = (
-    f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places, put those "
-    "of each place in a folder, or add a column view."
-)
 _CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
 
 
@@ -239,9 +237,15 @@ def plan_new_dataset(
     machine = load_mechanism(model)
     _check_place(folder, destination)
     photographs = find_photographs(folder)
+    by_names, pattern = with_likely_views(photographs)
     sheet = ReadingsSheet(path, machine, "photograph")
+    named = {view.casefold() for view in sheet.text("view") if view}
+    if named <= {photograph.folder.casefold() for photograph in by_names}:
+        photographs = by_names
+    else:
+        pattern = None  # the table names other views
     sheet_readings = sheet.readings(options.unit, lengths=options.lengths)
-    texts = (sheet.text(name) for name in ("image", "view"))
+    texts = (sheet.text(name) for name in ("image", "view", "time"))
     rows = tuple(itertools.starmap(Row, zip(sheet.where, *texts, strict=True)))
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
@@ -249,7 +253,7 @@ def plan_new_dataset(
     sigma, sigma_notes = _sigmas(
         options.encoder_sigma, sheet.motors, sheet_readings, MIN_SIGMA * machine.size
     )
-    one_view = set(view_of) == {ONE_VIEW} and not any(row.view for row in rows)
+    views_stated = any(row.view for row in rows)
     return NewDataset(
         machine=machine,
         model=_model_name(model, machine, destination),
@@ -270,7 +274,7 @@ def plan_new_dataset(
             *matching.notes,
             *sigma_notes,
             *_made_notes(cameras, made),
-            *([_ALL_ONE_VIEW] * one_view),
+            *([] if views_stated else _view_notes(pattern, matching, view_of)),
         ),
         made_cameras={path: text for path, (_, text) in made.items()},
     )
@@ -287,6 +291,23 @@ def _made_notes(
             f"of its photographs, {camera.K[0, 0]:.0f} px, taken as good to "
             f"{100 * FOCAL_SIGMA:.0f} %: calibrate estimates it with the machine; calibrate the "
             "camera with legcal camera for a result that does not depend on it."
+        )
+
+
+def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str]) -> Iterator[str]:
+    """Yield a note on the views where no column names them, and on alternatives."""
+    if pattern is not None:
+        yield (
+            f"Views {few(list(dict.fromkeys(view_of)))} are taken from the names of the "
+            f"photographs, '{pattern}': if that is not where the camera stood, add a column view, "
+            "or put the photographs of each place in a folder."
+        )
+    elif set(view_of) == {ONE_VIEW}:
+        likely = likely_pattern([photograph for _, photograph in matching.pairs])
+        looks = f" as the names of the files look ('{likely}')," if likely else ""
+        yield (
+            f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places,"
+            f"{looks} put those of each place in a folder, or add a column view."
         )
 
 

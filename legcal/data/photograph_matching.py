@@ -1,9 +1,9 @@
-"""Match photographs to the rows of a table by name or order.
+"""Match photographs to the rows of a table by name, time or order.
 
 Names are compared in the strictest way that matches every row: the file name, the name without its
 extension, the last number of the name. Their case only breaks ties, and among files of equal name
-the folders decide. Without names, rows and photographs are matched in order (numbers in names count
-as numbers).
+the folders decide. Without names, times are compared; without times, rows and photographs are
+matched in order (numbers in names count as numbers).
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.image_choice import moment_of
@@ -30,6 +31,8 @@ from legcal.vision.image_file import (
 )
 
 MAX_PHOTOGRAPHS = 50_000
+MAX_VIEWS = 12  # maximum number of views guessed from names of photographs
+_SEPARATORS = " _-."
 _NUMBERS = re.compile(r"(\d+)", re.ASCII)
 
 
@@ -39,11 +42,16 @@ class Photograph:
 
     path: Path
     name: str  # relative to that folder, with "/"
+    view: str = ""  # from a pattern of names
+    label: str = ""  # rest of the name without the view
 
     @property
     def folder(self) -> str:
-        """Its folder, that of one view, relative to the folder of photographs or "."."""
-        return PurePosixPath(self.name).parent.as_posix()
+        """The group of photographs of one view: the view in the name, else the folder.
+
+        The folder is relative to the folder of photographs, "." for that folder itself.
+        """
+        return self.view or PurePosixPath(self.name).parent.as_posix()
 
 
 @dataclass(frozen=True)
@@ -53,6 +61,7 @@ class Row:
     where: Place
     image: str
     view: str
+    time: str
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,53 @@ class Matching:
     pairs: tuple[tuple[int, Photograph], ...]  # in the order of views and rows
     how: str  # method of matching, in words
     notes: tuple[str, ...] = ()
+
+
+_VIEW_FIRST = {"{view}_*": "_", "{view}-*": "-"}  # patterns of names, and the mark beside the view
+_VIEW_LAST = {"*_{view}": "_", "*-{view}": "-"}
+
+
+def _with_view(photograph: Photograph, pattern: str) -> Photograph:
+    """Return a photograph with the view in its name, "" if it has another form."""
+    stem = PurePosixPath(photograph.name).stem
+    if pattern in _VIEW_FIRST:
+        view, mark, label = stem.partition(_VIEW_FIRST[pattern])
+    else:
+        label, mark, view = stem.rpartition(_VIEW_LAST[pattern])
+    return replace(photograph, view=view if mark else "", label=label.strip(_SEPARATORS))
+
+
+def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
+    """Return photographs with the views in their names, and the pattern of names.
+
+    They are unchanged and the pattern is None where names do not follow a pattern or where folders
+    name the views. Numbers are not accepted as names of views.
+    """
+    pattern = likely_pattern(photographs)
+    if pattern is None or any(photograph.folder != "." for photograph in photographs):
+        return list(photographs), None
+    with_views = [_with_view(photograph, pattern) for photograph in photographs]
+    if all(photograph.view.isdecimal() for photograph in with_views):
+        return list(photographs), None
+    return with_views, pattern
+
+
+def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
+    """Return a pattern that splits names in one folder into several views of equal size.
+
+    Patterns with words as views are preferred to numbers, and then patterns with few views.
+    """
+    likely: list[tuple[bool, int, int, str]] = []
+    for k, pattern in enumerate((*_VIEW_FIRST, *_VIEW_LAST)):
+        labels: dict[str, set[str]] = {}
+        for photograph in photographs:
+            named = _with_view(photograph, pattern)
+            labels.setdefault(named.view, set()).add(named.label)
+        sizes = {len(of_view) for of_view in labels.values()}
+        if "" not in labels and 1 < len(labels) <= MAX_VIEWS and len(sizes) == 1 < max(sizes):
+            are_numbers = all(view.isdecimal() for view in labels)
+            likely.append((are_numbers, len(labels), k, pattern))
+    return min(likely)[-1] if likely else None
 
 
 def find_photographs(folder: Path) -> list[Photograph]:
@@ -112,7 +168,7 @@ def in_order(name: str) -> tuple[object, ...]:
 
 
 def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
-    """Match photographs to rows: by name, else in order.
+    """Match photographs to rows: by name, else by time, else in order.
 
     *photographs* are in the order of their names; *table* is for messages.
 
@@ -123,6 +179,8 @@ def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) ->
     """
     if any(row.image for row in rows):
         matching = _by_name(rows, photographs, table)
+    elif any(row.time for row in rows):
+        matching = _by_time(rows, photographs, table)
     else:
         matching = _in_order(rows, photographs, table)
     used = {photograph.name for _, photograph in matching.pairs}
@@ -198,7 +256,8 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
             continue
         by_key: dict[str, list[Photograph]] = {}
         for photograph in photographs:
-            by_key.setdefault(key(photograph.name), []).append(photograph)
+            for text in {key(photograph.name), *([key(photograph.label)] * bool(photograph.view))}:
+                by_key.setdefault(text, []).append(photograph)
         matches = {}
         for k in named:
             same_key = by_key.get(key(rows[k].image), [])
@@ -337,7 +396,7 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
             notes.append(
                 f"The photographs of {name} were not taken in the order of their names, as their "
                 "EXIF times say; see that the rows are in the order of the names, or add a column "
-                "image."
+                "image or time."
             )
         pairs += zip(members, inside, strict=True)
     return Matching(tuple(pairs), method, tuple(notes))
@@ -349,3 +408,51 @@ def photograph_time(photograph: Photograph) -> datetime | None:
         return moment_of(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
     except OSError:
         return None
+
+
+def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+    """Give each row the photograph taken nearest to its time.
+
+    Clocks may differ by a constant where there are as many photographs as rows.
+    """
+    taken = {p.name: when for p in photographs if (when := photograph_time(p)) is not None}
+    dated = sorted((p for p in photographs if p.name in taken), key=lambda p: taken[p.name])
+    if len(dated) < len(rows):
+        raise DatasetError(
+            f"{table}: the photographs could not be matched by time: found {len(dated)} "
+            f"photographs with a time in their EXIF data for {len(rows)} rows, needed as many or "
+            "more; copy the files from the camera as they are, add a column image, or remove the "
+            "column time to match rows and photographs in order."
+        )
+    day = taken[dated[0].name].date()
+    times = [moment_of(row.time, day) for row in rows]
+    bad = [
+        f"{row.where}, column time: the time could not be read: found {describe(row.time)}, needed "
+        "one such as 2026-11-23 10:15:00; correct the cell."
+        for row, when in zip(rows, times, strict=True)
+        if when is None
+    ]
+    if bad:
+        raise DatasetError(bad)
+    moments = [when for when in times if when is not None]
+    order = sorted(range(len(rows)), key=lambda k: moments[k])
+    gaps = [moments[b] - moments[a] for a, b in pairwise(order)]
+    least = min(gaps, default=timedelta(days=1))
+    shift = timedelta()
+    if len(dated) == len(rows):
+        apart = [taken[p.name] - moments[k] for k, p in zip(order, dated, strict=True)]
+        shift = sorted(apart)[len(apart) // 2]
+        pairs = dict(zip(order, dated, strict=True))
+    else:
+        pairs = {k: min(dated, key=lambda p: abs(taken[p.name] - moments[k])) for k in order}
+    worst = max(abs(taken[p.name] - moments[k] - shift) for k, p in pairs.items())
+    if len({p.name for p in pairs.values()}) < len(rows) or 2 * worst >= least:
+        raise DatasetError(
+            f"{table}: the photographs could not be matched by time: found times up to "
+            f"{worst.total_seconds():.0f} s apart and rows {least.total_seconds():.0f} s apart, "
+            "needed less than half of that; leave out photographs without a row, so that a "
+            "difference of the clocks shows, or add a column image."
+        )
+    about = f", clocks {shift.total_seconds():+.0f} s apart" if shift else ""
+    matches = [(k, [p]) for k, p in sorted(pairs.items())]
+    return Matching(_sorted(rows, matches), f"by time, within {worst.total_seconds():.0f} s{about}")

@@ -44,7 +44,7 @@ def matching_table(new: NewDataset) -> Report:
     rows = [
         (
             str(k + 1),
-            new.rows[k].image,
+            new.rows[k].image or new.rows[k].time,
             photograph.name,
             view,
             f"{size * new.readings.q[k, 0]:z.3f}",

@@ -1,7 +1,8 @@
-"""The posture of the machine, moved by readings.
+"""The posture of the machine, moved by readings or by independent platform coordinates.
 
-They move the closed chain, each step from the last (``Follower``). After a motion that is not
-possible the machine is unchanged, with the reason in words.
+Readings move the closed chain, each step from the last (``Follower``); a pose is met exactly and
+the legs follow. After a motion that is not possible the machine is unchanged, with the reason in
+words.
 """
 
 from __future__ import annotations
@@ -12,12 +13,18 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError
+from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
+from legcal.machine.closing import coordinates_of, independent_coordinates, poses_at_coordinates
 from legcal.machine.kinematics import Follower, followed_poses
-from legcal.machine.model import Machine, joint_values, readings_at
+from legcal.machine.model import Machine, joint_values, readings_at, readings_at_poses
 from legcal.machine.redundancy import consistent_readings
 
 _AT_END = 2.5e-6  # distance from the end of a travel that counts as none, in mean leg lengths
+_TICKS = 40  # steps of the search for the range of a coordinate, on either side of home
+_TURN = 0.5 * np.pi  # range of an angle that no travel limits [rad]
+_WAY = 1.0  # range of a position that no travel limits, in leg lengths
+_BEYOND = 1.15  # range of a coordinate, relative to the range within the travel of legs
 _STROKE = 0.5  # range of a motor without travel, in leg lengths
 _LEAST_SHARE = 1e-6  # least share of a reading that the freedoms of the platform change
 
@@ -38,12 +45,15 @@ class Motion:
     ----------
     machine : Machine
         The machine.
+    columns : (m,) array of int
+        Independent coordinates of the platform, as indices of x, y, z, roll, pitch, yaw.
     posture : Posture
         The current posture.
     """
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
+        self.columns = independent_coordinates(machine)
         self._follower = Follower(machine) if machine.is_determined else None
         self.posture = self.home()
 
@@ -53,6 +63,12 @@ class Motion:
         if self._follower is not None:
             self._follower.configuration = self.machine.home_configuration
         return self._stand(T, self._values(T))
+
+    @property
+    def coordinates(self) -> Array:
+        """The independent coordinates of the pose, (m,) [m, rad]."""
+        values, _ = coordinates_of(self.posture.T.as_matrix()[None, :3])
+        return np.asarray(values[0, self.columns])
 
     @property
     def at_end(self) -> BoolArray:
@@ -77,6 +93,29 @@ class Motion:
         travel = self.travel
         free = ~np.isfinite(travel) | (np.ptp(travel, axis=1) <= 0.0)[:, None]
         return np.where(free, about + stroke * np.array([-1.0, 1.0]), travel)
+
+    def ranges_of_coordinates(self) -> Array:
+        """Return the range of each independent coordinate, (m, 2) [m, rad].
+
+        With the others at home, it extends slightly beyond the travel of the legs.
+        """
+        machine, home = self.machine, self.machine.home.as_matrix()[:3]
+        centre = coordinates_of(home[None])[0][0, self.columns]
+        scale = machine.size
+        lower, upper = self.travel.T
+        ranges = np.zeros((len(self.columns), 2))
+        for k, which in enumerate(self.columns.tolist()):
+            most = _WAY * scale if which < 3 else _TURN
+            for side, sign in enumerate((-1.0, 1.0)):
+                steps = sign * most * np.arange(1, _TICKS + 1) / _TICKS
+                wanted = np.repeat(centre[None], _TICKS, axis=0)
+                wanted[:, k] += steps
+                poses, reached = poses_at_coordinates(machine, self.columns, wanted, home)
+                q = readings_at_poses(machine, poses)
+                inside = reached & (((q >= lower) & (q <= upper)) | ~self._slides).all(axis=1)
+                last = int(np.argmin(inside)) if not inside.all() else _TICKS
+                ranges[k, side] = centre[k] + _BEYOND * steps[max(last - 1, 0)]
+        return ranges
 
     def read(self, leg: int, value: float) -> Posture:
         """Move a motor to a reading [m], the others unchanged, and return the posture.
@@ -107,6 +146,16 @@ class Motion:
         except LegcalError as error:
             return self._stay(str(error))
         return self._stand(T, joint_values(self.machine, self._follower.configuration))
+
+    def place(self, coordinate: int, value: float) -> Posture:
+        """Move one independent coordinate to a value [m, rad], and return the posture."""
+        wanted = self.coordinates
+        wanted[coordinate] = value
+        near = self.posture.T.as_matrix()[:3]
+        poses, reached = poses_at_coordinates(self.machine, self.columns, wanted[None], near)
+        if not reached[0]:
+            return self._stay("The joints of the legs allow no pose with these coordinates.")
+        return self._follow(motion_of(poses[0, :, :3], poses[0, :, 3]))
 
     def show(self, q: Array) -> Posture:
         """Move to readings (n_legs,) [m] of a session, from any posture, and return the posture."""

@@ -18,6 +18,7 @@ import numpy as np
 from legcal.errors import LegcalError, printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
+from legcal.machine.closing import COORDINATES
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.parameters import geometries
 from legcal.pages.document import Page, Scene, Section, Sliders, page_html, time_of_page
@@ -122,7 +123,7 @@ class ViewServer(PageServer):
     # The sliders
 
     def _sliders(self) -> dict[str, _Slider]:
-        """Return the sliders by name: the pose of the session, and readings."""
+        """Return the sliders by name: the pose of the session, readings, coordinates."""
         motion, machine, sliders = self.motion, self.source.machine, dict[str, _Slider]()
         if n := len(self._photographs.poses):
             ends = np.array([1.0, n])
@@ -139,10 +140,22 @@ class ViewServer(PageServer):
                     partial(self._reading, j),
                     partial(motion.read, j),
                 )
+        for k, ends in enumerate(motion.ranges_of_coordinates()):
+            which = int(motion.columns[k])
+            sliders[f"x{k}"] = _Slider(
+                COORDINATES[which],
+                "m" if which < 3 else "rad",
+                ends,
+                partial(self._coordinate, k),
+                partial(motion.place, k),
+            )
         return sliders
 
     def _reading(self, leg: int) -> float:
         return float(self.motion.posture.q[leg])
+
+    def _coordinate(self, k: int) -> float:
+        return float(self.motion.coordinates[k])
 
     def _show_pose(self, value: float) -> None:
         """Move to a pose of the session."""

@@ -1,4 +1,4 @@
-"""Camera files of ROS, OpenCV, Kalibr, mrcal and COLMAP: read and written.
+"""Camera files of ROS, OpenCV, Kalibr, mrcal, COLMAP, Basalt and MATLAB: read and written.
 
 ``_FORMATS`` lists the forms of mappings that are read, ``PARAMETERS`` the lens models of programs
 that list all numbers of a camera in one row. Files are written for datasets as ROS has them, and
@@ -169,6 +169,43 @@ class MrcalEntry(_OpenSchema):
     imagersize: Size
 
 
+class BasaltCamera(_OpenSchema):
+    """One camera of a calibration of Basalt."""
+
+    camera_type: str
+    intrinsics: dict[str, float]
+
+
+class BasaltEntry(_OpenSchema):
+    """The cameras of a calibration of Basalt."""
+
+    intrinsics: Annotated[list[BasaltCamera], Field(min_length=1)]
+    resolution: Annotated[list[Size], Field(min_length=1)]
+
+
+def _as_3x3(rows: object) -> object:
+    """Refuse what is not three rows of three entries."""
+    lists = rows if isinstance(rows, list) else []
+    if [len(row) if isinstance(row, list) else 0 for row in lists] != [3, 3, 3]:
+        raise BadValue(
+            describe(rows), "three rows of three numbers", "copy the matrix from the calibration"
+        )
+    return rows
+
+
+_Rows = Annotated[list[list[float]], BeforeValidator(_as_3x3)]
+
+
+class MatlabEntry(_OpenSchema):
+    """The struct of MATLAB's camera parameters, as ``jsonencode`` writes it."""
+
+    ImageSize: Size  # rows, columns
+    RadialDistortion: Annotated[list[float], Field(min_length=2, max_length=3)]
+    TangentialDistortion: Annotated[list[float], Field(min_length=2, max_length=2)]
+    K: _Rows | None = None
+    IntrinsicMatrix: _Rows | None = None  # the transpose of K, before R2022b
+
+
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
 _OPENCV_KEYS = {
     "image_width": ("image_width", "image_Width"),
@@ -205,6 +242,11 @@ PARAMETERS: Mapping[str, Mapping[str, tuple[DistortionModel, str]]] = {
         "OPENCV_FISHEYE": ("equidistant", _FISHEYE),
         "SIMPLE_RADIAL_FISHEYE": ("equidistant", "f cx cy k1"),
         "RADIAL_FISHEYE": ("equidistant", "f cx cy k1 k2"),
+    },
+    "Basalt": {
+        "pinhole": ("plumb_bob", _PINHOLE),
+        "pinhole-radtan8": ("rational_polynomial", f"{_OPENCV4} k3 k4 k5 k6"),
+        "kb4": ("equidistant", _FISHEYE),
     },
 }
 _SIGMAS = (1e-12, 1e6)  # plausible standard deviations of an intrinsic [px, or none]
@@ -345,20 +387,20 @@ def _covariance_problem(
         return f"{len(rows)} rows that are not {n} of {n} numbers for distinct names"
     C = np.array(rows).reshape(n, n)
     variance = np.diagonal(C)
-    wrong = (variance != 0.0) & ~((variance >= least**2) & (variance <= most**2))
-    if wrong.any():
-        i = int(np.argmax(wrong))
+    is_exact = variance == 0.0
+    implausible = ~is_exact & ~((variance >= least**2) & (variance <= most**2))
+    if implausible.any():
+        i = int(np.argmax(implausible))
         return f"the variance {variance[i]:g} of {names[i]}, no square of {least:g} to {most:g}"
     deviation = np.sqrt(variance)
-    exact = np.flatnonzero(variance == 0.0)
-    scale = np.where(variance == 0.0, 1.0, deviation)
-    correlation = np.clip(C / np.outer(scale, scale), -2.0, 2.0)
-    if (
-        np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING
-        or np.linalg.eigvalsh(correlation).min(initial=0.0) < -_ROUNDING
-        or C[exact].any()
-    ):
-        return "a matrix that is not symmetric and positive semidefinite"
+    bound = (1.0 + _ROUNDING) * np.outer(deviation, deviation)
+    scale = np.where(is_exact, 1.0, deviation)
+    correlation = np.clip(C, -2.0 * bound, 2.0 * bound) / np.outer(scale, scale)
+    if np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
+        return "a matrix that is not symmetric"
+    least_eigenvalue = float(np.linalg.eigvalsh(correlation).min(initial=0.0))
+    if np.any(np.abs(C) > bound) or least_eigenvalue < -_ROUNDING:
+        return "a matrix that is not positive semidefinite"
     for name, s in zip(names, deviation.tolist(), strict=True):
         if abs(sigma.get(name, s) - s) > _SIGMA_DIGITS * s:
             return f"the standard deviation {s:g} of {name}, unlike {sigma[name]:g} in sigma"
@@ -453,6 +495,32 @@ def _from_colmap(document: Mapping[str, Any], path: Path) -> Camera:
             "COLMAP's cameras.txt."
         )
     return _of_parameters(path, "COLMAP", lens, values[2:], (size[0], size[1]), first_pixel=0.5)
+
+
+def _from_basalt(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the only camera of a calibration of Basalt."""
+    entry = validate(BasaltEntry, document["value0"], path, "value0")
+    _only([f"camera {k}" for k in range(len(entry.intrinsics))], path)
+    camera = entry.intrinsics[0]
+    names = PARAMETERS["Basalt"].get(camera.camera_type, ("", ""))[1].split()
+    parameters = [camera.intrinsics[name] for name in names if name in camera.intrinsics]
+    return _of_parameters(path, "Basalt", camera.camera_type, parameters, entry.resolution[0])
+
+
+def _from_matlab(document: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of MATLAB's struct: its first pixel is (1, 1)."""
+    entry = validate(MatlabEntry, document, path)
+    transposed = None if entry.IntrinsicMatrix is None else np.transpose(entry.IntrinsicMatrix)
+    by_rows = transposed if entry.K is None else np.array(entry.K)
+    if by_rows is None:
+        raise DatasetError(
+            f"{path}: K could not be read: found no such key, needed it; add 'K: ...' to the file."
+        )
+    K = by_rows - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    height, width = entry.ImageSize
+    k1, k2, *k3 = entry.RadialDistortion
+    coefficients = [k1, k2, *entry.TangentialDistortion, *(k3 or [0.0])]
+    return _checked(path, K, (width, height), "plumb_bob", coefficients)
 
 
 def _of_parameters(
@@ -665,6 +733,7 @@ _Reader = Callable[[Mapping[str, Any], Path], Camera]
 _FORMATS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], _Reader], ...] = (
     ("COLMAP's cameras.txt", lambda d: "colmap" in d, _from_colmap),
     ("mrcal's .cameramodel", lambda d: "lensmodel" in d, _from_mrcal),
+    ("a calibration of Basalt", lambda d: isinstance(d.get("value0"), dict), _from_basalt),
     (
         "a Kalibr camchain (cam0: camera_model, ...)",
         lambda d: _is_kalibr(d) or any(map(_is_kalibr, d.values())),
@@ -675,6 +744,7 @@ _FORMATS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], _Reader], ...] =
         lambda d: "k" in d or ("K" in d and "D" in d),
         _from_message,
     ),
+    ("MATLAB's struct as JSON", lambda d: "RadialDistortion" in d, _from_matlab),
     (
         "a ROS camera_info or an OpenCV FileStorage (camera_matrix, ...)",
         lambda d: "camera_matrix" in d or "image_width" in d,
