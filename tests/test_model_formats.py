@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_formats import FORMATS, with_loops_at_joints, write_format
+from model_formats import FORMATS, write_format
 from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
@@ -70,19 +70,6 @@ def test_every_format_gives_the_same_analysis(name: str, machine: str, tmp_path:
     if not name.startswith("mjcf"):  # these have no pose where they are closed
         found = replace(found, home=expected.home)
     assert_same_analysis(found, expected)
-
-
-@pytest.mark.parametrize(
-    ("machine", "tag"),
-    [("3-rpr", "loop_joint"), ("3-rpr", "constraint"), ("3-upu", "constraint")],
-)
-def test_loops_are_closed_by_revolute_and_universal_joints(
-    machine: str, tag: str, tmp_path: Path
-) -> None:
-    expected = machine_of(machine)
-    path = tmp_path / "machine.urdf"
-    path.write_text(with_loops_at_joints(expected, tag))
-    assert_same_analysis(replace(load_mechanism(path), home=expected.home), expected)
 
 
 @pytest.mark.parametrize("name", ["mjcf sites", "loop_joint", "gepetto"])
@@ -211,7 +198,7 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
     root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), XmlProblems(path)
     reader = MjcfReader(root, problems)
     reader.read_bodies()
-    pairs = [close_loop(loop, reader.tree, reader.poses)[0] for loop in reader.loops()]
+    pairs = [close_loop(loop, reader.tree)[0] for loop in reader.loops()]
     problems.raise_if_any()
     chain = ClosedChain(reader.tree.robot("machine").decode(), [])
     q = chain.neutral()

@@ -126,25 +126,6 @@ class Distance(Document):
     dE_rad: NotNegative
 
 
-class ComparedJoint(Document):
-    """The centre of a joint in two models, in the link of the first [m]."""
-
-    leg: str
-    xyz: Triple
-    reference: Triple  # its R_b or R_e laid on that of the model
-    difference: Triple
-    defined: list[bool]  # coordinates x, y, z that agree by the definition of the frame
-    defines: FrameMark | None
-
-
-class ComparedLink(Document):
-    """The joints of two models on base or platform, R_b or R_e of the reference on the model's."""
-
-    link: str  # of the model
-    frames_apart: Distance  # of the frames, each in the link of its own model
-    joints: list[ComparedJoint]
-
-
 class WeakCombination(Document):
     """A combination of parameters that is known badly."""
 
@@ -557,15 +538,6 @@ class ComparedParameter(Document):
     difference: float
 
 
-class UnreachedRow(Document):
-    """A row of ``measurements.csv`` whose readings a model does not reach."""
-
-    row: int  # counted from 1, without the header
-    view: str
-    image: str  # what other tables call it where it has none
-    by: list[Literal["model", "reference"]]  # who does not reach it
-
-
 class EvaluationDocument(SparseDocument):
     """What ``legcal evaluate --json`` prints; null where no pose is compared."""
 
@@ -574,8 +546,5 @@ class EvaluationDocument(SparseDocument):
     dX_max_m: float | None
     poses: int  # that are compared
     left_out: int  # poses that are not, since one of the models does not reach them
-    unreached: list[UnreachedRow]  # the rows of these
-    # Of the readings of a dataset by model and reference; left out where these cannot disagree
-    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None = None
+    unreached: list[int]  # the rows of these, counted from 1
     parameters: list[ComparedParameter]
-    links: dict[Link, ComparedLink]

@@ -1,6 +1,7 @@
 """The table of a machine: YAML or CSV, read strictly, lengths in its stated unit.
 
-A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`). Common headings
+A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`), which alone can
+describe motors that carry rods. Common headings
 are understood, in three layouts: a row for each leg (``bx by bz px py pz``, ``base_x``,
 ``x_base``), a row with all joints (``B1x``), and a row for each joint (``B1, x, y, z``, or side
 and number in two columns; headings are optional there). If both A and B occur they are base and
@@ -504,9 +505,9 @@ def _wrong_actuators(file: TableFile, source: str) -> list[str]:
         elif (motor is None) is not (type_.actuator is None):
             on = "no motor that it hangs on" if motor is None else f"it on '{motor}'"
             problems.append(
-                f"{where}: found {on} and the type {type_}, needed actuators and hangs_on for "
-                "types that begin with the motor of a rod (PSS, RSS, PRS), and for no others; "
-                "correct them."
+                f"{where}: found {on} and the type {type_}, needed actuators and hangs_on (of a "
+                "table in YAML) for types that begin with the motor of a rod (PSS, RSS, PRS), and "
+                "for no others; correct them."
             )
         elif motor is not None and actuators[motor].turns is not (
             type_.actuator is ActuatorKind.REVOLUTE
@@ -813,7 +814,7 @@ _OTHER = {
     "tube": ("tube", "tuberadius"),
     "rod": ("rod", "rodradius"),
 }
-_NOT_LENGTHS = ("deg", "us", "-")  # units of other columns
+_NOT_LENGTHS = ("deg", "-")  # units of other columns
 _POINT = ("point", "joint", "name", "id", "label")
 _WORDS = "|".join(sorted([*SIDES["base"], *SIDES["platform"], "b"], key=len, reverse=True))
 _COORDINATE = re.compile(rf"({_WORDS})(?:joints?|points?)?(\d*)([xyz])(\d*)")
@@ -821,20 +822,16 @@ _COORDINATE_FIRST = re.compile(rf"([xyz])({_WORDS})(\d*)")
 _NAMED = re.compile(rf"({_WORDS})(?:joints?|points?|legs?)?0*(\d{{1,3}})")
 _XYZ = ("x", "y", "z")
 _RADII = ("radius", "tube", "rod")
-_AT_HOME = {"home_reading": "home_readings", "home_reading_deg": "home_readings_deg"}
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
     *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
-    *(f"{vector}_{i}" for vector in ("direction", "point", "axis") for i in _XYZ),
-    *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
-    *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
 )
 COLUMNS = (
     *(
         Column(name, "text", required=False)
-        for name in ("leg", "type", "kind", "unit", "hangs_on", "platform_in")
+        for name in ("leg", "type", "kind", "unit", "platform_in")
     ),
     *(
         Column(
@@ -872,8 +869,6 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         table.refuse(row, conflict, "one of them", *_RADII, remedy=remedy, what="radius")
     table.check()
     cells = _Cells(table)
-    hangs_on = cells.texts("hangs_on")
-    motors = _motors(table, cells, hangs_on)
     document: dict[str, Any] = {
         "legcal_table": 1,
         "name": path.stem,
@@ -882,11 +877,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "types": cells.texts("type") if "type" in table else None,
         "base_joints": cells.points("base"),
         "platform_joints": cells.points("platform"),
-        # The travel of a leg carried by a motor is the travel of the motor.
-        "travel": [
-            travel if motor is None else None
-            for travel, motor in zip(cells.pairs("travel"), hangs_on, strict=True)
-        ],
+        "travel": cells.pairs("travel"),
         "radius": [
             {k: x for k, x in (("tube", tube), ("rod", rod)) if x is not None} or radius
             for radius, tube, rod in zip(*map(cells.numbers, _RADII), strict=True)
@@ -901,10 +892,8 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "max_length": cells.numbers("max_length"),
         "base_axes": cells.vectors("base_axis"),
         "platform_axes": cells.vectors("platform_axis"),
-        "hangs_on": hangs_on,
     }
-    document |= {key: of_legs for key, of_legs in optional.items() if _is_given(of_legs)}
-    return document | motors
+    return document | {key: of_legs for key, of_legs in optional.items() if _is_given(of_legs)}
 
 
 class _Cells:
@@ -930,48 +919,6 @@ class _Cells:
     def pairs(self, name: str) -> list[Any]:
         pairs = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
         return [None if pair == (None, None) else list(pair) for pair in pairs]
-
-
-def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict[str, Any]:
-    """Return the motors that carry legs, and their readings at home.
-
-    The numbers of a motor may be in any row of a leg that it carries, or in several.
-    """
-    columns = {
-        **{key: cells.vectors(key) for key in MOTIONS},
-        **{key: cells.pairs(key) for key in ("travel", "travel_deg", "travel_us")},
-        **{key: cells.numbers(key) for key in ("centre_us", "us_per_deg", "arm_radius", *_AT_HOME)},
-    }
-    motors = dict[str, dict[str, Any]]()
-    for row, motor in enumerate(hangs_on):
-        if motor is None:
-            continue
-        entry = motors.setdefault(motor, dict.fromkeys(columns))
-        for key, column in columns.items():
-            value = column[row]
-            if entry[key] is None:
-                entry[key] = value
-            elif value is not None and value != entry[key]:
-                table.refuse(
-                    row,
-                    f"another {key}",
-                    f"the same {key} in all rows of '{motor}'",
-                    "hangs_on",
-                    remedy="correct it, or leave it empty",
-                    what="hangs_on",
-                )
-    table.check()
-    if not motors:
-        return {}
-    actuators = {
-        name: {k: x for k, x in entry.items() if x is not None and k not in _AT_HOME}
-        for name, entry in motors.items()
-    }
-    readings = {
-        key: {name: entry[column] for name, entry in motors.items() if entry[column] is not None}
-        for column, key in _AT_HOME.items()
-    }
-    return {"actuators": actuators, **{key: stated for key, stated in readings.items() if stated}}
 
 
 def _shared(table: Table, name: str) -> str | None:

@@ -10,17 +10,14 @@ import numpy as np
 
 from legcal.calibration.identify.ranks import (
     Analysis,
-    expected_intrinsics,
     is_scale_open,
     n_open_with_radii,
     refusal_of_scale,
-    scale_sources,
     undetermined,
     weak_directions,
 )
 from legcal.calibration.identify.remedies import (
     find_remedies,
-    judge_board,
     recommend,
 )
 from legcal.calibration.identify.report import (
@@ -223,7 +220,6 @@ def identifiability_of_dataset(
     """
     analysis = replace(_analysis_of(dataset, choices), noise=noise)
     report = _report_on(dataset.machine, analysis, None, None)
-    report = report.model_copy(update={"intrinsics": expected_intrinsics(analysis)})
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
@@ -289,11 +285,7 @@ def _report_on(
 ) -> Identifiability:
     session = analysis.session
     conditions = _named_conditions(machine, session)
-    board = judge_board(
-        analysis,
-        *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
-    )
-    platform_board = judge_board(analysis, (), (), link="platform")
+    on_platform = np.unique(session.view[np.flatnonzero(session.platform_board)])
     full = analysis.full
     notes = []
     if analysis.motion.why_not:
@@ -317,13 +309,13 @@ def _report_on(
         identifiable=full.complete,
         views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
         images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
-        board=board,
-        platform_board=platform_board,
+        board=bool(session.board.all()),
+        platform_board=len(on_platform) == session.n_views,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
         remedies=() if full.complete else find_remedies(analysis, replanned),
         recommendation=recommendation,
         notes=tuple(notes),
-        scale=scale_sources(analysis) or None,
+        scale_is_open=bool(session.actuators) and is_scale_open(analysis),
         parts=analysis.parts or None,
         paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )

@@ -1,7 +1,7 @@
 """Remedies: the smallest sufficient sets of views, calibration boards, and other changes.
 
-Views are recommended by the paper's counts and the ranks. A calibration board is judged for every
-session; other remedies are candidates, tested by computing the ranks again.
+Views are recommended by the paper's counts and the ranks. Remedies are candidates, tested by
+computing the ranks again.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
-from legcal.calibration.identify.ranks import Analysis, missing, undetermined, weak_directions
+from legcal.calibration.identify.ranks import Analysis, missing, undetermined
 from legcal.calibration.identify.report import (
-    BoardRanks,
-    BoardReport,
     Recommendation,
     Remedy,
     WeakDirection,
@@ -32,12 +30,10 @@ from legcal.geometry.types import Array
 from legcal.machine.leg import JointType
 from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_words, list_in_words
-from legcal.paper.conditions import Condition, count_conditions, three_legs_at_once
-from legcal.vision.board import Link
+from legcal.paper.conditions import count_conditions, three_legs_at_once
 
 _MOST_VIEWS = 4
 _MOST_WINDOWS = 12  # tested views of one size, evenly around the base
-_COMPLEMENT = 1e-6  # least component outside the open space
 _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
@@ -165,61 +161,6 @@ class _Candidates:
         return self.of_size[size]
 
 
-def judge_board(
-    analysis: Analysis,  # of the session
-    # without, with_board: the paper's conditions without a board and with one in every view
-    without: Sequence[Condition],
-    with_board: Sequence[Condition],
-    *,
-    link: Link = "base",
-) -> BoardReport:
-    """Report the effect of a board on a link, whether the session has one or not."""
-    session = analysis.session
-    is_visible = session.board if link == "base" else session.platform_board
-    without_board = analysis.with_board(board=False, link=link) if is_visible.any() else analysis
-    with_boards = (
-        analysis if len(is_visible) and is_visible.all() else analysis.with_board(link=link)
-    )
-    views = (
-        np.flatnonzero(is_visible) if link == "base" else session.view[np.flatnonzero(is_visible)]
-    )
-    is_present = len(np.unique(views)) == session.n_views
-    needed = [
-        before.name
-        for before, after in zip(without, with_board, strict=True)
-        if before.fails and not after.fails
-    ]
-    if with_boards.full.complete and not without_board.full.complete:
-        needed.append("full")
-    return BoardReport(
-        present=is_present,
-        needed_for=tuple(needed),
-        without=_ranks(without_board),
-        with_board=_ranks(with_boards),
-        mends=_determined_by_board(without_board, with_boards),
-    )
-
-
-def _ranks(analysis: Analysis) -> BoardRanks:
-    return BoardRanks(analysis.full.rank, analysis.full.complete)
-
-
-def _determined_by_board(without_board: Analysis, with_boards: Analysis) -> tuple[str, ...]:
-    """Describe directions that move the platform and that only a board determines."""
-    open_before, open_after = (
-        undetermined(a.session, a.information) for a in (without_board, with_boards)
-    )
-    newly_determined = _complement(open_before, open_after)
-    directions = weak_directions(without_board.session, without_board.motion, newly_determined)
-    return tuple(d.direction for d in directions if not d.harmless)
-
-
-def _complement(space: Array, part: Array) -> Array:
-    """Orthonormal basis of the complement of a subspace (k, p) in a space (w, p)."""
-    _, singular, basis = np.linalg.svd(space - space @ part.T @ part, full_matrices=False)
-    return np.asarray(basis[singular > _COMPLEMENT])
-
-
 def find_remedies(
     analysis: Analysis,  # of the session
     # plans the session with another number of images a view; None for a recorded one
@@ -315,7 +256,7 @@ def _board(analysis: Analysis) -> Iterator[_Candidate]:
         yield text, analysis.with_board(), ()
     if not analysis.session.platform_board.any():
         text = "put a calibration board on the platform, visible to every camera"
-        yield text, analysis.with_board(link="platform"), ()
+        yield text, analysis.with_board("platform"), ()
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:

@@ -38,7 +38,7 @@ from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
     Sensitivity,
     WrongIntrinsic,
-    sensitivities,
+    sensitivity_to_cameras,
 )
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
@@ -274,7 +274,7 @@ def assemble_solution(
         },
         gammas=gammas,
         sensitivities=(
-            *sensitivities(cameras, normal, contradicted),
+            *sensitivity_to_cameras(cameras, normal, contradicted),
             *sensitivity_to_scale(problem, state, linear, kept),
         ),
         outlines=_with_rejections(outlines, fit),

@@ -45,6 +45,7 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import actuator_index, actuators_of, first_rods
 from legcal.machine.ties import Ties, independent, ties_of
+from legcal.machine.tolerance import PART_OF_TRAVEL
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
@@ -223,6 +224,8 @@ class FittedLegs:
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
     is_redundant: bool = False  # whether readings can contradict each other
+    # of the travel of all motors that slide alike, as a part of it
+    sigma_travel: float = PART_OF_TRAVEL
 
     @property
     def n_legs(self) -> int:
@@ -280,6 +283,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
         },
         machine.home_of_frames,
         machine.is_redundant,
+        machine.tolerance.travel or PART_OF_TRAVEL,
     )
 
 
