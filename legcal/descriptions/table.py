@@ -760,9 +760,9 @@ def _check_legs(described: Description, problems: Problems) -> None:
                     f"write null in {side}_axes",
                 )
             )
-    for some, *facts in lacking:
+    for some, found, needed, remedy in lacking:
         if some:
-            problems.add(_unused(legs_in_words([leg.name for leg in some])), *facts)
+            problems.add(_unused(legs_in_words([leg.name for leg in some])), found, needed, remedy)
     # Coincident legs, and joints that all coincide.
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
