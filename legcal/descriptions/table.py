@@ -762,8 +762,7 @@ def _check_legs(described: Description, problems: Problems) -> None:
             )
     for some, found, needed, remedy in lacking:
         if some:
-            named = legs_in_words([leg.name for leg in some])
-            problems.add(_unused(named), found, needed, remedy)
+            problems.add(_unused(legs_in_words([leg.name for leg in some])), found, needed, remedy)
     # Coincident legs, and joints that all coincide.
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
