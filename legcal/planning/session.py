@@ -7,13 +7,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
@@ -24,6 +23,7 @@ from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.quantities import mm_deg
 from legcal.data.dataset import PLAN_NAME, POSES_NAME
+from legcal.data.dataset_file import dataset_texts
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError
@@ -35,14 +35,12 @@ from legcal.files.folder import (
     result_folder,
 )
 from legcal.files.motions import Pose, motion_to_xyz_quat
-from legcal.files.published import with_schema
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import Document, Number, SparseDocument, Version
 from legcal.files.table import format_table
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
-from legcal.machine.files import DATASET_YAML
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, LaidBoard, Setting
@@ -53,7 +51,7 @@ from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 from legcal.vision.visibility import Seen
 
-CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
+CAMERA = "camera_info.yaml"
 HAND = "hand"  # the view of a hand-held camera
 PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 
@@ -142,30 +140,6 @@ def rough_view(
     if legs is not None and len(legs) < machine.n_legs:
         entry["legs"] = list(legs)
     return entry
-
-
-def dataset_texts(
-    machine: Machine,
-    model: str,  # path of its YAML in the dataset
-    views: Mapping[str, Any],
-    rows: Iterable[Sequence[Any]],  # of *columns* and readings
-    encoder_sigma: float | dict[str, float],
-    blocks: Mapping[str, Any],
-    columns: Sequence[str] = ("view", "image", "pose"),
-) -> dict[str, str]:
-    """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
-    document = {
-        "legcal_dataset": 1,
-        "mechanism": model,
-        "measurements": MEASUREMENTS,
-        "encoder_sigma": encoder_sigma,
-        "views": dict(views),
-        **blocks,
-    }
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    joints = [column.name for column in reading_columns(machine.legs)]
-    table = format_table([*columns, *joints], rows)
-    return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}
 
 
 def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
