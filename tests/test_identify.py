@@ -128,7 +128,6 @@ def test_the_document_is_that_of_the_report(
     assert document["paper"] == {"ok": found.conditions_hold}
     assert document["board"] is True
     assert document["views"] == [list(view) for view in VIEWS["halves"]]
-    assert document["recommendation"] is None
     assert found == report("halves", images=15, board=True)
 
 
@@ -151,9 +150,6 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     verdict = legcal.identifiability(loaded(name), chosen, 6)
     said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
     assert said in out
-    assert ("smallest sufficient sets of views" in out) == (not views)
-    if "  *" in out:
-        assert "whose own camera places and poses give the error below" in " ".join(out.split())
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:
@@ -171,7 +167,6 @@ def test_all_problems_of_views_are_refused_at_once() -> None:
 def test_a_dataset_is_judged_by_itself() -> None:
     found = identifiability_of_dataset(example())
     assert found.identifiable
-    assert found.recommendation is None
     assert (found.full.rank, sum(found.images)) == (30, example().measurements.n_rows)
 
 
