@@ -24,8 +24,8 @@ import legcal
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
-    ranks_of_dataset,
 )
+from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
@@ -212,7 +212,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
-        return ranks_of_dataset(two_images(), choices)[1].rank
+        return Analysis(recorded_session(two_images()), choices).full.rank
 
     alone = rank(Choices())
     assert rank(Choices(fixed=frozenset(names))) == 30

@@ -221,17 +221,6 @@ def identifiability_of_dataset(
     return report.model_copy(update={"notes": (*report.notes, note)})
 
 
-def ranks_of_dataset(
-    dataset: Dataset, choices: Choices = NO_CHOICES
-) -> tuple[tuple[ConditionBlock, ...], Ranks]:
-    """Return the paper's conditions and the rank of the joint fit for a dataset.
-
-    As :func:`identifiability_of_dataset`, without remedies.
-    """
-    analysis = _analysis_of(dataset, choices)
-    return _named_conditions(dataset.machine, analysis.session), analysis.full
-
-
 def _named_conditions(machine: Machine, session: Session) -> tuple[ConditionBlock, ...]:
     """Return the paper's conditions with the names of legs."""
     conditions = conditions_of(machine, session)
