@@ -230,8 +230,6 @@ class Plan:
     growth : (n, 2) array
         Numbers of images, and the criterion with that many, most useful images first; beyond the
         planned number, with copies of the planned images.
-    limits : dict
-        Sources of error that limit a plan: the criterion [m] without each of them.
     """
 
     machine: Machine
@@ -246,7 +244,6 @@ class Plan:
     names: tuple[str, ...]
     units: tuple[str, ...]
     growth: Array
-    limits: dict[str, float]
     seed: int = 0
     board: LaidBoard | None = None  # on the base, in every image
     hand_held: bool = False
@@ -331,7 +328,6 @@ class Plan:
             },
             parameters=[ExpectedSigma(name=n, sigma=sigma, unit=u) for n, sigma, u in rows],
             growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
-            limits=self.limits,
             notes=list(self.notes),
             parts=list(self.parts) or None,
         ).document()
@@ -412,7 +408,6 @@ class PlanDocument(SparseDocument):
     views: dict[str, ViewOfPlan]
     parameters: list[ExpectedSigma]
     growth: list[Growth]
-    limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
     parts: list[PartSigma] | None = None  # left out where not asked for (--only)
 
