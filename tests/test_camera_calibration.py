@@ -87,7 +87,7 @@ def test_every_number_of_the_camera_is_recovered_within_its_sigma(model: Distort
     assert np.abs(again - corners).max() < 3.0
 
 
-@pytest.mark.parametrize(("n_images", "seed"), thinned([(5, 31), (10, 36)], [(5, 31)]))
+@pytest.mark.parametrize(("n_images", "seed"), [(5, 31)])
 def test_boards_that_all_lean_alike_give_the_camera_within_its_sigma(
     n_images: int, seed: int
 ) -> None:
@@ -287,7 +287,7 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     assert "leave out --model" in " ".join(given.warnings)
 
 
-@pytest.mark.parametrize("model", thinned(["plumb_bob", "equidistant"], ["plumb_bob"]))
+@pytest.mark.parametrize("model", ["plumb_bob"])
 def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     model: DistortionModel,
 ) -> None:

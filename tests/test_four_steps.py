@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,7 +49,7 @@ def noisy(
 
 
 @pytest.mark.parametrize("criteria", CRITERIA)
-@pytest.mark.parametrize("name", thinned([*EVEN, *DETERMINED], ["3-rpr", "3-rps", "tricept"]))
+@pytest.mark.parametrize("name", ["3-rpr", "3-rps", "tricept"])
 def test_exact_axes_give_the_machine_from_3_mm_and_1_degree(name: str, criteria: Criteria) -> None:
     observed = exact(name)
     before = np.abs(observed.errors(observed.nominal.legs))
@@ -100,7 +99,7 @@ PRINTED: dict[str, list[tuple[Any, ...]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", thinned(PRINTED, ["hexapod", "3-rps", "tricept"]))
+@pytest.mark.parametrize("name", ["hexapod", "3-rps", "tricept"])
 def test_printed_criteria_keep_their_numbers(name: str) -> None:
     found = shipped(name, noise=0.25, n_poses=10).run("literal").legs
     for j, A, B, q0, axis in PRINTED[name]:
@@ -205,7 +204,7 @@ CHANGES = ("cameras", "legs", "views")
 
 @pytest.mark.parametrize(
     ("change", "criteria"),
-    thinned(product(CHANGES, CRITERIA), [("cameras", "literal"), ("legs", "default")]),
+    [("cameras", "literal"), ("legs", "default")],
 )
 def test_turned_cameras_and_other_orders_change_nothing(change: str, criteria: Criteria) -> None:
     observed = shipped("3-rps", noise=0.1)
