@@ -477,32 +477,6 @@ def test_where_the_fit_starts_does_not_show_in_the_result(name: str) -> None:
     assert other.quality.cost == pytest.approx(one.quality.cost, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["tricept", "3-rpr"])
-def test_relabelling_legs_relabels_the_result(name: str) -> None:
-    session, found = noisy_fit(name)
-    legs, n = session.legs, session.legs.n_legs
-    order = np.roll(np.arange(n), 1)  # new leg i is old leg order[i]
-    new = np.argsort(order)
-    relabelled = FittedLegs(
-        tuple(legs.names[i] for i in order),
-        tuple(legs.nominal[i] for i in order),
-        tuple(int(new[i]) for i in legs.frame_legs),
-        {(int(new[i]), part): r for (i, part), r in legs.radii.items()},
-    )
-    m, start = session.measurements, session.start
-    again = refine(
-        relabelled,
-        replace(m, q=m.q[:, order]),
-        replace(session.outlines, leg=new[session.outlines.leg]),
-        replace(start, legs=tuple(start.legs[i] for i in order)),
-    )
-    assert set(again.estimates.names) == set(found.estimates.names)
-    sigma = dict(zip(found.estimates.names, found.estimates.sigma.tolist(), strict=True))
-    for parameter, s in zip(again.estimates.names, again.estimates.sigma.tolist(), strict=True):
-        assert abs(again.estimates.values[parameter] - found.estimates.values[parameter]) < 1e-3 * s
-        assert s == pytest.approx(sigma[parameter], rel=1e-4)
-
-
 @pytest.mark.parametrize("name", ["tricept"])
 def test_a_machine_in_another_size_gives_the_same_in_that_size(name: str) -> None:
     session, found = noisy_fit(name)

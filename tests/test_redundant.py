@@ -206,10 +206,8 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
-@pytest.mark.parametrize("slip", [3e-4, 1e-3])
-def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(
-    slip: float, tmp_path: Path
-) -> None:
+def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(tmp_path: Path) -> None:
+    slip = 3e-4
     session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=8)
     m = session.measurements
     later = m.pose >= 4
