@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 from hexapod_sessions import disturbed_hexapod, paper_session, plain_scene
-from machines import from_vector, point_like_legs
+from machines import from_vector
 from outline_sessions import closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -37,6 +37,7 @@ from legcal.machine.leg import (
     Leg,
     LegKind,
     parameters_of_legs,
+    point_like_legs,
 )
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (

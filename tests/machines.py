@@ -13,7 +13,7 @@ import legcal
 from legcal.descriptions.new_model import Created, Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
-from legcal.machine.leg import JointType, KinematicParameters, Leg, LegKind, main_cylinders
+from legcal.machine.leg import KinematicParameters, LegKind, main_cylinders
 from legcal.machine.model import Machine
 from legcal.machine.parameters import free_coordinates
 
@@ -276,18 +276,6 @@ def four_upu() -> MachineSpec:
         for a, b, axis, kind in zip(A, B, axes, ["actuated"] * 3 + ["passive"], strict=True)
     )
     return MachineSpec(legs, RigidTransform.from_translation([0.0, 0.0, 0.4]))
-
-
-def point_like_legs(parameters: KinematicParameters) -> tuple[Leg, ...]:
-    """Return legs with point-like joints, actuated unless passive."""
-    S = JointType.SPHERICAL
-    joints = zip(
-        parameters.base_joints, parameters.platform_joints, parameters.offsets, strict=True
-    )
-    return tuple(
-        Leg(S, S, LegKind.PASSIVE if j in parameters.passive else LegKind.ACTUATED, A, B, float(q0))
-        for j, (A, B, q0) in enumerate(joints)
-    )
 
 
 def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> KinematicParameters:

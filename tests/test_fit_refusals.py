@@ -14,7 +14,6 @@ from fit_sessions import (
     irregular_hexapod,
     noisy_outlines,
 )
-from machines import point_like_legs
 
 from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.fit import refine
@@ -29,6 +28,7 @@ from legcal.data.measurements import View
 from legcal.data.outlines import Outlines, no_outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.files.motions import motion_from_xyz_quat
+from legcal.machine.leg import point_like_legs
 from legcal.simulation.observe import moved_outlines
 
 

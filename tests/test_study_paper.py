@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import from_vector, point_like_legs
+from machines import from_vector
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
@@ -15,7 +15,7 @@ from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
 from legcal.machine.configurations import JITTER
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import Leg
+from legcal.machine.leg import Leg, point_like_legs
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, to_vector
 from legcal.report.session import study_table

@@ -10,18 +10,10 @@ from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
 from legcal.simulation.observe import TableNoise, table_of, table_of_lines
 from legcal.vision.cylinder import (
+    angles_of_direction,
     direction_derivative,
     direction_of_angles,
 )
-
-
-def angles_of_direction(
-    u: Array,  # (..., 3) unit directions in the camera frame, from base to platform
-) -> tuple[Array, Array]:
-    """Return psi = asin(u_z) and theta = atan2(-u_x, u_y)."""
-    x, y, z = np.moveaxis(u, -1, 0)
-    # Equal to asin(u_z), without its loss of digits near the optical axis.
-    return np.arctan2(z, np.hypot(x, y)), np.arctan2(-x, y)
 
 
 def _indices(n: int) -> tuple[IntArray, IntArray]:

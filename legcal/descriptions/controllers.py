@@ -119,7 +119,7 @@ def _with_named_files(path: Path, text: str, outer: tuple[Path, ...] = ()) -> st
     def included(match: re.Match[str]) -> str:
         pattern = match[1].strip()
         several = glob.has_magic(pattern)
-        found = glob.glob(str(path.parent / pattern)) if several else [path.parent / pattern]
+        found = glob.glob(str(path.parent / pattern)) if several else [str(path.parent / pattern)]
         texts = []
         for file in map(Path, sorted(found)):
             if file.resolve() in outer:

@@ -475,6 +475,18 @@ def parameters_of_legs(legs: Sequence[Leg]) -> KinematicParameters:
     )
 
 
+def point_like_legs(parameters: KinematicParameters) -> tuple[Leg, ...]:
+    """Return legs with point-like joints, actuated unless passive."""
+    S = JointType.SPHERICAL
+    joints = zip(
+        parameters.base_joints, parameters.platform_joints, parameters.offsets, strict=True
+    )
+    return tuple(
+        Leg(S, S, LegKind.PASSIVE if j in parameters.passive else LegKind.ACTUATED, A, B, float(q0))
+        for j, (A, B, q0) in enumerate(joints)
+    )
+
+
 def mean_length(legs: Sequence[Leg], pose: Array) -> float:
     """Return the mean length of legs at a pose (3, 4) [m]."""
     R, t = pose[:, :3], pose[:, 3]
