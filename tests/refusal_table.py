@@ -1064,6 +1064,7 @@ def _formats() -> Iterable[Refusal]:
     link1 = '<link1 link="leg1_tube"'
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
+        ("universal", ('type="spherical"', 'type="universal"'), ("line", "needed one of")),
         ("no-type", ('type="spherical"', ""), ("line", "the type ''")),
         ("twice", ('name="loop1"', 'name="loop0"'), ("line", "'loop0', which another")),
         ("link", (link1, link1.replace("tube", "tub")), ("line", "mean 'leg1_tube'")),
@@ -1082,16 +1083,6 @@ def _formats() -> Iterable[Refusal]:
         "loops-and-yaml", "inspect {in}/machine.urdf",
         ("which is not read beside a mechanism YAML",), "loop_joint", (beside,),
     )  # fmt: skip
-    spherical = 'type="spherical"'
-    constraints: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
-        ("universal", (spherical, 'type="universal"'), ("line", "two axes")),
-        ("planar", (spherical, 'type="planar"'), ("line", "'planar'", "needed one of")),
-        ("one-link", ('<child link="base"/>', ""), ("line", "names 1 links, needed two")),
-        ("axis", (f"{spherical}>", 'type="revolute"><axis xyz="0 0 0"/>'), ("line", "zero axis")),
-        ("frame", (f"{spherical}>", 'type="revolute"><axis xyz="0 0 1" frame="parent"/>'),
-         ("line", "frame 'parent' alone")),
-    ]  # fmt: skip
-    yield from _of_file("constraints", "machine.urdf", "constraint", constraints)
     gepetto: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("axes", ("joint_type:\n- UJOINT_XY", "joint_type:\n- UJOINT_XX"),
          ("'UJOINT_XX'", "SPHERICAL")),

@@ -40,8 +40,10 @@ from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.table import Column, read_table
 from legcal.geometry.types import IntArray
+from legcal.machine.tolerance import Tolerance
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
+NEGLIGIBLE = 0.3  # of the predicted error: it adds less than a twentieth to that
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
 _ALONG = 9  # points along an outline
@@ -93,8 +95,9 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, reported)
     else:
         change, sigma, found = _change_of_platform(platform)
-        by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
-        found += "".join(f"; {clause}" for clause in (by_radii, by_readings) if clause)
+        by_radii = _share_of_scale(platform)
+        by_travel = _error_of_travel(platform, solution, machine.tolerance)
+        found += "".join(f"; {clause}" for clause in (by_radii, by_travel) if clause)
         if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
@@ -245,17 +248,21 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
     )
 
 
-def _error_of_readings(platform: PlatformAccuracy, solution: Solution) -> str:
-    """Return a clause on what all readings may be wrong by, where that is more than the rest."""
+def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance) -> str:
+    """Return a clause on what an error of all travel does, "" where that is negligible."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
     parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
-    if not parts or parts[0].mean_displacement <= predicted:
+    if not parts or parts[0].mean_displacement <= NEGLIGIBLE * predicted:
         return ""
-    witnesses = scale_witnesses(solution.posterior.problem)
-    rests = f"{witnesses[0]} alone" if len(witnesses) == 1 else few(witnesses)
+    problem = solution.posterior.problem
+    witnesses = scale_witnesses(problem)
+    rests = f"{witnesses[0]} alone; " if len(witnesses) == 1 else f"{few(witnesses)}; of "
+    assumed = "" if tolerance.travel else ", assumed: state tolerance: {travel: ...}"
     return (
-        f"the scale rests on {rests}, and an error that all readings share, as of screws or belts, "
-        f"may add {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)} (1 sigma)"
+        f"the scale rests on {rests}an error of {problem.legs.sigma_travel:.2%} of the travel "
+        f"(1 sigma{assumed}) "
+        + ("" if len(witnesses) == 1 else "what these leave ")
+        + f"moves the platform by {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)}"
     )
 
 
