@@ -239,13 +239,12 @@ def test_places_that_take_no_files_are_refused_before_any_work(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(module, name, refused)
-    out, page, film = tmp_path / "out", tmp_path / "page.html", tmp_path / "none.mp4"
+    out, film = tmp_path / "out", tmp_path / "none.mp4"
     for words in (
         ("simulate", "3-rpr", "-o", out),
         ("plan", "3-rpr", "-o", out),
         ("study", "paper", "-o", out),
         ("example", "-o", out),
-        ("identify", "3-rpr", "--page", page),
         ("import", film, "--model", "3-rpr", "--camera", "none.yaml", "-o", out),
     ):
         assert run(monkeypatch, *words) == 2

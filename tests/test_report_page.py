@@ -349,29 +349,6 @@ def test_overlays_that_cannot_be_drawn_are_left_out_and_told(
         legcal.calibrate(moved, output=tmp_path / "out", overlays=True)
 
 
-def test_other_commands_write_what_they_print_as_a_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "identify.html"
-    words = ("identify", "hexapod", "--view", "leg1,leg2", "--page", path)
-    run(monkeypatch, *words)
-    printed = capsys.readouterr().out
-    found: Any = html.fromstring(path.read_text("utf-8"))
-    assert found.xpath("//main/section/@id") == ["verdict", "result", "record"]
-    assert "doubtful" in found.xpath("//section[@id='verdict']/@class")[0]  # the fit alone can
-    cells = [cell.text_content() for cell in found.xpath("//table//td")]
-    assert len(cells) > 20
-    flat = " ".join(printed.split())
-    assert all(cell in flat for cell in cells if " " not in cell)
-    assert "legcal identify hexapod" in found.xpath("string(//section[@id='record'])")
-    before = path.read_bytes()
-    (tmp_path / "mine.html").write_text("mine")
-    assert run(monkeypatch, *words[:-1], tmp_path / "mine.html") == 2
-    assert (tmp_path / "mine.html").read_text() == "mine"
-    assert run(monkeypatch, *words[:-1], tmp_path / "none" / "page.html") == 2
-    assert path.read_bytes() == before
-
-
 @pytest.mark.system
 @pytest.mark.usefixtures("page")  # which writes the report of the result
 def test_a_check_writes_a_page_and_never_over_that_of_a_result(

@@ -70,8 +70,6 @@ LITTLE_USED = 0.1  # smallest range of readings without a warning, relative to t
 SOFT = 3.0  # largest median blur of a view without a warning [px]
 CLIPPED = 0.1  # largest share of clipped pixels of a view without a note
 FEW_LEGS = 0.5  # smallest share of the visible legs of a view found without a warning
-MIN_READINGS = 6  # smallest number of readings with a last digit
-MAX_DIGITS = 10  # largest number of decimals of readings in metres
 LOOKING = "Looking at light and sharpness"  # stage of progress
 
 
@@ -262,7 +260,7 @@ def _look_at_files(checklist: _Checklist, problems: Sequence[tuple[int, Problem]
 
 
 def _look_at_readings(checklist: _Checklist, notes: Sequence[str]) -> None:
-    """Check readings against each other and the travel, and their digits against the noise."""
+    """Check readings against each other and the travel."""
     dataset = checklist.dataset
     for note in notes:
         checklist.add("readings", "warning", note)
@@ -284,7 +282,6 @@ def _look_at_readings(checklist: _Checklist, notes: Sequence[str]) -> None:
         used = _range([100.0 * share for share in shares.values()])
         checklist.checks["readings"] += f", {used} % of their travel used"
     _look_for_still_encoders(checklist, shares)
-    _look_for_rounded_readings(checklist)
 
 
 def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
@@ -331,37 +328,6 @@ def _look_for_still_encoders(checklist: _Checklist, shares: Mapping[str, float])
             f"{100 * LITTLE_USED:.0f} % or more of every encoder for poses that tell parameters "
             "apart; take photographs at poses that differ more, and check the unit of readings.",
         )
-
-
-def _look_for_rounded_readings(checklist: _Checklist) -> None:
-    dataset, legs = checklist.dataset, checklist.dataset.machine.legs
-    sigma = dataset.measurements.sigma_of(legs)
-    for unit in ("m", "rad"):
-        of_unit = [j for j in dataset.machine.motors if legs[j].reading_unit == unit]
-        digit = _last_digit(dataset.measurements.q[:, of_unit])
-        if digit is None or digit / np.sqrt(12.0) <= (stated := float(sigma[of_unit].min())):
-            continue
-        step = f"{1e3 * digit:g} mm" if unit == "m" else f"{digit:g} rad"
-        checklist.add(
-            "readings",
-            "warning",
-            f"{dataset.table_path}: found readings in steps of {step}, whose rounding alone has a "
-            f"standard deviation of {digit / np.sqrt(12.0):.2g} {unit}, needed no more than the "
-            f"encoder_sigma of {stated:.2g} {unit} in {dataset.yaml_path.name}; write more digits, "
-            "or state a greater encoder_sigma.",
-        )
-
-
-def _last_digit(q: Array) -> float | None:
-    """Return the size of the last digit of readings; None if they are too few."""
-    values = q[np.isfinite(q)]
-    if len(values) < MIN_READINGS:
-        return None
-    for digits in range(MAX_DIGITS):
-        scaled = values * 10.0**digits
-        if np.all(np.abs(scaled - np.rint(scaled)) < 1e-6):
-            return float(10.0**-digits)
-    return None
 
 
 def _look_at_cameras(checklist: _Checklist, choices: Choices) -> None:

@@ -18,14 +18,11 @@ from legcal.cli.options import (
     ModelArgument,
     NoiseOption,
     OnlyOption,
-    PageOption,
     as_lines,
-    check_page,
     open_browser,
     print_json,
     print_table,
     show,
-    write_page,
 )
 from legcal.errors import UsageError, printable
 
@@ -241,14 +238,12 @@ def identify(
     hand_held: HandHeldOption = False,
     noise: NoiseOption = None,
     only: OnlyOption = None,
-    page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Report which parameters are identifiable, and how to make the others so."""
     from legcal.calibration.identify.identifiability import answer
-    from legcal.report.identify import identify_table, identify_verdict
+    from legcal.report.identify import identify_table
 
-    check_page(page)
     views = [text.split(",") for text in view or []]
     identified = answer(
         model,
@@ -260,8 +255,6 @@ def identify(
         noise=noise,
         only=only,
     )
-    verdict = identify_verdict(identified)
-    write_page(page, f"Identifiability of {model}", identify_table(identified), verdict)
     show(as_json, identified.document, lambda: identify_table(identified))
 
 
@@ -319,7 +312,6 @@ def locate(
             "0,0,0 by default.",
         ),
     ] = None,
-    page: PageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the base in the world and the tool in the platform from measured tool poses."""
@@ -337,7 +329,6 @@ def locate(
     def quantity(text: str | None, units: Mapping[str, float], option: str) -> float | None:
         return None if text is None else parse_quantity(text, units, option)
 
-    check_page(page)
     LOCATION_FILE.check_place(output)
     machine = load_mechanism(model)
     location = locate.locate(
@@ -353,8 +344,6 @@ def locate(
         written += [str(path) for path in paths]
     write_location(location, output)
     written.append(str(output))
-    title = f"Base and tool of {machine.name}"
-    write_page(page, title, location_table(location, written))
     show(
         as_json,
         lambda: location_document(location) | {"written": written},

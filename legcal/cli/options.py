@@ -93,25 +93,11 @@ ClusterOption = Annotated[
 ]
 
 
-PageOption = Annotated[
-    Path | None,
-    typer.Option("--page", metavar="FILE.html", help="Write the same as a page for the browser."),
-]
-
-
 if TYPE_CHECKING:
     from rich.text import Text
 
     from legcal.pages.document import Verdict
     from legcal.report.render import Report
-
-
-def check_page(page: Path | None) -> None:
-    """Refuse, before any work, a place where no page can be written."""
-    from legcal.pages.document import PAGE
-
-    if page is not None:
-        PAGE.check_place(page)
 
 
 def write_page(

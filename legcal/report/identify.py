@@ -15,7 +15,7 @@ from legcal.calibration.identify.report import (
     WeakDirection,
 )
 from legcal.machine.parameters import leg_labels, legs_in_words, list_in_words
-from legcal.pages.document import Table, Verdict
+from legcal.pages.document import Table
 from legcal.report.render import Part, Report, table
 from legcal.report.render import report as blocks
 
@@ -152,20 +152,3 @@ def _verdict(report: Identifiability) -> list[Part]:
     if failed:
         lines.append(f"The paper's conditions fail: {list_in_words(failed)}.")
     return [*lines, *(f"note: {note}" for note in report.notes)]
-
-
-def identify_verdict(report: Identifiability) -> Verdict:
-    """Return whether a session determines its machine: amber where a condition fails."""
-    full = report.full
-    sentence = f"The joint fit determines {full.rank} of {full.of} parameters."
-    if not report.identifiable:
-        word = "These images cannot determine the machine"
-        reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
-        return Verdict("bad", word, sentence, reasons)
-    if report.scale_is_open:
-        word = "These images can determine all of the machine but its scale"
-        return Verdict("doubtful", word, sentence, [f"{_SCALE[0].upper()}{_SCALE[1:]}."])
-    if not report.conditions_hold:
-        word = "The joint fit can determine it, but conditions of the paper fail"
-        return Verdict("doubtful", word, sentence, [])
-    return Verdict("good", "These images determine the machine", sentence, [])
