@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -145,8 +145,15 @@ def part_errors(
 
     *turned* [m or rad] are motors whose zero is known to be elsewhere, by their labels.
     """
+    return _part_errors(legs, tolerance, frozenset((turned or {}).items()))
+
+
+@lru_cache(maxsize=4)  # a plan builds hundreds of fits of the same legs
+def _part_errors(
+    legs: FittedLegs, tolerance: Tolerance, turned: frozenset[tuple[str, float]]
+) -> PartErrors:
     columns, nominal, first = LegColumns, legs.nominal, reading_legs(legs.nominal)
-    base = with_zeros(nominal, turned or {})
+    base = with_zeros(nominal, dict(turned))
     place = np.arange(legs.n_legs * columns.COUNT, dtype=np.intp).reshape(legs.n_legs, -1)
     place[:, columns.ACTUATOR] = place[list(first)][:, columns.ACTUATOR]  # rods share their motor
     rods = [leg.q0 for leg in nominal if leg.actuator is not None]
