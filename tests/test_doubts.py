@@ -237,12 +237,13 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
 
 def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
     solution = healthy.solution
-    focal = next(s for s in solution.sensitivities if "focal" in s.what)
+    (shared,) = solution.sensitivities
+    focal = replace(shared, what=FITTED_CAMERA, steps=0.01 * shared.steps)
     fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
     wrong = FocalLength("c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
         "camera_doubts": (wrong,),
-        "sensitivities": (*solution.sensitivities, replace(focal, what=FITTED_CAMERA)),
+        "sensitivities": (shared, focal),
     }
     found = _judged(healthy, **changes)
     (doubt,) = found.doubts
@@ -250,7 +251,7 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
     effect = found.platform.effects[-1].error
     assert (doubt.code, doubt.sigma_dX_m) == ("camera", effect.mean_displacement)
     assert model_error(found.doubts) == (effect.mean_displacement, effect.mean_rotation)
-    large = replace(focal, what=FITTED_CAMERA, steps=1e3 * focal.steps)
+    large = replace(focal, steps=1e4 * focal.steps)
     found = _judged(healthy, **changes | {"sensitivities": (large,)})
     assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
     assert found.verdict.is_to_be_refused

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -269,6 +269,7 @@ class FittedLegs:
         return vector_of(self.parametrization, legs, self.nominal)
 
 
+@lru_cache(maxsize=1)  # one machine is fitted several times, and what follows from its legs kept
 def fitted_legs(machine: Machine) -> FittedLegs:
     """Return the legs of a mechanism as inputs of the joint fit."""
     return FittedLegs(
