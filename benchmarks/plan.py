@@ -143,7 +143,7 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
         choices = Choices(priors={f"{rod[0].name}.length": known})
     sigma = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
     predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices, sigma)
-    scene = Scene.nominal(Task(predictor, args.images, args.cameras, default_setting(machine.size)))
+    scene = Scene.nominal(Task(predictor, args.images, args.cameras, default_setting(machine)))
     work = workspace_of(machine, predictor.legs)
     if work is None:
         raise NotIdentifiable(f"{name}: readings do not give the pose, needed another machine.")

@@ -2,6 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/session_mistakes.py [--sessions 40] [--first 0]
                          [--machines hexapod,...] [--kinds slip,...] [--record FILE]
+                         [--photographs]
 
 Outlines of 45 images of a machine whose joints are off are simulated. Two sessions in three have a
 mistake, drawn at a size from harmless to gross: the zero of an encoder slips or drifts, photographs
@@ -13,6 +14,8 @@ against the true machine is compared with what is stated, for mistakes of the sc
 that all readings may share. Printed are sessions that harm by more than three stated sigmas, how
 many of these are trusted, and how often the first doubt names their mistake; ``pitch`` is a kind
 apart. FILE keeps sessions as JSON lines; those in it are not done again. About 5 s a session.
+With --photographs 18 small photographs are rendered in place of outlines, and mistakes are those of
+readings, of a stated length, and of a focal length, to which images are enlarged; about a minute.
 """
 
 import argparse
@@ -24,6 +27,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import cv2
 import numpy as np
 from machine_kinds import measured_length
 from scipy.spatial.transform import Rotation
@@ -31,6 +35,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from changed_rays import turned, with_moved_joint, with_rays, zoomed
+from simulated import small_camera
 
 from legcal import (
     LegcalError,
@@ -72,7 +77,7 @@ SIZES: dict[str, tuple[float, float, tuple[str, ...]]] = {
     PITCH: (2e-4, 4e-3, ()),
 }
 # Two witnesses of the scale, one of which is wrong, and one alone; asked for by --kinds
-OF_SCALE = {
+OF_SCALE: dict[str, tuple[float, float, tuple[str, ...]]] = {
     "length": (3e-4, 3e-2, ("scale",)),  # a stated length, relative
     "pitch and length": (3e-4, 1e-2, ("scale",)),  # all motors, beside a right length
     "pitch and board": (3e-4, 1e-2, ("scale",)),  # the same beside a right board
@@ -80,6 +85,10 @@ OF_SCALE = {
     "nominal length": (0.0, 0.0, ("nominal_length",)),  # stated, and not measured
 }
 KINDS = SIZES | OF_SCALE
+PHOTOGRAPHED = (
+    "slip", "drift", "backlash", "lag", "gain", "commands", "eccentricity", "focal length", "length"
+)  # fmt: skip
+PHOTOGRAPHS = {"poses": 6, "views": 3, "level": Level.PHOTOGRAPHS}
 
 
 def stated_lengths(kind: str, size: float, truth: Machine, nominal: Machine,
@@ -115,9 +124,21 @@ def relit(dataset: Dataset, rows: BoolArray, size: float, angle: float) -> Datas
     return replace(dataset, observations=replace(o, h=new_h, ends=new_ends))
 
 
+def enlarge(dataset: Dataset, rows: BoolArray, size: float) -> None:
+    """Enlarge some photographs of one view about its principal point."""
+    m = dataset.measurements
+    for row in np.flatnonzero(rows).tolist():
+        file = str(dataset.folder / m.image[row])
+        image, centre = cv2.imread(file, cv2.IMREAD_UNCHANGED), m.views[m.view[row]].camera.K[:2, 2]
+        assert image is not None
+        by = np.column_stack([(1.0 + size) * np.eye(2), -size * centre])
+        larger = cv2.warpAffine(image, by, image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+        cv2.imwrite(file, larger)
+
+
 def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
-            scene: Scene) -> Dataset:  # fmt: skip
-    """Return a session with a mistake."""
+            scene: Scene | None) -> Dataset:  # fmt: skip
+    """Return a session with a mistake; photographs without a scene."""
     m, machine = dataset.measurements, dataset.machine
     n, j = m.n_rows, int(rng.choice(machine.motors))
     is_motor = np.equal(machine.reads, j).astype(float)
@@ -136,7 +157,7 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
     if kind in ("length", "nominal length"):
         return dataset
     kind = PITCH if kind.startswith(PITCH) else kind
-    if kind == "joint":
+    if kind == "joint" and scene is not None:
         direction = rng.normal(size=3)
         by = size * direction / np.linalg.norm(direction)
         return with_moved_joint(dataset, scene, later, int(rng.integers(len(machine.legs))), by)
@@ -150,6 +171,9 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
     if kind in ("camera", "focal length", "lamp"):
         changed = np.zeros(n, dtype=np.bool_)
         changed[rows[int(len(rows) * 0.4) :]] = True
+        if scene is None:
+            enlarge(dataset, changed, size)
+            return dataset
         if kind == "lamp":
             return relit(dataset, changed, size, rng.uniform(0.0, 2.0 * np.pi))
         return with_rays(dataset, changed, turned(size) if kind == "camera" else zoomed(size))
@@ -172,7 +196,9 @@ def spoiled(dataset: Dataset, kind: str, size: float, rng: np.random.Generator,
     return replace(dataset, measurements=replace(m, q=m.q + changes[kind]()))
 
 
-def session(seed: int, name: str, kinds: list[str], scratch: Path) -> dict[str, object]:
+def session(
+    seed: int, name: str, kinds: list[str], scratch: Path, *, photographs: bool
+) -> dict[str, object]:
     """Simulate, spoil and calibrate a session."""
     rng = np.random.default_rng(seed)
     folder, out = scratch / f"{seed}", scratch / f"{seed}-out"
@@ -184,13 +210,18 @@ def session(seed: int, name: str, kinds: list[str], scratch: Path) -> dict[str, 
         size = float(np.exp(rng.uniform(np.log(least), np.log(most)))) if least else 0.0
     board = "charuco" if "board" in kind else None
     settings = SimulationSettings(level=Level.OUTLINES, seed=seed, board=board)
+    if photographs:
+        settings = replace(settings, **PHOTOGRAPHS, camera=small_camera(scratch, 640, 480))  # type: ignore[arg-type]
     simulate(name, folder, settings)
     truth = next((folder / "truth/models").glob("*.yaml"))
     nominal: Machine = load_mechanism(name)
     dataset = load_dataset(folder)
     if kind != HEALTHY:
-        simulated = simulate_session(load_mechanism(truth), nominal, settings, streams(seed))
-        dataset = spoiled(dataset, kind, size, rng, simulated.scene)
+        scene = None
+        if not photographs:
+            true = load_mechanism(truth)
+            scene = simulate_session(true, nominal, settings, streams(seed)).scene
+        dataset = spoiled(dataset, kind, size, rng, scene)
     priors = stated_lengths(kind, size, load_mechanism(truth), nominal, rng)
     line: dict[str, object] = {"seed": seed, "machine": name, "kind": kind, "size": size}
     begin = time.perf_counter()
@@ -247,19 +278,22 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--machines", default=",".join(MACHINES))
-    parser.add_argument("--kinds", default=",".join(SIZES))
+    parser.add_argument("--kinds")
+    parser.add_argument("--photographs", action="store_true")
     parser.add_argument("--record", type=Path)
     given = parser.parse_args()
     lines: list[dict[str, object]] = []
     if given.record is not None and given.record.exists():
         lines = [json.loads(text) for text in given.record.read_text().splitlines()]
     done, machines = {line["seed"] for line in lines}, given.machines.split(",")
+    usual = PHOTOGRAPHED if given.photographs else tuple(SIZES)
+    kinds = given.kinds.split(",") if given.kinds else list(usual)
     for seed in range(given.first, given.first + given.sessions):
         if seed in done:
             continue
         with TemporaryDirectory() as scratch:
             name = machines[(seed // 3) % len(machines)]
-            line = session(seed, name, given.kinds.split(","), Path(scratch))
+            line = session(seed, name, kinds, Path(scratch), photographs=given.photographs)
         print(json.dumps(line), flush=True)
         lines.append(line)
         if given.record is not None:

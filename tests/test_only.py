@@ -139,7 +139,7 @@ def test_identify_says_how_well_a_group_will_be_known(only: Group) -> None:
 @pytest.mark.system
 def test_a_plan_says_how_well_a_group_will_be_known(only: Group) -> None:
     machine = replace(load_mechanism("3-rpr"), tolerance=TYPICAL["bought"])
-    setting = replace(default_setting(machine.size), draws=1)
+    setting = replace(default_setting(machine), draws=1)
     planned = plan(machine, images=2, cameras=1, noise=WHITE, setting=setting, only=only)
     _states(machine, planned.parts, planned.notes, only)
 

@@ -51,7 +51,7 @@ from legcal.vision.camera_file import camera_info
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
-FEW = replace(default_setting(load_mechanism("3-rpr").size), draws=3)
+FEW = replace(default_setting(load_mechanism("3-rpr")), draws=3)
 BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 

@@ -36,6 +36,7 @@ from legcal.machine.kinematics import (
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries
+from legcal.machine.tolerance import Tolerance
 from legcal.planning.places import default_setting
 from legcal.planning.poses import surely_reached
 from legcal.simulation.dataset import simulate
@@ -128,7 +129,13 @@ def test_poses_for_plans_of_redundant_machines_are_those_of_least_squares(name: 
     machine = machine_of(name)
     legs = fitted_legs(machine)
     drawn = feasible_poses(machine, 12, np.random.default_rng(0), extreme=False)
-    assert surely_reached(machine, legs, default_setting(machine.size), drawn).mean() > 0.5
+    reached = surely_reached(machine, legs, default_setting(machine), drawn)
+    assert reached.mean() > 0.5
+    worse = dataclasses.replace(machine, tolerance=Tolerance(joints=0.05 * machine.size))
+    fewer = surely_reached(machine, legs, default_setting(worse), drawn)
+    assert fewer.sum() < reached.sum()
+    better = dataclasses.replace(machine, tolerance=Tolerance(joints=1e-5, axes=1e-4))
+    assert default_setting(better) == default_setting(machine)
 
 
 def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() -> None:

@@ -119,9 +119,9 @@ def _with_named_files(path: Path, text: str, outer: tuple[Path, ...] = ()) -> st
     def included(match: re.Match[str]) -> str:
         pattern = match[1].strip()
         several = glob.has_magic(pattern)
-        found = glob.glob(str(path.parent / pattern)) if several else [str(path.parent / pattern)]
+        found = sorted(glob.glob(pattern, root_dir=path.parent)) if several else [pattern]
         texts = []
-        for file in map(Path, sorted(found)):
+        for file in (path.parent / name for name in found):
             if file.resolve() in outer:
                 raise ModelError(
                     f"{path}: [include {pattern}] could not be followed: found a file that "

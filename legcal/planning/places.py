@@ -8,8 +8,9 @@ pointing up, also for hanging machines: a tripod stands on the ground.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -76,9 +77,16 @@ class Setting:
         )
 
 
-def default_setting(size: float) -> Setting:
-    """Return the default tolerances for a mean leg length *size* [m]."""
-    return Setting(USUAL_SHIFT * size, USUAL_LENGTH * size, draws=USUAL_DRAWS)
+def default_setting(machine: Machine) -> Setting:
+    """Return the default tolerances, those of a machine that is stated to be worse.
+
+    Uniform errors up to the root of three sigmas have that sigma.
+    """
+    usual = Setting(USUAL_SHIFT * machine.size, USUAL_LENGTH * machine.size, draws=USUAL_DRAWS)
+    stated = machine.tolerance
+    length = math.sqrt(3.0) * max(stated.joints or 0.0, stated.lengths or 0.0)
+    angle = math.sqrt(3.0) * (stated.axes or 0.0)
+    return replace(usual, length=max(length, usual.length), angle=max(angle, usual.angle))
 
 
 @dataclass(frozen=True, eq=False)

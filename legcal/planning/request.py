@@ -136,7 +136,7 @@ def plan(
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     _check_visible(machine)
-    setting = default_setting(machine.size) if setting is None else setting
+    setting = default_setting(machine) if setting is None else setting
     listed = tuple(replace(place, fixed=True) for place in places)
     n_images, n_views = _counts(
         images, images_per_view, cameras, target, len(listed), hand_held=hand_held

@@ -454,7 +454,7 @@ class GuidedSession:
         predictor = Predictor(
             self.machine, m.views[0].camera, DEFAULT_NOISE, m.sigma_q, lengths, m.sigma_by_joint
         )
-        return Scene.nominal(Task(predictor, 1, 1, default_setting(self.machine.size)))
+        return Scene.nominal(Task(predictor, 1, 1, default_setting(self.machine)))
 
     @cached_property
     def _work(self) -> Workspace | None:
