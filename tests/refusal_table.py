@@ -1329,7 +1329,6 @@ def _without_none(entry: dict[str, Any]) -> dict[str, Any]:
 
 def _poses() -> Iterable[Refusal]:
     p = "hexapod.csv"
-    sigma = swap(p, "\n", ",0.5\n", -1)
     joint = "leg1_prismatic"
     rows: Rows = [
         ("no-y", header(p, "y", None), ("'y'",)),
@@ -1344,7 +1343,6 @@ def _poses() -> Iterable[Refusal]:
         ("half", cell(p, 2, qx=""), ("row 2", "qx")),
         ("norm", cell(p, 2, qx="2.0"), ("row 2", "0.001")),
         ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
-        ("angle-sigma", (sigma, swap(p, "0.5", "angle_sigma")), ("angle_sigma", "0.5")),
         ("twice", doubled(p), ("row 25", "row 1")),
         ("no-rows", kept(p, 0), ("no row",)),
         ("two-poses", kept(p, 2), ("2", "3")),

@@ -7,9 +7,11 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, files
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from model_formats import FORMATS, write_format
 from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -105,6 +107,27 @@ def test_what_is_written_down_loads_with_an_equal_analysis(
     assert_same_analysis(written, found)
     for key in ("leg_names", "frame_legs", "platform_joint"):
         assert getattr(written, key) == getattr(found, key)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"machine_kind": "printed"},
+        {"tolerance": {"joints": "0.3 mm", "lengths": 1e-4, "zeros": "0.2 mm"}, "spline_teeth": 25},
+        {"tolerance": {"axes": "0.5 deg", "zeros": 1e-3}},
+    ],
+)
+def test_a_copied_model_says_how_well_the_machine_is_built(
+    stated: dict[str, Any], tmp_path: Path
+) -> None:
+    path, _ = write_model(machine_of("hexapod"), tmp_path / "from")
+    document = yaml.safe_load(path.read_text())
+    document["legcal"] |= stated
+    path.write_text(yaml.safe_dump(document))
+    machine = load_mechanism(path)
+    copied = load_mechanism(write_model(machine, tmp_path / "to")[0])
+    assert machine.tolerance != machine_of("hexapod").tolerance
+    assert (copied.tolerance, copied.spline_teeth) == (machine.tolerance, machine.spline_teeth)
 
 
 def test_a_urdf_that_needs_no_change_is_copied_and_nothing_written_over(tmp_path: Path) -> None:

@@ -348,16 +348,6 @@ class PlatformBlock(Document):
     sensitivities: list[SensitivityRow]
 
 
-class HoldoutPlatform(Document):
-    """The pose by readings against that by an image alone, root mean squares."""
-
-    poses: int
-    dX_m: Number
-    expected_dX_m: Number
-    dE_rad: Number
-    expected_dE_rad: Number
-
-
 class Holdout(Document):
     """How well the fit predicts the held-out images."""
 
@@ -368,7 +358,6 @@ class Holdout(Document):
     rms_px: Number | None
     expected_px: Number | None
     views: dict[str, Number]
-    platform: HoldoutPlatform | None
 
 
 class DiagnosisBlock(Document):

@@ -647,12 +647,5 @@ def _held_out(held_out: HeldOut | None) -> list[Doubt]:
         f"images that were kept aside lie {held_out.rms_px:.3f} px from their prediction, where "
         f"{held_out.expected_px:.3f} px were expected"
     )
-    pair = held_out.platform
-    return [
-        Doubt(
-            "held_out",
-            what,
-            "look at the worst outlines, and for play, bending or a camera that moved",
-            *((None, None) if pair is None else (pair.dX_m, pair.dE_rad)),
-        )
-    ]
+    remedy = "look at the worst outlines, and for play, bending or a camera that moved"
+    return [Doubt("held_out", what, remedy)]

@@ -476,19 +476,10 @@ def _holdout_lines(found: Holdout) -> list[str]:
     if found.rms_px is None or found.expected_px is None:
         return [f"Held out: {of} show no outline that could be compared."]
     views = ", ".join(f"{name} {rms:.3f}" for name, rms in found.views.items())
-    lines = [
+    return [
         f"Held out: {of}: {found.outlines - found.wrong} of {found.outlines} outlines are "
         f"{found.rms_px:.3f} px (rms) from their prediction by the others, "
         f"{found.expected_px:.3f} px were expected ({views})."
-    ]
-    pair = found.platform
-    if pair is None:
-        return [*lines, "They show too few legs at once to determine the platform's pose alone."]
-    return [
-        *lines,
-        f"At the platform, its pose by what {pair.poses} of {found.poses} poses show alone is "
-        f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
-        f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
     ]
 
 

@@ -32,7 +32,7 @@ from legcal.data.photograph_matching import (
 from legcal.data.reading_units import are_commands, default_unit, sigma_in, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
+from legcal.files.folder import OutputKind, check_path, holds_files, new_files, result_folder
 from legcal.files.published import with_schema
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
@@ -331,20 +331,12 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         for _, photograph in new.matching.pairs
         if not photograph.path.resolve().is_relative_to(new.destination.resolve())
     }
-    existing = [
-        name for name in [*dataset_files, *linked] if os.path.lexists(new.destination / name)
-    ]
     contents = {
         names[camera]: new.made_cameras[camera].encode()
         if camera in new.made_cameras
         else camera.read_bytes()
         for camera in cameras
     }
-    if existing and not force:
-        raise UsageError(
-            f"{new.destination}: the dataset could not be written: found {few(existing)} already "
-            "there, needed new files; give another folder with -o, or --force to replace them."
-        )
     header = ["view", "image", *(["pose"] if new.poses else []), *new.joints]
     rows = [
         [view, new.place(photograph), *(new.poses[k : k + 1]), *new.readings.q[k].tolist()]
@@ -357,7 +349,8 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         "encoder_sigma": new.encoder_sigma,
         "views": {view: {"camera": names[camera]} for view, camera in new.cameras.items()},
     }
-    with result_folder(new.destination, DATASET_FOLDER) as folder:
+    names_to_write = [*dataset_files, *linked]
+    with new_files(new.destination, "dataset", names_to_write, force=force) as folder:
         for name, content in contents.items():
             (folder / name).write_bytes(content)
         for name, path in linked.items():

@@ -263,6 +263,25 @@ def result_folder(
 
 
 @contextmanager
+def new_files(
+    folder: Path, noun: str, names: Iterable[str], *, force: bool | None = None
+) -> Iterator[Path]:
+    """Give a temporary folder for files of some names, as :func:`result_folder`.
+
+    Files that are there are replaced only with *force*, None where the command has no such option.
+    """
+    there = [name for name in names if os.path.lexists(folder / name)]
+    if there and not force:
+        replaced = "" if force is None else ", or --force to replace them"
+        raise UsageError(
+            f"{folder}: the {noun} could not be written: found {' and '.join(there)} already "
+            f"there, needed new files; give another folder or name{replaced}."
+        )
+    with result_folder(folder, OutputKind(noun, "", "")) as temporary:
+        yield temporary
+
+
+@contextmanager
 def _named(destination: Path, new: Path) -> Iterator[None]:
     """Make errors of the block name the destination instead of the temporary folder."""
     try:
@@ -313,7 +332,7 @@ def _workshop(destination: Path) -> Path:
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:
     """Move files into a folder; if that is interrupted, restore the previous files."""
-    names = _files_in(new)
+    names = sorted(_files_in(new), key=lambda name: name.suffix == ".yaml")  # they name the others
     gone = [name for name in stale if name not in names and (destination / name).is_file()]
     kept = [name for name in names if os.path.lexists(destination / name)] + gone
     for name in kept:

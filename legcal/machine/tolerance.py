@@ -152,6 +152,21 @@ class Tolerance:
         """Whether something is stated beside the travel."""
         return replace(self, travel=None) != NOT_STATED
 
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The keys of a file that state it."""
+        if (
+            kind := next((k for k, typical in TYPICAL.items() if typical == self), None)
+        ) is not None:
+            return {"machine_kind": str(kind)}
+        zeros: float | str | None = self.zeros
+        if self.zeros != self.angles_at_zero:  # of one dimension
+            unit = "rad" if self.zeros is None else "m"
+            zeros = f"{self.zeros or self.angles_at_zero!r} {unit}"
+        numbers = {"joints": self.joints, "axes": self.axes, "lengths": self.lengths}
+        stated = {name: x for name, x in {**numbers, "zeros": zeros}.items() if x is not None}
+        return {"tolerance": stated} if stated else {}
+
     def completed(self, size: float) -> Tolerance:
         """Return all of them, rough ones where nothing is stated; *size* is the mean leg length."""
         rough = (_PART_OF_SIZE * size, _ANGLE, _PART_OF_SIZE * size, _PART_OF_ZERO * size)
