@@ -68,10 +68,10 @@ def simulated(
         with contextlib.suppress(OSError):  # another process was faster
             other.rename(kept)
         return made
-    made: SimulatedDataset = pickle.loads((kept / "made").read_bytes())
+    earlier: SimulatedDataset = pickle.loads((kept / "made").read_bytes())
     shutil.copytree(kept / "files", folder)
-    truth = folder / made.truth_path.relative_to(made.folder)
-    return replace(made, folder=folder, truth_path=truth)
+    truth = folder / earlier.truth_path.relative_to(earlier.folder)
+    return replace(earlier, folder=folder, truth_path=truth)
 
 
 _MADE: list[Path] = []  # the folder of what was simulated

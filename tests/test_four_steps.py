@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from hexapod_sessions import PaperSession, extreme_poses, nominal_of
+from machines import from_vector
 from staged_sessions import Observed, errors, exact_session, noisy_session, shipped, staged
 
 from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegKind, point_like_legs
-from legcal.machine.parameters import from_vector, to_vector
+from legcal.machine.parameters import to_vector
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_base_steps, run_platform_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras

@@ -34,13 +34,22 @@ from legcal.machine.kinematics import (
     platform_in_base,
 )
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, slider_columns
+from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries
-from legcal.machine.redundancy import reading_residuals
 from legcal.planning.places import default_setting
 from legcal.planning.poses import surely_reached
 from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
+
+
+def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
+    """Return the residuals of readings q (n_legs,) at a pose [m], zero for legs without motor.
+
+    Without redundant motors they vanish at the pose of forward kinematics, up to rounding.
+    """
+    motors, residuals = list(machine.motors), np.zeros(machine.n_legs)
+    residuals[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
+    return residuals
 
 
 def _concurrent() -> MachineSpec:

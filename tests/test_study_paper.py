@@ -4,6 +4,7 @@ import io
 
 import numpy as np
 import pytest
+from machines import from_vector
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
@@ -14,7 +15,7 @@ from legcal.machine.configurations import JITTER
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, point_like_legs
 from legcal.machine.model import Machine
-from legcal.machine.parameters import from_vector, geometries, to_vector
+from legcal.machine.parameters import geometries, to_vector
 from legcal.report.session import study_table
 from legcal.simulation.observe import TableNoise, axes_in_images
 from legcal.simulation.paper import (
