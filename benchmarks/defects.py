@@ -228,7 +228,7 @@ class Tree:
             os.chdir(self.folder)
             os.environ["PYTHONPATH"] = str(self.folder)
             sys.path[0] = str(self.folder)
-            options = ["-x", "-q", "-n", "0", "-m", "not slow", "-p", "no:cacheprovider"]
+            options = ["-x", "-q", "-n", "0", "-m", "", "-p", "no:cacheprovider"]
             code = int(pytest.main([*options, "--tb=no", "-rfE", *command]))
         except BaseException:
             traceback.print_exc()

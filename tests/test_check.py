@@ -44,9 +44,6 @@ pytestmark = pytest.mark.usefixtures("without_steps")
 MODEL = "3-rpr"
 
 
-Rows = list[dict[str, str]]
-
-
 def _simulated(
     folder: Path, model: str = MODEL, *, poses: int = 4, views: int = 1, **changes: Any
 ) -> Path:

@@ -4,6 +4,7 @@ import base64
 import gzip
 import http.client
 import json
+import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -74,16 +75,30 @@ def found(examined: Examination) -> Detection:
     return examined.detection
 
 
-@pytest.fixture
-def one_image(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
-    """The same view with two images, to be changed."""
+def _one_view(rendered: RepeatedImages, folder: Path) -> RepeatedImages:
+    """Write the same view with two images."""
     entry = json.loads(json.dumps(rendered.entry))
     del entry["views"]["c2"]
     rows = [dict(row) for row in rendered.rows[:2]]
     pictures = {row["image"]: rendered.pictures[row["image"]] for row in rows}
-    made = RepeatedImages(tmp_path / "set", rendered.machine, entry, rows, pictures)
+    made = RepeatedImages(folder / "set", rendered.machine, entry, rows, pictures)
     made.write()
     return made
+
+
+@pytest.fixture(scope="module")
+def of_one_view(rendered: RepeatedImages, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What is found in that view, to be copied."""
+    folder = tmp_path_factory.mktemp("one")
+    detect(_one_view(rendered, folder).path, output=folder / "out")
+    return folder / "out"
+
+
+@pytest.fixture
+def one_image(rendered: RepeatedImages, of_one_view: Path, tmp_path: Path) -> RepeatedImages:
+    """That view and, beside it in the folder out, what is found in it: to be changed."""
+    shutil.copytree(of_one_view, tmp_path / "out")
+    return _one_view(rendered, tmp_path)
 
 
 def test_folder_json_and_summary_tell_the_same(
@@ -207,7 +222,6 @@ def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
     one_image: RepeatedImages, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    detect(one_image.path, output=out)
     rows = read_rows(out / "observations.csv")
     rows[3] |= {"verdict": "rejected", "reason": "a cable", "source": "edited"}
     write_rows(out / "observations.csv", rows)
@@ -227,7 +241,6 @@ def test_an_earlier_detection_is_replaced_and_other_files_are_kept(
     one_image: RepeatedImages, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    detect(one_image.path, output=out)
     (out / "overlays" / "mine.txt").write_text("mine")
     del one_image.rows[1]
     one_image.write()

@@ -200,12 +200,8 @@ def test_corners_are_where_the_camera_projects_them() -> None:
 @pytest.mark.parametrize(
     "name",
     thinned(
-        [
-            *("hexapod", "nategh-agheli", "6-sps", "3-rps", "3-upu-tilted", "hexapod-rod"),
-            *("tricept", "delta", "3-prs", "delta-round-arms"),
-        ],
+        ["nategh-agheli", "tricept", "3-prs", "hexapod", "hexapod-rod", "delta-round-arms"],
         ["nategh-agheli", "tricept", "3-prs"],
-        system=["hexapod", "hexapod-rod", "delta-round-arms"],
     ),
 )
 def test_all_factors_have_the_derivatives_of_finite_differences(name: str) -> None:

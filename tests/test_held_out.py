@@ -32,7 +32,6 @@ from legcal.geometry.types import IntArray
 from legcal.machine.leg import Leg
 from legcal.simulation.observe import moved_outlines
 
-MACHINES = ("6-spu-coplanar", "hexaglide", "3-prs", "3-upu-tilted", "3-rpr")
 N_SEEDS = 2
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 
-MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))
 HALVES = ((0, 1), (2, 3, 4, 5))
 VIEWS = [

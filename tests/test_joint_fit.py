@@ -32,7 +32,6 @@ from fit_sessions import (
     with_board,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
-from thinned import thinned
 
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
@@ -56,7 +55,6 @@ from legcal.machine.leg import ARMS, Leg, ParameterId, parameters_of_legs, radiu
 from legcal.machine.parameters import moved_legs, parametrize
 from legcal.simulation.observe import moved_outlines
 
-MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
 LIKE_OTHERS = ("hexapod-strut", "nategh-agheli", "6-sps", "3-upu-tilted", "3-spr")  # in their legs
 SCALE = 2.5
 
@@ -125,10 +123,10 @@ def starts_far_away(session: MachineSession) -> bool:
 
 @pytest.mark.parametrize(
     ("name", "known_radii"),
-    thinned(
-        [*((name, False) for name in SHIPPED), ("3-upu", True), ("delta-round-arms", True)],
-        lambda name, _: name not in (*LIKE_OTHERS, "3-upu"),  # it has a test of its own
-    ),
+    [
+        *((name, False) for name in SHIPPED if name not in (*LIKE_OTHERS, "3-upu")),
+        ("delta-round-arms", True),
+    ],  # the 3-UPU has a test of its own
 )
 def test_exact_outlines_give_the_truth_from_3_mm_and_1_degree_away(
     name: str, known_radii: bool
@@ -232,7 +230,7 @@ def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Se
     )
 
 
-@pytest.mark.parametrize("name", thinned(SHIPPED, lambda name: name not in LIKE_OTHERS))
+@pytest.mark.parametrize("name", [name for name in SHIPPED if name not in LIKE_OTHERS])
 def test_all_that_identify_calls_determined_is_estimated(name: str) -> None:
     session = machine_session(name)
     ranks = Analysis(session_as_identify_sees_it(session, session.legs)).full

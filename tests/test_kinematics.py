@@ -9,7 +9,6 @@ import pytest
 from layouts import Layout, LegLayout, write_machine
 from machines import MACHINES, SHIPPED, displaced, of_types
 from scipy.spatial.transform import RigidTransform
-from thinned import thinned
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
@@ -36,7 +35,7 @@ def drawn_of(name: str) -> Configurations:
     return random_configurations(machine_of(name), DRAWN, 5)
 
 
-@pytest.fixture(scope="module", params=thinned(SHIPPED, lambda name: name not in LIKE_OTHERS))
+@pytest.fixture(scope="module", params=[name for name in SHIPPED if name not in LIKE_OTHERS])
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

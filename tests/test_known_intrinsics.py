@@ -169,7 +169,6 @@ def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
             ),
         ],
         lambda name, *_: name == "cx",
-        "system",
     ),
 )
 def test_a_camera_that_contradicts_its_covariance_is_named(

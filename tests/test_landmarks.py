@@ -25,7 +25,6 @@ from legcal.machine.rods import ends_at_poses
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
-KINDS = ["hexapod", "3-rpr", "delta", "linear-delta", "servo-hexapod", "orthoglide"]
 ROOT = Path(__file__).parents[1]
 
 

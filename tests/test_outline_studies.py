@@ -149,7 +149,7 @@ def test_a_bias_of_half_a_sigma_is_told_by_its_parameter_and_a_failed_run_is_cou
 # Designs, their bound and sessions
 
 
-@pytest.mark.parametrize("machine", thinned(MACHINES, ["3-rpr"], "system"))
+@pytest.mark.parametrize("machine", thinned(MACHINES, ["3-rpr"]))
 def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
     design, bound, session = _design(machine), _bound(machine), _session(machine)
     solution = one_fit(session, NOISE.radius_sigma)

@@ -26,8 +26,6 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of, parametrize
 
-MACHINES = ("hexapod-rod", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
-
 
 def _motions(nominal: Machine, other: Machine, q: Array) -> Array:
     """Return rotation vectors and displacements of R_e in R_b from one model to another, (k, 6)."""

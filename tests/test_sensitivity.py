@@ -15,7 +15,6 @@ from fit_sessions import (
     noisy_readings,
     with_camera,
 )
-from thinned import thinned
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices
@@ -51,11 +50,9 @@ def notes_on_focal_lengths(solution: Solution) -> list[str]:
     return [note for note in solution.notes if "focal length" in note]
 
 
-@pytest.mark.parametrize(
-    ("camera", "factor"), thinned([(PINHOLE, 0.99), (LENS, 1.01)], lambda camera, _: camera is LENS)
-)
-def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: float) -> None:
-    solution = fitted(irregular_hexapod(12, camera=camera), 0, factor)
+def test_a_focal_length_wrong_by_one_percent_is_noticed() -> None:
+    factor = 1.01
+    solution = fitted(irregular_hexapod(12, camera=LENS), 0, factor)
     (note,) = notes_on_focal_lengths(solution)
     found = float(note.partition("found fx = ")[2].partition(" +-")[0])
     assert found == pytest.approx(1290.0, abs=5.0)
@@ -83,20 +80,10 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
 
 @pytest.mark.parametrize(
     ("camera", "wrong", "start", "words"),
-    thinned(
-        [
-            (LENS, {"k1": 0.0}, "The distortion of c1", "appears not to have been removed"),
-            (PINHOLE, {"k1": -0.1}, "The distortion of c1", "appears to have been removed"),
-            (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
-            (
-                LENS,
-                {"cx": 524.0, "cy": 394.0},
-                "The principal point of c1",
-                "given (524.0, 394.0) px",
-            ),
-        ],
-        lambda _, wrong, *__: wrong in ({"k1": -0.1}, {"cx": 539.0}),
-    ),
+    [
+        (PINHOLE, {"k1": -0.1}, "The distortion of c1", "appears to have been removed"),
+        (PINHOLE, {"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
+    ],
 )
 def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     camera: Camera, wrong: dict[str, float], start: str, words: str

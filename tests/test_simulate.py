@@ -5,7 +5,6 @@ What options of the command give and how wrong ones are refused is in tests/refu
 
 import io
 import json
-import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -201,23 +200,6 @@ def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
     assert m.time.tolist() == [0.0, 10.0, 0.0, 10.0]  # both views take a pose at once
     readings = np.array([[float(x) for x in row.split(",")] for row in rows])
     assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
-
-
-@pytest.mark.slow
-def test_the_python_of_the_description_of_simulated_datasets_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (Path(__file__).parents[1] / "docs" / "simulate.md").read_text()
-    code = next(
-        block for block in text.split("\n\n") if block.startswith("    settings = legcal.Sim")
-    )
-    assert "poses=20" in code
-    code = code.replace("poses=20", "poses=2")
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {"legcal": legcal}
-    exec(textwrap.dedent(code), names)
-    assert names["made"].seen.shape == (6, 6)
-    assert 1e-4 < names["apart"].displacement.mean() < 2e-3
 
 
 def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:

@@ -42,7 +42,7 @@ def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> No
         assert end.solution.outlines.used_keys() == first.solution.outlines.used_keys()
 
 
-@pytest.mark.parametrize("name", thinned(RECORDED_SESSIONS, ["planar"], "system"))
+@pytest.mark.parametrize("name", thinned(RECORDED_SESSIONS, ["planar"]))
 def test_recorded_sessions_give_one_result_from_every_start(name: str) -> None:
     folder = RECORDED / name
     steps = needs_steps(folder)

@@ -1,8 +1,6 @@
 """The paper's evaluation: eq (20), its records, means, table and figure."""
 
 import io
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,16 +33,6 @@ from legcal.simulation.paper import (
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.session import SimulatedSession, streams
 from legcal.simulation.study import StudyResult, run_study
-
-N_RUNS = 2
-STUDY = PaperStudy(n_poses=8)
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]:
-    """Run the study once, with a few runs of few poses."""
-    output = tmp_path_factory.mktemp("study") / "paper"
-    return run_study(STUDY, N_RUNS, output=output), output
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:
@@ -123,57 +111,6 @@ def test_a_session_is_that_of_the_paper(name: str) -> None:
 
 
 # Runs
-
-
-OF_BOUND = {  # least and most root mean squared error over the bound
-    "initial": (30.0, 300.0),
-    "literal": (5.0, 300.0),
-    "default": (1.5, 6.0),
-    "fit": (0.75, 1.25),
-    "bound": (1.0, 1.0),
-}
-
-
-@pytest.mark.slow
-def test_every_estimator_has_a_row_for_either_machine_measured_by_the_bound_of_its_runs(
-    result: tuple[StudyResult, Path],
-) -> None:
-    document = result[0].document()
-    rows = document["rows"]
-    assert [(row["coplanar"], row["estimator"]) for row in rows] == [
-        (coplanar, estimator)
-        for coplanar in (True, False)
-        for estimator in ("literal", "default", "fit", "bound")
-    ]
-    assert all(len(row["parameters_mm"]) == 30 == len(document["names"]) for row in rows)
-    assert all(row["runs"] + row["failed"] == N_RUNS for row in rows)
-    assert [row["coplanar"] for row in document["initial"]] == [True, False]
-    assert all(0.5 < np.mean(row["parameters_mm"]) < 1.5 for row in document["initial"])
-    for row in (*rows, *document["initial"]):
-        low, high = OF_BOUND[row["estimator"]]
-        assert low <= row["of_bound"] <= high
-        assert (row["of_bound_sigma"] > 0.0) == (row["estimator"] != "bound")
-    assert json.loads((result[1] / "study.json").read_bytes()) == document
-
-
-@pytest.mark.slow
-def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bound(
-    result: tuple[StudyResult, Path],
-) -> None:
-    document = result[0].document()
-    rows = {(row["estimator"], row["coplanar"]): row for row in document["rows"]}
-    before = document["initial"][0]["dX_mm"]
-    assert rows["literal", True]["dX_mm"] > before
-    assert rows["default", True]["dX_mm"] < before / 5.0
-    errors = np.array(rows["literal", True]["parameters_mm"])
-    is_z = np.array([name.endswith(".z") for name in document["names"]])
-    assert errors[is_z].mean() > 4.0 * errors[~is_z].max()
-    for coplanar in (True, False):
-        bound = rows["bound", coplanar]
-        assert 0.5 < rows["fit", coplanar]["dX_mm"] / bound["dX_mm"] < 2.0
-        ratio = np.divide(rows["fit", coplanar]["parameters_mm"], bound["parameters_mm"])
-        assert 0.6 < ratio.mean() < 1.5
-        assert rows["default", coplanar]["dX_mm"] > bound["dX_mm"]
 
 
 def test_means_have_their_standard_deviations() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import SHIPPED_YAML
 from scipy.spatial.transform import RigidTransform
 
 import legcal
@@ -29,11 +28,6 @@ from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.visibility import Bodies, in_picture, pixels_inside, visible_parts
 
-SHIPPED = (
-    "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",
-    "hexapod-strut", "nategh-agheli", "tricept",
-)  # fmt: skip
-MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
 FAR = np.array([1.4, 0.3, 0.25])
 MIDDLE = np.array([0.0, 0.0, 0.2])
 
