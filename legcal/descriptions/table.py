@@ -391,10 +391,10 @@ def read_description(
 
 
 def _is_csv(path: Path, content: str) -> bool:
-    """Return whether a table is CSV, from its first line of content; a name decides where none."""
+    """Return whether a table is CSV or a workbook, from its first line, else from its name."""
     lines = (line.strip() for line in content.splitlines())
     first = next((line for line in lines if line and not line.startswith("#")), "")
-    is_csv = path.suffix.lower() == ".csv"
+    is_csv = path.suffix.lower() in (".csv", ".xlsx", ".xls") or content.startswith("PK\x03\x04")
     if re.match(r"""(---|\{|legcal_table|['"]?[\w-]+['"]?\s*:(\s|$))""", first):
         return is_csv and bool(re.search(r"[;\t,]\s*[;\t,]", first))
     return is_csv or any(mark in first for mark in ",;\t")

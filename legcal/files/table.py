@@ -14,8 +14,10 @@ import io
 import math
 import re
 import unicodedata
+import zipfile
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
@@ -44,6 +46,7 @@ _WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)\s*({'|'.join(_UNITS_BELOW)})", re.AS
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
+_BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
 
 Lines = list[tuple[int, list[str]]]  # lines that are not blank: number from 1, stripped cells
@@ -392,12 +395,13 @@ WORDS: dict[str, str] = {
     "diameter": "diameter diam dia durchmesser diametre ø d od",
     "tube": "tube barrel rohr hulse corps fut",
     "rod": "rod stange stangen kolbenstange kolben tige piston",
+    "tool": "tool tcp werkzeug outil",
     "note": "note notes remark remarks comment comments bemerkung bemerkungen kommentar remarque "
     "remarques commentaire",
     "view": "view camera cam viewpoint station setup kamera ansicht stativ standort vue",
     "image": "image img file filename photo photograph picture pic frame shot bild foto datei "
     "dateiname aufnahme cliche fichier",
-    "pose": "pose position pos stellung lage",
+    "pose": "pose poseid poselabel position pos stellung lage",
     "time": "time timestamp datetime date clock elapsed elapsedtime takenat zeit uhrzeit "
     "zeitstempel datum heure temps horodatage",
     "": "of the at der die das des von bei am de du la le au",
@@ -462,7 +466,7 @@ def split_heading(
     name, unit = (match[1], match[2] or match[3] or "") if match else (text, "")
     if others and not unit and (stated := _IN_BRACKETS.fullmatch(text.strip())):
         name, unit = stated[1], stated[2].strip()
-        unit = "" if " " in unit else unit
+        unit = "" if re.fullmatch(r"\w+( [^\W\d_]+)+", unit) else unit
     letters = "".join(letter for letter in _folded(name) if letter.isalnum())
     return letters, "um" if unit in ("µm", "μm") else unit
 
@@ -484,10 +488,7 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     content = content_of(path, noun)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
-        raise DatasetError(
-            f"{path}: the {noun} could not be read: found {workbook}, needed CSV; save the sheet "
-            "as CSV (comma-separated)."
-        )
+        return _sheet(path, noun, content, workbook)
     try:
         text = _decoded(content, loose=loose)
         delimiter = _delimiter(text) if loose else ","
@@ -516,6 +517,41 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
             "in UTF-8; save it again as CSV."
         ) from error
     return [(number, cells) for number, cells in lines if any(cells)]
+
+
+def _sheet(path: Path, noun: str, content: bytes, workbook: str) -> Lines:
+    """Return the lines of the first sheet of a workbook that has a table (``legcal[excel]``)."""
+    try:
+        import openpyxl
+    except ImportError:
+        openpyxl = None
+    remedy = "save the sheet as CSV (comma-separated)"
+    if openpyxl is None:
+        remedy += ", or install legcal[excel] to read XLSX"
+    else:
+        try:
+            book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
+            for sheet in book.worksheets:
+                rows = [list(map(_cell_text, cells)) for cells in sheet.iter_rows(values_only=True)]
+                filled = [max((i + 1 for i, x in enumerate(row) if x), default=0) for row in rows]
+                lines = [(n, row[: max(filled)]) for n, row in enumerate(rows, 1) if any(row)]
+                if len(lines) > 1:
+                    return lines
+            workbook = "an XLSX workbook without a table"
+        except _BAD_WORKBOOK:
+            pass
+    raise DatasetError(
+        f"{path}: the {noun} could not be read: found {workbook}, needed CSV; {remedy}."
+    )
+
+
+def _cell_text(value: object) -> str:
+    """Return the text of a cell of a workbook, numbers with as many digits as they need."""
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return "" if value is None else str(value).strip()
 
 
 def _without_title(lines: Lines) -> Lines:
