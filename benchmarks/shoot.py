@@ -6,7 +6,7 @@ the same machine is photographed at random poses, as an owner chooses them, from
 Both are calibrated; the error of the platform is the mean over the workspace.
 
     python benchmarks/shoot.py --runs 20
-    python benchmarks/shoot.py --runs 2 --rendered
+    python benchmarks/shoot.py --runs 2 --rendered [--camera SMALL.yaml]
 
 With ``--planned`` fewer photographs than ``--images``, the others are those that ``shoot`` finds
 best by what is known then. With ``--rendered`` photographs are checked as they come.
@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=15, help="photographs of a guided session")
     parser.add_argument("--planned", type=int, help="of these, those of the plan")
     parser.add_argument("--plan", type=Path, help="the folder of a plan, in place of a new one")
+    parser.add_argument("--camera", type=Path, help="the camera file, of small images for example")
     parser.add_argument("--unguided", type=int, default=30, help="photographs beside them")
     parser.add_argument("--cameras", type=int, default=3)
     parser.add_argument(
@@ -55,7 +56,10 @@ def main() -> None:
         plan = args.plan or folder / "plan"
         if args.plan is None:
             n = args.planned or args.images
-            write_session(legcal.plan(args.machine, images=n, cameras=args.cameras), plan)
+            planned = legcal.plan(
+                args.machine, images=n, cameras=args.cameras, camera=args.camera
+            )
+            write_session(planned, plan)
         for seed in range(args.first, args.first + args.runs):
             here = folder / str(seed)
             try:

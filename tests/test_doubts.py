@@ -39,7 +39,7 @@ from legcal.calibration.verdict import judge
 from legcal.errors import DatasetError
 from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
-from legcal.report.calibration_page import next_steps
+from legcal.report.calibration import next_steps
 from legcal.simulation.settings import Level
 
 pytestmark = pytest.mark.usefixtures("without_steps")

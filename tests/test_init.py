@@ -103,12 +103,10 @@ def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(
     (tmp_path / "own.csv").write_text("\n".join(lines))
     before = snapshot(tmp_path / "photos")
     camera = HEXAPOD / "camera_info.yaml"
-    assert init(monkeypatch, tmp_path, "--camera", str(camera)) == 2
-    said = capsys.readouterr().err
-    assert "look like lengths of legs in mm; add --lengths" in said
-    words = ("--camera", str(camera), "--lengths", "--encoder-sigma", "2um")
+    words = ("--camera", str(camera), "--encoder-sigma", "2um")
     assert init(monkeypatch, tmp_path, *words) == 0
     out = " ".join(capsys.readouterr().out.split())
+    assert "Unit of the whole lengths of legs: mm" in out
     assert "45 photographs, 3 views, 6 encoders" in out
     assert "whatever its extension" in out
     assert "'Remark'" in out
@@ -235,6 +233,8 @@ def test_a_title_and_a_row_of_units_are_no_readings(
         (LEGS, 40.0, 0.0, ("--unit", "40 steps/mm")),
         ([f"LEG{j}_prismatic/mm" for j in range(1, 7)], 1.0, 345.0, ("--lengths",)),
         (LEGS, 1e-3, 345.0, ("--lengths",)),
+        ([f"Zylinder {j} (Länge) [mm]" for j in range(1, 7)], 1.0, 345.0, ()),
+        ([f"Vérin {j}" for j in range(1, 7)], 1.0, 345.0, ()),
     ],
 )
 def test_units_and_columns_are_found(
@@ -263,7 +263,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"names": ["1.5"] * 6}, (), ("numbers in the first line", "leg1")),
     (FLAT, {"names": ["a", "b", "c", "d", "e", "f"]}, (), ("'a'", "L1, q1, 1")),
     (FLAT, {"names": [*LEGS[:5], "leg5 mm"]}, (), ("'leg5'", "'leg5 mm'")),
-    (FLAT, {"add": 345.0}, (), ("lengths of legs in mm", "add --lengths")),
+    (FLAT, {"add": 345.0}, ("--unit", "m"), ("lengths of legs in mm", "add --lengths")),
     (FLAT, {}, ("--lengths",), ("readings in mm", "leave out --lengths")),
     (FLAT, {}, ("--unit", "m"), ("readings in mm", "state the unit mm")),
     (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),

@@ -215,8 +215,8 @@ def calibrate(
     page_of.say()
     show(
         as_json,
-        lambda: found.result.document(),
-        lambda: calibration.summary(found, output, verbose=verbose),
+        lambda: calibration.document(found, output, command_line()),
+        lambda: calibration.summary(found, output, command_line(), verbose=verbose),
     )
     if not found.verdict.trustworthy:
         raise typer.Exit(1)

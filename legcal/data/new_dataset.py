@@ -257,7 +257,7 @@ def plan_new_dataset(
         table=path,
         destination=destination,
         columns=sheet.taken,
-        are_lengths=options.lengths,
+        are_lengths=sheet_readings.are_lengths,
         rows=rows,
         poses=sheet.text("pose") if "pose" in sheet else (),
         matching=matching,

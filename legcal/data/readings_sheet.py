@@ -33,7 +33,15 @@ from legcal.data.reading_units import (
 from legcal.errors import DatasetError, Place, UsageError
 from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN, unit_size
 from legcal.files.schema import describe
-from legcal.files.table import Column, Lines, is_number, read_table, split_heading
+from legcal.files.table import (
+    WORDS,
+    Column,
+    Lines,
+    concepts,
+    is_number,
+    read_table,
+    split_heading,
+)
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
@@ -43,15 +51,9 @@ LEAST_USED = 0.01  # minimum fraction of the travel in use: with less, the unit 
 GUESSED = {False: ("m", "mm"), True: ("rad", "deg", PULSES)}
 READING_ANGLES = (*ANGLE, PULSES)
 _DECIMALS = 12  # of readings in metres and radians
-_HEADINGS = {
-    "view": ("view", "camera", "cam", "cameraposition", "viewpoint", "station", "setup"),
-    "image": ("image", "img", "file", "filename", "imagefile", "name", "photo", "photograph",
-              "photofile", "picture", "pic", "imagename", "photoname", "frame", "shot"),
-    "pose": ("pose", "poseid", "posenumber", "posename", "poselabel"),
-    "time": ("time", "timestamp", "datetime", "date", "takenat", "clock", "elapsed", "elapsedtime"),
-}  # fmt: skip
 _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_TIME = re.compile(rf"(?:{'|'.join(_HEADINGS['time'])}|t)({'|'.join(_SECONDS)})")
+_COLUMNS = ("view", "image", "pose", "time")
+_TIME = re.compile(rf"(?:{WORDS['time'].replace(' ', '|')}|t)({'|'.join(_SECONDS)})")
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 # Units at the end of a heading without brackets that would else be part of a name
 _FOREIGN = {
@@ -68,6 +70,7 @@ class SheetReadings:
     digits: Array  # (n_motors,) the size of the last digit [m or rad]
     units: tuple[ReadingUnit, ...]  # of each motor
     unit_from: str  # origin of the units, in words
+    are_lengths: bool  # whether they are written as whole lengths of legs
 
     @property
     def unit(self) -> str:
@@ -135,7 +138,7 @@ class ReadingsSheet:
             Unit of the motors of its kind, sliding or turning; by default the unit of the headings,
             else the unit in which readings lie in the travel.
         lengths : bool
-            Whether the columns are whole lengths of legs.
+            Whether the columns are whole lengths of legs; they are too if nothing else fits.
 
         Raises
         ------
@@ -143,7 +146,7 @@ class ReadingsSheet:
             If the unit cannot be decided or is certainly wrong, or with a sentence for each
             reading outside its travel.
         """
-        units, unit_from = self._units(unit, lengths)
+        units, unit_from, lengths = self._units(unit, lengths)
         texts = [self._table.text(joint) for joint in self._joints]
         q = joint_values(self._table.numbers(self._joints), units)
         q = readings_of_lengths(q, self.motors) if lengths else q
@@ -169,10 +172,12 @@ class ReadingsSheet:
         self._table.check()
         digits = [min(int(Decimal(x).as_tuple().exponent) for x in column) for column in texts]
         last = [abs(unit.size) * 10.0**digit for digit, unit in zip(digits, units, strict=True)]
-        return SheetReadings(q, np.array(last), units, unit_from)
+        return SheetReadings(q, np.array(last), units, unit_from, lengths)
 
-    def _units(self, option: str | None, lengths: bool) -> tuple[tuple[ReadingUnit, ...], str]:
-        """Return the unit of the readings of each motor, and the origin of the units in words."""
+    def _units(
+        self, option: str | None, lengths: bool
+    ) -> tuple[tuple[ReadingUnit, ...], str, bool]:
+        """Return the unit of each motor, the origin of the units, whether they are of lengths."""
         self._refuse_options(option, lengths)
         unit_of_motor, origins = dict[int, ReadingUnit](), list[str]()
         for turning in (False, True):
@@ -188,8 +193,9 @@ class ReadingsSheet:
             meaning, origin = of_kind.meaning(option if is_of_kind else None)
             unit_of_motor |= dict(zip(some, meaning.units, strict=True))
             origins.append(origin)
+            lengths = lengths or meaning.are_lengths
         units = tuple(unit_of_motor[j] for j in range(len(self.motors)))
-        return units, " and ".join(dict.fromkeys(origins))
+        return units, " and ".join(dict.fromkeys(origins)), lengths
 
     def _refuse_options(self, option: str | None, lengths: bool) -> None:
         """Refuse a unit that no motor has, and lengths of legs that have none."""
@@ -228,7 +234,7 @@ class _Headings:
 
     def columns(self) -> list[Column]:
         """Return the columns of the table once its headings are understood."""
-        texts = [Column(name, "text", required=False) for name in _HEADINGS]
+        texts = [Column(name, "text", required=False) for name in _COLUMNS]
         return [*texts, *(Column(joint, what="reading") for joint in self.joints)]
 
     def reshape(self, lines: Lines) -> Lines:
@@ -246,9 +252,9 @@ class _Headings:
         meaning: dict[int, str] = {}
         clock: dict[int, float] = {}  # seconds in a unit of a column of times
         for i, (key, _) in enumerate(split):
-            for name, words in _HEADINGS.items():
+            for name in _COLUMNS:
                 timed = _TIME.fullmatch(key) if name == "time" else None
-                if (key in words or timed) and name not in meaning.values():
+                if (_means(header[i]) == name or timed) and name not in meaning.values():
                     meaning[i] = name
                 if timed and meaning.get(i) == name:
                     clock = {i: _SECONDS[timed[1]]}
@@ -322,6 +328,16 @@ class _Headings:
         )
 
 
+def _means(heading: str) -> str:
+    """Return which of the columns beside readings a heading speaks of, "" if none."""
+    what = set(concepts(heading)) - {"name", "number"}
+    if not what and "name" in concepts(heading):
+        return "image"
+    if what == {"view", "pose"}:  # camera position
+        return "view"
+    return next((name for name in _COLUMNS if what == {name}), "")
+
+
 def _is_known(unit: str) -> bool:
     """Return whether readings may have a unit."""
     return unit == PULSES or is_length(unit) or unit_size(unit, ANGLE) is not None
@@ -387,6 +403,10 @@ class _MotorsOfKind:
         named = [m for m in meanings(self.values, self.legs, tried)
                  if m.are_lengths is self.lengths]  # fmt: skip
         fitting = [m for m in named if self.fits(m)]
+        if not fitting and not self.lengths:
+            whole = [m for m in meanings(self.values, self.legs, tried) if m.are_lengths]
+            if fitting := list(filter(self.fits, whole)):
+                origin += ", whole lengths of legs, as no reading is in the travel"
         if not fitting:
             self._refuse_other(named)
             fitting = [m for m in named if self.fits(m, moving=False)]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
@@ -69,7 +70,9 @@ from legcal.files.table import (
     Column,
     Lines,
     Table,
+    concepts,
     header_problem,
+    in_unit,
     is_number,
     read_table,
     split_heading,
@@ -390,12 +393,13 @@ def read_description(
 
 
 def _is_csv(path: Path, content: str) -> bool:
-    """Return whether a table is CSV, from its first line of content; a name decides where none."""
+    """Return whether a table is CSV or a workbook, from its first line, else from its name."""
     lines = (line.strip() for line in content.splitlines())
     first = next((line for line in lines if line and not line.startswith("#")), "")
-    if re.match(r"""(---|\{|['"]?[\w-]+['"]?\s*:(\s|$))""", first):
-        return False
-    return path.suffix.lower() == ".csv" or any(mark in first for mark in ",;\t")
+    is_csv = path.suffix.lower() in (".csv", ".xlsx", ".xls") or content.startswith("PK\x03\x04")
+    if re.match(r"""(---|\{|legcal_table|['"]?[\w-]+['"]?\s*:(\s|$))""", first):
+        return is_csv and bool(re.search(r"[;\t,]\s*[;\t,]", first))
+    return is_csv or any(mark in first for mark in ",;\t")
 
 
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
@@ -781,29 +785,32 @@ def _check_legs(described: Description, problems: Problems) -> None:
         )
 
 
-SIDES = {
-    "base": ("base", "bottom", "fixed", "ground", "lower", "a"),
-    "platform": ("platform", "plat", "top", "moving", "mobile", "upper", "effector", "p", "t"),
+_OF_CONCEPTS = {  # columns by what their headings speak of, legs and joints aside
+    frozenset(key.split()): column
+    for column, keys in {
+        "type": ("type",),
+        "unit": ("unit",),
+        "leg": ("number", "name"),
+        "offset": ("zero length", "reading 0", "length 0"),
+        "length": ("rod length",),
+        "min_length": ("min length", "short", "short length"),
+        "max_length": ("max length", "long", "long length"),
+        "stroke": ("stroke", "length stroke"),
+        "travel_low": ("min reading", "min stroke"),
+        "travel_high": ("max reading", "max stroke"),
+        "radius": ("radius",),
+        "tube": ("tube", "tube radius"),
+        "rod": ("rod", "rod radius"),
+        "diameter": ("diameter",),
+        "tube diameter": ("tube diameter",),
+        "rod diameter": ("rod diameter",),
+        "note": ("note",),
+    }.items()
+    for key in keys
 }
-_OTHER = {
-    "leg": ("leg", "name", "legname", "nr", "no", "number", "id"),
-    "type": ("type", "legtype"),
-    "unit": ("unit", "units"),
-    "offset": ("offset", "q0", "l0", "lengthatzero", "zerolength"),
-    "min_length": ("minlength", "lmin", "lengthmin", "minl", "shortest", "minimumlength"),
-    "max_length": ("maxlength", "lmax", "lengthmax", "maxl", "longest", "maximumlength"),
-    "travel_low": ("travellow", "travelmin", "qmin", "mintravel", "lowestreading"),
-    "travel_high": ("travelhigh", "travelmax", "qmax", "maxtravel", "highestreading"),
-    "radius": ("radius", "legradius"),
-    "tube": ("tube", "tuberadius"),
-    "rod": ("rod", "rodradius"),
-}
+_DIAMETERS = {"diameter": "radius", "tube diameter": "tube", "rod diameter": "rod"}
 _NOT_LENGTHS = ("deg", "-")  # units of other columns
-_POINT = ("point", "joint", "name", "id", "label")
-_WORDS = "|".join(sorted([*SIDES["base"], *SIDES["platform"], "b"], key=len, reverse=True))
-_COORDINATE = re.compile(rf"({_WORDS})(?:joints?|points?)?(\d*)([xyz])(\d*)")
-_COORDINATE_FIRST = re.compile(rf"([xyz])({_WORDS})(\d*)")
-_NAMED = re.compile(rf"({_WORDS})(?:joints?|points?|legs?)?0*(\d{{1,3}})")
+_LETTERS = ("a", "b", "p", "t")  # of sides, as in A1
 _XYZ = ("x", "y", "z")
 _RADII = ("radius", "tube", "rod")
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
@@ -935,45 +942,91 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     """
     lines = _with_headings(lines, path)
     number, header = lines[0]
-    split = [split_heading(text, others=True) for text in header]
-    keys = [key for key, _ in split]
-    stated = {unit for (_, unit), text in zip(split, header, strict=True) if text not in names}
-    units = sorted(stated - {"", *_NOT_LENGTHS})
-    if len(units) > 1 or (units and units[0] not in LENGTH):
+    units = [split_heading(text, others=True)[1] for text in header]
+    of_lengths = [
+        unit
+        for unit, text in zip(units, header, strict=True)
+        if text not in names and unit not in ("", *_NOT_LENGTHS)
+    ]
+    if unknown := sorted({unit for unit in of_lengths if unit not in LENGTH}):
         raise DatasetError(
-            f"{path}, header: the unit could not be decided: found {' and '.join(units)}, needed "
-            f"one of {', '.join(LENGTH)} for all lengths; correct the headings."
+            f"{path}, header: the unit could not be decided: found {' and '.join(unknown)}, needed "
+            f"one of {', '.join(LENGTH)}; correct the headings."
         )
-    if {"x", "y"} <= set(keys) and len(lines) > 1:
-        lines = _from_points(lines, keys, path)
-        keys = [split_heading(text)[0] for text in lines[0][1]]
-    coordinates = [_coordinate(key) for key in keys]
+    if of_lengths:  # all lengths in that of the first
+        sizes = [Decimal(repr(LENGTH.get(unit, 1.0))) for unit in (*units, of_lengths[0])]
+        factors = [
+            size / sizes[-1] if unit in of_lengths else Decimal(1)
+            for size, unit in zip(sizes, units, strict=False)
+        ]
+        lines = _scaled(lines, factors)
+    lines = [(number, [_column(text, names) for text in header]), *lines[1:]]
+    if {"x", "y"} <= set(lines[0][1]) and len(lines) > 1:
+        lines = _from_points(lines, path)
+    coordinates = [_place(text) for text in lines[0][1]]
     sides = _sides(side for side, *_ in filter(None, coordinates))
     if any(coordinate is not None and coordinate[1] for coordinate in coordinates):
         lines = _from_one_row(lines, coordinates, sides, path)
-        header = lines[0][1]
     else:
-        plain = {split_heading(name)[0]: name for name in names}
-        plain |= {word: name for name, words in _OTHER.items() for word in words}
-        header = [
-            f"{sides[coordinate[0]]}_{coordinate[2]}"
-            if coordinate
-            else plain.get(key, text.lower())
-            for coordinate, key, text in zip(coordinates, keys, lines[0][1], strict=True)
-        ]
-    below = lines[1:]
-    if "leg" in header and all(
-        len(cells) == len(header) and cells[header.index("leg")].isdigit() for _, cells in below
-    ):
-        at = header.index("leg")
-        below = [
-            (line, [f"leg{cell}" if i == at else cell for i, cell in enumerate(cells)])
-            for line, cells in below
-        ]
-    if units and "unit" not in header:
-        n, header = len(header), [*header, "unit"]
-        below = [(line, [*cells, units[0]] if len(cells) == n else cells) for line, cells in below]
-    return [(number, header), *below]
+        named = zip(coordinates, lines[0][1], strict=True)
+        header = [f"{sides[x[0]]}_{x[2]}" if x and x[2] else text for x, text in named]
+        lines = [(number, header), *lines[1:]]
+    return _of_legs(lines, of_lengths[0] if of_lengths else "")
+
+
+def _column(text: str, names: Sequence[str]) -> str:
+    """Return the column of a heading by its exact name or by what it speaks of; others as it is."""
+    plain = {split_heading(name)[0]: name for name in names}
+    if (key := split_heading(text, others=True)[0]) in plain:
+        return plain[key]
+    found = concepts(text)
+    if found and set(found) <= {*_XYZ, "joint"} and len(set(found) & {*_XYZ}) == 1:
+        return next(x for x in found if x in _XYZ)
+    what = frozenset(found) - {"leg", "joint"}
+    if not what and "leg" in found:
+        return "leg"
+    return _OF_CONCEPTS.get(what, text.lower())
+
+
+def _scaled(lines: Lines, factors: Sequence[Decimal]) -> Lines:
+    """Return the numbers of columns times their factors."""
+    scaled = [lines[0]]
+    for line, cells in lines[1:]:
+        pairs = zip(cells, factors, strict=False)
+        some = [in_unit(cell, factor) if factor != 1 else cell for cell, factor in pairs]
+        scaled.append((line, some + cells[len(some) :]))
+    return scaled
+
+
+def _of_legs(lines: Lines, unit: str) -> Lines:
+    """Return lines with diameters halved, strokes added, legs named, remarks gone."""
+    (number, header), n = lines[0], len(lines[0][1])
+    lines = _scaled(
+        lines, [Decimal("0.5") if name in _DIAMETERS else Decimal(1) for name in header]
+    )
+    add_stroke = "stroke" in header and "min_length" in header and "max_length" not in header
+    kept = [i for i, name in enumerate(header) if name != "note"]
+    below: Lines = []
+    for line, cells in lines[1:]:
+        if len(cells) == n:
+            row = dict(zip(header, cells, strict=True))
+            if add_stroke and is_number(row["stroke"]) and is_number(row["min_length"]):
+                cells[header.index("stroke")] = str(
+                    Decimal(row["min_length"]) + Decimal(row["stroke"])
+                )
+            if leg := row.get("leg", ""):
+                cells[header.index("leg")] = f"leg{leg}" if leg.isdigit() else _plain(leg)
+            cells = [*(cells[i] for i in kept), *([unit] if unit and "unit" not in header else [])]
+        below.append((line, cells))
+    names = {**_DIAMETERS, **({"stroke": "max_length"} if add_stroke else {})}
+    header = [names.get(header[i], header[i]) for i in kept]
+    return [(number, [*header, *(["unit"] if unit and "unit" not in header else [])]), *below]
+
+
+def _plain(name: str) -> str:
+    """Return a name in the letters that files and joints can have."""
+    ascii_letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    return re.sub(r"[^\w.-]+", "_", ascii_letters).strip("_") if not is_plain_name(name) else name
 
 
 def _with_headings(lines: Lines, path: object) -> Lines:
@@ -981,7 +1034,7 @@ def _with_headings(lines: Lines, path: object) -> Lines:
     first = lines[0][1]
     if sum(is_number(text) for text in first) < 2:
         return lines
-    if len(first) in (3, 4) and _NAMED.fullmatch(split_heading(first[0])[0]):
+    if len(first) in (3, 4) and _joint(first[0]):
         return [(lines[0][0], ["point", *_XYZ[: len(first) - 1]]), *lines]
     raise DatasetError(
         f"{path}: the joints could not be read: found numbers in the first line, needed headings "
@@ -990,19 +1043,33 @@ def _with_headings(lines: Lines, path: object) -> Lines:
     )
 
 
-def _coordinate(key: str) -> tuple[str, str, str] | None:
-    """Return side, number ("" if none) and coordinate of the heading of a joint."""
-    if match := _COORDINATE.fullmatch(key):
-        return None if match[2] and match[4] else (match[1], match[2] or match[4], match[3])
-    if match := _COORDINATE_FIRST.fullmatch(key):
-        return match[2], match[3], match[1]
-    return None
+def _place(text: str) -> tuple[str, str, str] | None:
+    """Return side, number and coordinate ("" if none) of the heading or the name of a joint.
+
+    A word for the side (A1 (Boden)) counts more than a letter.
+    """
+    found = concepts(text)
+    letters = [x for x in found if x in _LETTERS]
+    sides = {x for x in found if x in ("base", "platform")} or set(letters)
+    numbers, axes = [x for x in found if x.isdigit()], [x for x in found if x in _XYZ]
+    others = set(found) - {*sides, *letters, *numbers, *axes, "joint", "leg", "number", "name"}
+    if len(sides) != 1 or max(len(letters), len(numbers), len(axes)) > 1 or others:
+        return None
+    if not numbers and not axes:
+        return None
+    return sides.pop(), "".join(numbers), "".join(axes)
+
+
+def _joint(name: str) -> tuple[str, str] | None:
+    """Return the side and the number of the leg in the name of a joint."""
+    place = _place(name)
+    return (place[0], place[1]) if place and place[1] and not place[2] else None
 
 
 def _sides(words: Iterable[str]) -> dict[str, str]:
     """Return the side of each word; B is the platform if there is an A."""
-    side_of = {word: side for side, all_words in SIDES.items() for word in all_words}
-    return side_of | {"b": "platform" if "a" in set(words) else "base"}
+    platform = {"base": "base", "platform": "platform", "a": "base", "p": "platform"}
+    return platform | {"t": "platform", "b": "platform" if "a" in set(words) else "base"}
 
 
 def _from_one_row(
@@ -1031,25 +1098,26 @@ def _from_one_row(
     return _rows(joints, others, (number, rows[0][0]))
 
 
-def _from_points(lines: Lines, keys: Sequence[str], path: Path) -> Lines:
+def _from_points(lines: Lines, path: Path) -> Lines:
     """Return a row for each leg, from a table with a row for each joint.
 
     A joint is named in one column, or in two: side and number of the leg.
     """
     number, header = lines[0]
-    axes = {key: i for i, key in enumerate(keys) if key in _XYZ}
-    of_name = [i for i, key in enumerate(keys) if key in _POINT] or [
-        i for i, key in enumerate(keys) if key not in (*_XYZ, *_OTHER["unit"])
-    ]
-    known = {*axes.values(), *of_name[:2]}
-    for i, (key, text) in enumerate(zip(keys, header, strict=True)):
-        if i not in known and key not in _OTHER["unit"]:
+    axes = {text: i for i, text in enumerate(header) if text in _XYZ}
+    others = [i for i, text in enumerate(header) if text not in (*_XYZ, "unit", "note")]
+    of_name = [i for i in others if "joint" in concepts(header[i]) or header[i] == "leg"] or others
+    if len(of_name) < 2 and (more := [i for i in others if "side" in concepts(header[i])]):
+        of_name = [*of_name, *(i for i in more if i not in of_name)]
+    known = of_name[:2]
+    for i in others:
+        if i not in known:
             raise DatasetError(
                 header_problem(
                     path,
-                    f"the unknown column {describe(text)}",
+                    f"the unknown column {describe(header[i])}",
                     "those of a table with a row for each joint",
-                    closest(key, ["point", *_XYZ, "unit"]),
+                    closest(header[i], ["point", *_XYZ, "unit"]),
                     Code.UNKNOWN_COLUMN,
                 )
             )
@@ -1064,12 +1132,9 @@ def _from_points(lines: Lines, keys: Sequence[str], path: Path) -> Lines:
             refuse(row, line, f"{len(cells)} cells", f"{len(header)} as in the header")
             continue
         words = [cells[i] for i in of_name[:2]]
-        spelt = [
-            "".join(split_heading(word)[0] for word in order) for order in (words, words[::-1])
-        ]
-        match = next((match for text in spelt if (match := _NAMED.fullmatch(text))), None)
+        joint = _joint(" ".join(words))
         stated = describe(" ".join(words)) if "".join(words) else "no name"
-        if match is None:
+        if joint is None:
             needed = "a name of side and number such as B1 and P1, or base1 and platform1"
             refuse(row, line, stated, needed, *(header[i] for i in of_name[:2]))
             continue
@@ -1077,7 +1142,7 @@ def _from_points(lines: Lines, keys: Sequence[str], path: Path) -> Lines:
             if not is_number(cells[i]) and (cells[i] or axis != "z"):
                 found = describe(cells[i]) if cells[i] else "an empty cell"
                 refuse(row, line, found, f"a number below {MAX_NUMBER:g}", header[i])
-        named.append((row, line, stated, match[1], match[2], cells))
+        named.append((row, line, stated, *joint, cells))
     sides = _sides(side for _, _, _, side, *_ in named)
     joints: dict[int, dict[str, str]] = {}
     for row, line, stated, side, leg, cells in named:
@@ -1088,7 +1153,13 @@ def _from_points(lines: Lines, keys: Sequence[str], path: Path) -> Lines:
     if problems:
         problems.sort(key=lambda problem: problem.line or 0)
         raise DatasetError(problems)
-    return _rows(joints, {}, (number, lines[1][0]))
+    units = {cells[header.index("unit")] for *_, cells in named} if "unit" in header else set()
+    if len(units) > 1:
+        raise DatasetError(
+            f"{path}: the unit could not be decided: found {' and '.join(sorted(units))}, needed "
+            "the same in all lines; correct the column 'unit'."
+        )
+    return _rows(joints, dict(zip(["unit"], units, strict=False)), (number, lines[1][0]))
 
 
 def _rows(joints: dict[int, dict[str, str]], others: dict[str, str], at: tuple[int, int]) -> Lines:

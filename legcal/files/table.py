@@ -13,8 +13,12 @@ import csv
 import io
 import math
 import re
+import unicodedata
+import zipfile
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
+from decimal import Decimal
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -38,9 +42,11 @@ _MAX_NAMED = 10  # maximum number of columns named in a sentence
 _TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # Windows-1252, without rare characters
 _COMMENTS = re.compile(r"\A(?:\s*#[^\n]*\n)+")  # above the headings
 _UNITS_BELOW = (*LENGTH, *ANGLE, "us", "s")  # units of a row below the headings
+_WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)\s*({'|'.join(_UNITS_BELOW)})", re.ASCII)
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
-_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?", re.ASCII)
+_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
+_BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
 
 Lines = list[tuple[int, list[str]]]  # lines that are not blank: number from 1, stripped cells
@@ -360,7 +366,85 @@ def _number_in(text: str) -> float:
     return value if math.isfinite(value) else math.nan
 
 
+# Headings
+
+# Words of headings and of names of joints, as _folded writes them: English, German, French
+WORDS: dict[str, str] = {
+    "base": "base bottom fixed ground lower basis boden bodenplatte grundplatte gestell sockel "
+    "unten fest socle embase bas fixe sol bati inferieur",
+    "platform": "platform plat top moving mobile upper effector plattform oben beweglich nacelle "
+    "plateforme plateau haut superieur",
+    "joint": "joint joints point points pt gelenk gelenke gelenkpunkt punkt kugelgelenk kardan "
+    "articulation rotule liaison centre center mitte",
+    "leg": "leg legs strut struts cylinder cylinders actuator limb axis drive motor bein strebe "
+    "stab zylinder aktuator aktor antrieb achse spindel jambe verin axe actionneur moteur",
+    "name": "name label id bezeichnung nom designation",
+    "number": "number nr no num nummer numero #",
+    "side": "side seite cote",
+    "type": "type typ",
+    "unit": "unit units einheit einheiten unite",
+    "length": "length len lengths l lange langen laenge longueur",
+    "min": "min minimum minimal minimale lowest low kleinste mini",
+    "max": "max maximum maximal maximale highest high grosste maxi",
+    "short": "shortest kurzeste kuerzeste",
+    "long": "longest langste laengste",
+    "reading": "reading readings q travel lesung wert lecture",
+    "stroke": "stroke hub verfahrweg course",
+    "zero": "zero null nulle",
+    "radius": "radius radien rayon",
+    "diameter": "diameter diam dia durchmesser diametre ø d od",
+    "tube": "tube barrel rohr hulse corps fut",
+    "rod": "rod stange stangen kolbenstange kolben tige piston",
+    "tool": "tool tcp werkzeug outil",
+    "note": "note notes remark remarks comment comments bemerkung bemerkungen kommentar remarque "
+    "remarques commentaire",
+    "view": "view camera cam viewpoint station setup kamera ansicht stativ standort vue",
+    "image": "image img file filename photo photograph picture pic frame shot bild foto datei "
+    "dateiname aufnahme cliche fichier",
+    "pose": "pose poseid poselabel position pos stellung lage",
+    "time": "time timestamp datetime date clock elapsed elapsedtime takenat zeit uhrzeit "
+    "zeitstempel datum heure temps horodatage",
+    "": "of the at der die das des von bei am de du la le au",
+    **{letter: letter for letter in ("x", "y", "z", "a", "b", "p", "t")},
+}
+_CONCEPTS = {word: concept for concept, words in WORDS.items() for word in words.split()}
+_TOKEN = re.compile(r"\d+|[^\W\d_]+|#")
 _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]+)[\])]")
+
+
+def concepts(text: str) -> tuple[str, ...]:
+    """Return the concepts of a heading or a name, keys of WORDS, and its numbers.
+
+    Compounds are divided (``Bodengelenk 1`` is base, joint, 1). Words that are not known give
+    nothing in brackets, and no concept at all elsewhere.
+    """
+    found = list[str]()
+    name = match[1] if (match := _heading_with(tuple(LENGTH)).fullmatch(text.strip())) else text
+    for k, part in enumerate(re.split(r"[\[(]([^\])]*)[\])]", _folded(name))):
+        for token in _TOKEN.findall(part):
+            known = (token.lstrip("0") or "0",) if token.isdigit() else _divided(token)
+            if known is None and k % 2 == 0:
+                return ()
+            found += known or ()
+    return tuple(filter(None, found))
+
+
+@cache
+def _divided(token: str) -> tuple[str, ...] | None:
+    """Return the concepts of a word, or of the known words that it is made of."""
+    if token in _CONCEPTS:
+        return (_CONCEPTS[token],)
+    for end in range(len(token) - 1, 0, -1):
+        if token[:end] in _CONCEPTS and (rest := _divided(token[end:])) is not None:
+            return (_CONCEPTS[token[:end]], *rest)
+    return None
+
+
+def _folded(text: str) -> str:
+    """Return a text in small letters without accents, words at a hyphen joined."""
+    decomposed = unicodedata.normalize("NFKD", text.replace("⌀", "ø").casefold())
+    plain = "".join(letter for letter in decomposed if not unicodedata.combining(letter))
+    return re.sub(r"(?<=[^\W\d_])-(?=[^\W\d_])", "", plain)
 
 
 @cache
@@ -376,14 +460,23 @@ def split_heading(
     """Return a heading in small letters and digits alone, and its unit (of length) or "".
 
     ``Leg 1 [mm]``, ``leg1_mm`` and ``LEG-1 (mm)`` are all ``leg1`` in ``mm``. With *others* any
-    text in brackets is a unit, whether it is known or not.
+    word in brackets is a unit, whether it is known or not; several words are a remark.
     """
     match = _heading_with(tuple(units)).fullmatch(text.strip())
     name, unit = (match[1], match[2] or match[3] or "") if match else (text, "")
     if others and not unit and (stated := _IN_BRACKETS.fullmatch(text.strip())):
         name, unit = stated[1], stated[2].strip()
-    letters = "".join(letter for letter in name.casefold() if letter.isalnum())
+        unit = "" if re.fullmatch(r"\w+( [^\W\d_]+)+", unit) else unit
+    letters = "".join(letter for letter in _folded(name) if letter.isalnum())
     return letters, "um" if unit in ("µm", "μm") else unit
+
+
+def in_unit(cell: str, size: Decimal) -> str:
+    """Return a number times a size, as decimal as it was written; other cells unchanged."""
+    return str(Decimal(cell) * size) if is_number(cell) else cell
+
+
+# Files
 
 
 def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
@@ -395,10 +488,7 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     content = content_of(path, noun)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
-        raise DatasetError(
-            f"{path}: the {noun} could not be read: found {workbook}, needed CSV; save the sheet "
-            "as CSV (comma-separated)."
-        )
+        return _sheet(path, noun, content, workbook)
     try:
         text = _decoded(content, loose=loose)
         delimiter = _delimiter(text) if loose else ","
@@ -429,11 +519,64 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     return [(number, cells) for number, cells in lines if any(cells)]
 
 
+def _sheet(path: Path, noun: str, content: bytes, workbook: str) -> Lines:
+    """Return the lines of the first sheet of a workbook that has a table (``legcal[excel]``)."""
+    try:
+        import openpyxl
+    except ImportError:
+        openpyxl = None
+    remedy = "save the sheet as CSV (comma-separated)"
+    if openpyxl is None:
+        remedy += ", or install legcal[excel] to read XLSX"
+    else:
+        try:
+            book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
+            for sheet in book.worksheets:
+                rows = [list(map(_cell_text, cells)) for cells in sheet.iter_rows(values_only=True)]
+                filled = [max((i + 1 for i, x in enumerate(row) if x), default=0) for row in rows]
+                lines = [(n, row[: max(filled)]) for n, row in enumerate(rows, 1) if any(row)]
+                if len(lines) > 1:
+                    return lines
+            workbook = "an XLSX workbook without a table"
+        except _BAD_WORKBOOK:
+            pass
+    raise DatasetError(
+        f"{path}: the {noun} could not be read: found {workbook}, needed CSV; {remedy}."
+    )
+
+
+def _cell_text(value: object) -> str:
+    """Return the text of a cell of a workbook, numbers with as many digits as they need."""
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return "" if value is None else str(value).strip()
+
+
 def _without_title(lines: Lines) -> Lines:
-    """Return lines without those above the headings that have a single cell."""
+    """Return the headings and what is below, without titles above and remarks below.
+
+    These fill few cells. A line above headings that repeat (``X Y Z X Y Z``) names their groups.
+    """
     widths = [sum(map(bool, cells)) for _, cells in lines]
-    start = next((k for k, n in enumerate(widths) if n > 1 or max(widths) < 3), 0)
-    return lines[start:]
+    if max(widths, default=0) < 3:
+        return lines
+    start = next(k for k, n in enumerate(widths) if 2 * n > max(widths))
+    end = len(lines)
+    while end > start + 1 and widths[end - 1] == 1 and not is_number("".join(lines[end - 1][1])):
+        end -= 1
+    number, header = lines[start]
+    named = [name for name in header if name]
+    if start and widths[start - 1] > 1 and len({*named}) < len(named):
+        above, group = lines[start - 1][1], ""
+        above = above + [""] * (len(header) - len(above))
+        joined = []
+        for name, over in zip(header, above, strict=False):
+            group = over or group
+            joined.append(f"{group} {name}".strip())
+        return [(number, joined), *lines[start + 1 : end]]
+    return lines[start:end]
 
 
 def _with_units(lines: Lines) -> Lines:
@@ -443,9 +586,24 @@ def _with_units(lines: Lines) -> Lines:
     (number, header), (_, below) = lines[:2]
     units = [cell.strip("[]() ") for cell in below]
     if not any(units) or not all(unit in ("", *_UNITS_BELOW) for unit in units):
-        return lines
+        return _with_units_of_cells(lines)
     pairs = zip(header, units, strict=True)
     return [(number, [f"{name} [{unit}]" if unit else name for name, unit in pairs]), *lines[2:]]
+
+
+def _with_units_of_cells(lines: Lines) -> Lines:
+    """Return lines with the unit of the numbers of a column (``380 mm``) in its heading."""
+    (number, header), below = lines[0], [cells for _, cells in lines[1:]]
+    if any(len(cells) != len(header) for cells in below):
+        return lines
+    for i in range(len(header)):
+        parts = [_WITH_UNIT.fullmatch(cells[i]) for cells in below if not is_number(cells[i])]
+        units = {part[2] if part else "" for part in parts}
+        if len(units) == 1 and (unit := units.pop()):
+            header = [*header[:i], f"{header[i]} [{unit}]", *header[i + 1 :]]
+            below = [[*row[:i], row[i].removesuffix(unit).strip(), *row[i + 1 :]] for row in below]
+    numbers = (line for line, _ in lines[1:])
+    return [(number, header), *((n, row) for n, row in zip(numbers, below, strict=True))]
 
 
 def _decoded(content: bytes, *, loose: bool) -> str:
@@ -468,11 +626,12 @@ def _decoded(content: bytes, *, loose: bool) -> str:
 
 
 def _delimiter(text: str) -> str:
-    """Return the separator of cells in the first line that is not blank."""
-    first = next(filter(None, map(str.strip, text.splitlines())), "")
-    return next((mark for mark in ";\t, " if mark in first), ",")
+    """Return the separator of cells, the first that is in most of the lines that are not blank."""
+    lines = [line for line in map(str.strip, text.splitlines()) if line]
+    counts = {mark: sum(mark in line for line in lines) for mark in ";\t, "}
+    return next((mark for mark, n in counts.items() if 2 * n > len(lines)), ",")
 
 
 def _with_point(cell: str) -> str:
-    """Return a cell, its decimal comma as a point if it is a number."""
+    """Return a cell, its decimal comma as a point if it is a number, or one with a unit."""
     return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.text import Text
 
-from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
     brief_sentences,
@@ -16,9 +20,10 @@ from legcal.calibration.summary import (
     tables,
 )
 from legcal.data.measurements import few
+from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.leg import ParameterId
-from legcal.pages.document import Table, Verdict
+from legcal.pages.document import Step, Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
@@ -27,12 +32,15 @@ if TYPE_CHECKING:
     from legcal.calibration.result import Calibration
     from legcal.calibration.verification import Check
 
-_LARGEST = 5  # largest changes of parameters shown
+_SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
+_LARGEST = 3  # largest changes of parameters shown
 _EXPLANATIONS = 3  # alternative explanations shown
 
 
-def summary(calibration: Calibration, output: Path, *, verbose: bool = False) -> Report:
-    """Return one screen: verdict, platform, largest changes, weakest direction, notes.
+def summary(
+    calibration: Calibration, output: Path, command: str = "", *, verbose: bool = False
+) -> Report:
+    """Return one screen: verdict, platform, largest changes, weakest direction, notes, what next.
 
     *verbose* adds all parameters in mm, degrees and pixels, and the quality of the fit.
     """
@@ -42,19 +50,117 @@ def summary(calibration: Calibration, output: Path, *, verbose: bool = False) ->
         colour = "red"
     verdict = Text(calibration.verdict.sentence, style=f"bold {colour}")
     written = f"Written to {output}."
+    # The remedies of doubts stand in the verdict and beside each doubt
+    following = [one for one in next_steps(calibration, str(output), command) if one.command]
+    following_lines = [
+        Text(printable(line), overflow="ignore")
+        for one in following[:1]
+        for line in (f"Next: {one.what[0].lower()}{one.what[1:]}", f"  {one.command}")
+    ]
     if not verbose:
-        return report(
-            verdict,
-            None if result.platform is None else platform_table(result.platform),
-            _largest_changes(result),
-            [
-                *brief_sentences(result),
-                *(f"Note: {note}" for note in result.notes),
-                f"{written} All parameters: --verbose, or the files there.",
-            ],
-        )
+        platform = None if result.platform is None else platform_table(result.platform)
+        changes = _largest_changes(result) if calibration.verdict.trustworthy else None
+        taken = [calibration.verdict.sentence, *([""] * 5 if platform else [])]
+        taken += [
+            *([""] * (_LARGEST + 2) if changes else []),
+            *([""] * 3 if following_lines else []),
+        ]
+        brief = [*brief_sentences(result), *(f"Note: {note}" for note in result.notes)]
+        last = f"{written} All parameters: --verbose, or the files there."
+        room = _SCREEN - sum(map(_height, [*taken, last])) - 1
+        return report(verdict, platform, changes, [*_first(brief, room), last], following_lines)
     shown = [parameters.as_table(title) for title, parameters in tables(result)]
-    return report(*shown, [*sentences(result, verbose=True), written, verdict])
+    lines = [*sentences(result, verbose=True), written, verdict]
+    return report(*shown, lines, following_lines)
+
+
+def _first(lines: Sequence[str], room: int) -> list[str]:
+    """Return the lines that fit into the room on a screen, and how many notes do not."""
+    shown = list(lines)
+    while shown and sum(map(_height, shown)) + (len(shown) < len(lines)) > room:
+        shown.pop()
+    more = len(lines) - len(shown)
+    s = "s" * (more != 1)
+    return [*shown, *([f"{more} more note{s}: --verbose, or report.html."] if more else [])]
+
+
+def _height(line: str) -> int:
+    """Return the height of a text on a screen."""
+    return max(1, len(textwrap.wrap(line, _WIDTH)))
+
+
+def document(calibration: Calibration, output: Path, command: str) -> dict[str, Any]:
+    """Return the document of ``calibrate --json``: the result, and what to do next."""
+    steps = next_steps(calibration, str(output), command)
+    blocks = [NextStep(what=one.what, command=one.command) for one in steps]
+    return calibration.result.model_copy(update={"next": blocks}).document()
+
+
+def _written_beside(command: str) -> str:
+    """Return a command with another output folder, so that the result of the first stays."""
+    words = shlex.split(command)
+    for k, word in enumerate(words[:-1]):
+        if word in ("-o", "--output"):
+            words[k + 1] = f"{words[k + 1].rstrip('/')}-holdout"
+    return shlex.join(words)
+
+
+def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step]:
+    """Return what to do next, the first thing first; *command* has made the result, if any has."""
+    result, steps = calibration.result, list[Step]()
+    dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
+    for doubt in calibration.doubts:
+        what, remedy = (f"{text[0].upper()}{text[1:]}" for text in (doubt.what, doubt.remedy))
+        steps.append(Step(f"{what}. {remedy}, and calibrate again."))
+    remedy = calibration.verdict.remedy
+    if remedy and all(remedy != doubt.remedy for doubt in calibration.doubts):
+        steps.append(Step(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again."))
+    if calibration.verdict.trustworthy:
+        steps.append(
+            Step(
+                "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
+                "move to a few poses whose place you can measure."
+            )
+        )
+        if result.holdout is None and calibration.dataset.machine.is_determined:
+            again = _written_beside(command or f"legcal calibrate {dataset} -o {out}")
+            steps.append(
+                Step(
+                    "See how well it predicts images that it has not seen:",
+                    f"{again} --holdout 0.2",
+                )
+            )
+        steps.append(
+            Step(
+                "Where the base stands in the cell and the tool on the platform is not seen in "
+                "photographs of legs; with measured POSES of the tool:",
+                f"legcal locate {out}/calibrated.yaml POSES -o located.yaml",
+            )
+        )
+        steps.append(
+            Step(
+                "In some months, or after a collision, photograph a few poses (NEW) and ask "
+                "whether anything moved:",
+                f"legcal calibrate NEW --check {out}",
+            )
+        )
+    elif not result.diagnosis:
+        if result.weakest:
+            steps.append(
+                Step(f"More images help where least is known: {result.weakest[0].in_words}.")
+            )
+        steps.append(
+            Step("Look at the worst outlines below: blur, reflections and wrong edges show there.")
+        )
+    if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
+        steps.append(
+            Step(
+                "Calibrate the camera, with the board that you have: its file then states how well "
+                "it is known, which belongs into the uncertainty of the result.",
+                "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
+            )
+        )
+    return steps
 
 
 def platform_table(platform: PlatformBlock) -> Table:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform as system
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration.evaluation import Evaluation, evaluate
-from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.quantities import joints_of, parameters_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
@@ -44,7 +42,6 @@ from legcal.pages.document import (
     Row,
     Scene,
     Section,
-    Step,
     Table,
     Text,
     Verdict,
@@ -53,7 +50,7 @@ from legcal.pages.document import (
     time_of_page,
 )
 from legcal.pages.svg import Bars, log_bars, number_grid
-from legcal.report.calibration import platform_table
+from legcal.report.calibration import next_steps, platform_table
 from legcal.report.residuals import outline_crops, residual_charts
 from legcal.scene.motions import MachineScene, PlacedModel, pyramid, scene_content
 from legcal.version import __version__
@@ -160,73 +157,6 @@ def verdict_of(calibration: Calibration) -> Verdict:
         light = "bad" if verdict.is_to_be_refused else "doubtful"
     reasons = brief_sentences(calibration.result)
     return Verdict(light, _WORDS[light], verdict.sentence, reasons)
-
-
-def _written_beside(command: str) -> str:
-    """Return a command with another output folder, so that the result of the first stays."""
-    words = shlex.split(command)
-    for k, word in enumerate(words[:-1]):
-        if word in ("-o", "--output"):
-            words[k + 1] = f"{words[k + 1].rstrip('/')}-holdout"
-    return shlex.join(words)
-
-
-def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step]:
-    """Return what to do next, the first thing first; *command* has made the result, if any has."""
-    result, steps = calibration.result, list[Step]()
-    dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
-    for doubt in calibration.doubts:
-        what, remedy = (f"{text[0].upper()}{text[1:]}" for text in (doubt.what, doubt.remedy))
-        steps.append(Step(f"{what}. {remedy}, and calibrate again."))
-    remedy = calibration.verdict.remedy
-    if remedy and all(remedy != doubt.remedy for doubt in calibration.doubts):
-        steps.append(Step(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again."))
-    if calibration.verdict.trustworthy:
-        steps.append(
-            Step(
-                "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
-                "move to a few poses whose place you can measure."
-            )
-        )
-        if result.holdout is None and calibration.dataset.machine.is_determined:
-            again = _written_beside(command or f"legcal calibrate {dataset} -o {out}")
-            steps.append(
-                Step(
-                    "See how well it predicts images that it has not seen:",
-                    f"{again} --holdout 0.2",
-                )
-            )
-        steps.append(
-            Step(
-                "Where the base stands in the cell and the tool on the platform is not seen in "
-                "photographs of legs; with measured POSES of the tool:",
-                f"legcal locate {out}/calibrated.yaml POSES -o located.yaml",
-            )
-        )
-        steps.append(
-            Step(
-                "In some months, or after a collision, photograph a few poses (NEW) and ask "
-                "whether anything moved:",
-                f"legcal calibrate NEW --check {out}",
-            )
-        )
-    elif not result.diagnosis:
-        if result.weakest:
-            steps.append(
-                Step(f"More images help where least is known: {result.weakest[0].in_words}.")
-            )
-        steps.append(
-            Step("Look at the worst outlines below: blur, reflections and wrong edges show there.")
-        )
-    if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
-        steps.append(
-            Step(
-                "Calibrate the camera, with the board that you have: its file then states how well "
-                "it is known, which belongs into the uncertainty of the result.",
-                "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
-            )
-        )
-    return steps
 
 
 # Platform error

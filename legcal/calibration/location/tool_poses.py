@@ -1,7 +1,8 @@
 """Measured tool poses: the table, and the noise of its rows.
 
 The table is a CSV file. Its header has the actuated joints, ``x,y,z`` and, if orientations are
-measured, ``qx,qy,qz,qw``, in any order; ``name`` is optional.
+measured, ``qx,qy,qz,qw``, in any order; ``name`` is optional. Without names of joints it is read as
+a table of readings is: legs by name or number, units in headings, readings or whole lengths.
 
 A row has two sources of error: the measurement, which is isotropic, with one standard deviation for
 positions and one for orientations that may be unknown; and a calibrated model, whose errors all
@@ -15,6 +16,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +26,21 @@ from legcal.brief import brief
 from legcal.calibration.location.frames import PosePairs
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
+from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import Code, DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
-from legcal.files.table import Column, Table, header_problem, read_table
+from legcal.files.quantity import ANGLE, LENGTH
+from legcal.files.schema import content_of
+from legcal.files.table import (
+    Column,
+    Lines,
+    Table,
+    concepts,
+    header_problem,
+    in_unit,
+    read_table,
+    split_heading,
+)
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import pose_sensitivity
@@ -85,10 +99,14 @@ class ToolPoses:
 
 
 def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
-    """Return the measured tool poses of a file.
+    """Return the measured tool poses of a file, in SI by joints or as people write it.
 
     Raises DatasetError with one sentence for each problem, naming row and column.
     """
+    joints = [column.name for column in reading_columns(machine.legs)]
+    sheet = None
+    if not any(re.search(rf"\b{re.escape(joint)}\b", _first_line(path)) for joint in joints):
+        sheet = ReadingsSheet(path, machine, "pose")
     table = read_table(
         path,
         "table of tool poses",
@@ -96,11 +114,11 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         [*reading_columns(machine.legs), *_COLUMNS],
         needed="a row for each pose; measure some",
         unknown=lambda name: _about_angles(path, name),
+        reshape=None if sheet is None else lambda lines: _tool_columns(lines, sheet, joints),
     )
     readings, notes = readings_in(table, machine.legs)
     position = table.numbers(_POSITION)
     rotation, oriented, worst = _orientations(table)
-    joints = [column.name for column in reading_columns(machine.legs)]
     numbers = table.numbers(
         [*joints, *(name for name in (*_POSITION, *_QUATERNION) if name in table)]
     )
@@ -128,6 +146,32 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         numbers=np.arange(1, len(table) + 1),
         notes=notes,
     )
+
+
+def _first_line(path: Path) -> str:
+    """Return the first line of a file that is not blank."""
+    text = content_of(path, "table of tool poses").decode("utf-8-sig", errors="replace")
+    return next((line for line in text.splitlines() if line.strip()), "")
+
+
+def _tool_columns(lines: Lines, sheet: ReadingsSheet, joints: Sequence[str]) -> Lines:
+    """Return lines under our names in metres and radians, with the readings of their sheet."""
+    (number, header), below = lines[0], lines[1:]
+    readings = sheet.readings()
+    known = {split_heading(column.name)[0]: column.name for column in _COLUMNS}
+    names, factors = dict[int, str](), dict[int, Decimal]()
+    for i, text in enumerate(header):
+        key, unit = split_heading(text, (*LENGTH, *ANGLE))
+        found = set(concepts(text)) - {"tool", "joint", "pose"}
+        axis = found.pop() if len(found) == 1 else ""
+        name = axis if axis in _POSITION else known.get(key, "")
+        if name or sheet.taken.get(text) not in (*joints, "view", "image", "pose", "time"):
+            names[i] = name or text.lower()
+            factors[i] = Decimal(repr({**LENGTH, **ANGLE}.get(unit, 1.0)))
+    rows: Lines = []
+    for (line, cells), q in zip(below, readings.q.tolist(), strict=True):
+        rows.append((line, [*map(str, q), *(in_unit(cells[i], factors[i]) for i in names)]))
+    return [(number, [*joints, *names.values()]), *rows]
 
 
 def _about_angles(path: Path, name: str) -> Problem | None:

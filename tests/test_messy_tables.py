@@ -1,0 +1,168 @@
+"""Tables that a person reads at once: languages, titles, remarks, units, diameters, workbooks."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from legcal import load_mechanism
+from legcal.calibration.location.tool_poses import read_tool_poses
+from legcal.descriptions.description import Description
+from legcal.descriptions.new_model import Dimensions, description_of
+from legcal.errors import ModelError
+from legcal.machine.kinematics import forward_kinematics_many
+
+BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
+        (289.8, -77.6)]  # fmt: skip
+PLATFORM = [(106.1, 106.1), (38.8, 144.9), (-144.9, 38.8), (-144.9, -38.8), (38.8, -144.9),
+            (106.1, -106.1)]  # fmt: skip
+
+
+def wide(header: str, *more: str, leg: str = "", size: float = 1.0, mark: str = "") -> str:
+    """Return a row for each leg; semicolons in the header make commas of points."""
+    rows = []
+    for j, (A, B) in enumerate(zip(BASE, PLATFORM, strict=True), 1):
+        numbers = [f"{size * x:g}{mark}" for x in (*A, 0.0, *B, 0.0)]
+        rows.append([*([leg.format(j)] if leg else []), *numbers, *more])
+    return joined(header, rows)
+
+
+def points(header: str, base: str, platform: str, *more: str) -> str:
+    """Return a row for each joint."""
+    named = [(name, joints) for name, joints in ((base, BASE), (platform, PLATFORM))]
+    rows = [
+        [*name.format(j).split("|"), f"{x:g}", f"{y:g}", "0", *more]
+        for name, joints in named
+        for j, (x, y) in enumerate(joints, 1)
+    ]
+    return joined(header, rows)
+
+
+def joined(header: str, rows: Sequence[Sequence[str]]) -> str:
+    between = next((mark for mark in ";\t," if mark in header), " ")
+    lines = [between.join(row) for row in rows]
+    lines = [line.replace(".", ",") for line in lines] if between == ";" else lines
+    return "\n".join([*([header] if header else []), *lines]) + "\n"
+
+
+SIX = "{0} X [mm];{0} Y [mm];{0} Z [mm];{1} X [mm];{1} Y [mm];{1} Z [mm]"
+TABLES = {  # content, and the radii of tube and rod in it [mm]
+    "German": (wide("Zylinder;" + SIX.format("Boden", "Plattform"), leg="Zylinder {}"), ()),
+    "title, blank line, units, remarks": (
+        points("Hexapod Labor 2, Stand Mai\n\nPunkt;X;Y;Z\n;mm;mm;mm", "A{} (Boden)",
+               "B{} (Plattform)"), ()),
+    "French, tube and rod": (
+        wide("Vérin;" + SIX.format("Base", "Nacelle") + ";Longueur min (mm);Longueur max (mm);"
+             "Diamètre corps (mm);Diamètre tige (mm)", "380", "500", "28", "16", leg="V{}"),
+        (14, 8)),
+    "units below": (
+        wide("Nr.;unten x;unten y;unten z;oben x;oben y;oben z;Länge min;Länge max;Ø Rohr;Ø Stange"
+             "\n" + ";mm" * 10, "380.0", "500.0", "28", "16", leg="{}"), (14, 8)),
+    "remark": (wide(f"Leg,{SIX.format('Base', 'Top').replace(';', ',')},Notes", "ok", leg="Leg {}"),
+               ()),
+    "cylinder and side": (
+        points("Joint,X (mm),Y (mm),Z (mm)", "Cylinder {} bottom", "Cylinder {} top"), ()),
+    "unit after a slash": (
+        points("Gelenk;x/mm;y/mm;z/mm", "Gelenk {} unten", "Gelenk {} oben"), ()),
+    "compounds, number in brackets": (
+        points("Name,X_mm,Y_mm,Z_mm", "Bodengelenk ({})", "Plattformgelenk ({})"), ()),
+    "units in cells": (
+        wide("leg,bx,by,bz,px,py,pz,min length,max length,rod diameter,tube diameter",
+             "380 mm", "500 mm", "16 mm", "28 mm", leg="{}", mark=" mm"), (14, 8)),
+    "groups": (
+        wide(";Boden;;;Plattform;;\nBein;X;Y;Z;X;Y;Z\n;mm;mm;mm;mm;mm;mm", leg="{}"), ()),
+    "title of two cells": (
+        wide("Projekt: Hexapod;;;Datum: 3.2.2026;;;\n" + SIX.format("B", "P")), ()),
+    "line below": (wide(SIX.format("b", "p")) + "gemessen mit Messschieber;;;;;\n", ()),
+    "metres and millimetres": (
+        wide("leg,base x [m],base y [m],base z [m],platform x [m],platform y [m],platform z [m],"
+             "min length [m],max length [mm],diameter [mm]", "0.38", "500", "20", leg="{}",
+             size=1e-3), (10, 10)),
+    "column of units": (points("Joint\tX\tY\tZ\tunité", "A{} (socle)", "B{} (plateau)", "mm"),
+                        ()),
+    "side and number": (points("Seite;Nr;X [mm];Y [mm];Z [mm]", "Boden|{}", "Plattform|{}"), ()),
+    "shortest and longest": (
+        wide("Bein;" + SIX.format("Basis", "Plattform") + ";kürzeste Länge;längste Länge;Radius",
+             "380", "500", "10", leg="{}"), (10, 10)),
+    "stroke": (
+        wide("Strebe;" + SIX.format("Boden", "Oben") + ";min. Länge;Hub;Durchmesser", "380", "120",
+             "20", leg="S{}"), (10, 10)),
+    "workshop English": (
+        wide("Actuator #,Base joint X (mm),Base joint Y (mm),Base joint Z (mm),"
+             "Platform joint X (mm),Platform joint Y (mm),Platform joint Z (mm),Min. length (mm),"
+             "Max. length (mm),Tube OD (mm),Rod dia. (mm)", "380", "500", "28", "16", leg="{}"),
+        (14, 8)),
+    "no headings": (points("", "Boden{}", "Plattform{}"), ()),
+    "axis first": (
+        wide("Jambe,X base,Y base,Z base,X plate-forme,Y plate-forme,Z plate-forme", leg="J{}"),
+        ()),
+}  # fmt: skip
+
+
+def described(path: Path, text: str, radii: Sequence[float]) -> Description:
+    has_unit = any(mark in text for mark in ("mm", "[m]"))
+    has_lengths = any(word in text for word in ("380", "0.38"))
+    size = 1e-3 if "[m]" in text else 1.0
+    given = Dimensions(
+        type="UPS",
+        unit=None if has_unit else "mm",
+        height=400.0 * size,
+        min_length=None if has_lengths else 380.0,
+        max_length=None if has_lengths else 500.0,
+        leg_radius=None if radii else 10.0,
+    )
+    return description_of(path, given)
+
+
+def check(made: Description, radii: Sequence[float]) -> None:
+    np.testing.assert_allclose([leg.A_base[:2] for leg in made.legs], 1e-3 * np.array(BASE))
+    np.testing.assert_allclose([leg.B_platform[:2] for leg in made.legs], 1e-3 * np.array(PLATFORM))
+    assert {leg.travel for leg in made.legs} == {(0.0, 0.12)}
+    assert {leg.offset for leg in made.legs} == {0.38}
+    tube, rod = radii or (10.0, 10.0)
+    assert {(leg.tube, leg.rod) for leg in made.legs} == {(1e-3 * tube, 1e-3 * rod)}
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_what_a_person_reads_at_once_is_read(kind: str, tmp_path: Path) -> None:
+    text, radii = TABLES[kind]
+    (tmp_path / "own.csv").write_text(text)
+    check(described(tmp_path / "own.csv", text, radii), radii)
+
+
+def test_the_sheet_of_a_workbook_that_has_a_table_is_read(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["Deckblatt"])
+    sheet = book.create_sheet("Gelenke")
+    for cells in (["Hexapod"], [], ["Bein", "Boden", *[None] * 2, "Plattform", *[None] * 2, "Ø"],
+                  [None, *"XYZXYZ"], [None, *["mm"] * 7]):  # fmt: skip
+        sheet.append(cells)
+    for j, (A, B) in enumerate(zip(BASE, PLATFORM, strict=True), 1):
+        sheet.append([f"Zylinder {j}", *A, 0, *B, 0.0, 28])
+    book.save(tmp_path / "own.xlsx")
+    check(described(tmp_path / "own.xlsx", "mm", (14, 14)), (14, 14))
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04none", b"\xd0\xcf\x11\xe0none"])
+def test_other_workbooks_are_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "own.xls"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=r"workbook.*save the sheet as CSV"):
+        described(path, "mm", ())
+
+
+def test_poses_of_a_tracker_beside_whole_lengths_in_mm_are_read(tmp_path: Path) -> None:
+    machine = load_mechanism("hexapod")
+    low, high = np.array([leg.travel for leg in machine.legs]).T
+    q = low + (high - low) * np.random.default_rng(0).uniform(0.3, 0.7, (8, 6))
+    poses = [pose.translation for pose in forward_kinematics_many(machine, q)]
+    numbers = np.hstack([machine.q0 + q, poses]) * 1e3
+    header = "Messung 3.2.\nPose;" + ";".join(f"Zylinder {j}" for j in range(1, 7)) + ";X;Y;Z\n"
+    rows = [[str(k), *(f"{x:.4f}" for x in row)] for k, row in enumerate(numbers, 1)]
+    path = tmp_path / "own.csv"
+    path.write_text(joined(header + ";mm" * 9, rows))
+    found = read_tool_poses(path, machine)
+    np.testing.assert_allclose(found.q, q, atol=6e-8)
+    np.testing.assert_allclose(found.position, poses, atol=6e-8)
