@@ -34,6 +34,8 @@ WIDE_LENSES: dict[DistortionModel, tuple[float, list[float]]] = {
         [0.55, -0.08, 4e-4, -3e-4, 0.01, 0.9, 0.02, 0.01, 2e-3, -4e-4, -1.5e-3, 3e-4],
     ),
     "equidistant": (564.0, [0.0705, -0.0234, 0.0164, -0.0014]),
+    # rectilinear in the middle and compressed at the edge, as of phones and action cameras
+    "splined_radial": (560.0, [0.022, 0.096, 0.19, 0.21, 0.12, 0.02]),
 }
 PINHOLE = Camera(np.diag([0.7, 0.7, 1.0]) @ _K, 448, 336, np.zeros(5))
 CAMERAS = {

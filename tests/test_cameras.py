@@ -19,6 +19,7 @@ from legcal.vision.camera import (
     intrinsic_names,
     intrinsic_unit,
     intrinsic_values,
+    project_with_derivatives,
     shared_cameras,
     undistort_with_derivatives,
     with_intrinsics,
@@ -34,6 +35,7 @@ PLUMB_BOB = [-0.25, 0.08, 1e-3, -8e-4, 0.01]
 RATIONAL = [0.3, 0.1, 1e-3, -5e-4, 0.02, 0.4, 0.05, 0.01]
 PRISM = [*RATIONAL, 0.002, -0.0004, -0.0015, 0.0003]
 FISHEYE = [0.03, -0.01, 0.004, -0.002]
+SPLINE = [0.02, 0.06, 0.09, 0.07, 0.01, -0.05]
 LENSES: list[tuple[DistortionModel, list[float]]] = [
     ("plumb_bob", []),
     ("plumb_bob", PLUMB_BOB),
@@ -42,6 +44,7 @@ LENSES: list[tuple[DistortionModel, list[float]]] = [
     ("thin_prism", PRISM),
     ("equidistant", FISHEYE),
     ("equidistant", [0.0] * 4),
+    ("splined_radial", SPLINE),
 ]
 CAMERAS = [Camera(K, *SIZE, np.array(D), model) for model, D in LENSES]
 EACH = pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{c.model}-{len(c.distortion)}")
@@ -380,7 +383,7 @@ def test_cameras_are_written_for_other_programs(
     tmp_path: Path, program: CameraProgram, lacks: tuple[str, ...]
 ) -> None:
     source, output = tmp_path / "camera.yaml", tmp_path / f"{program}.txt"
-    for model, D in LENSES[2:]:
+    for model, D in LENSES[2:-1]:
         D = D[:4] if program == "kalibr" and model == "plumb_bob" else D
         source.write_text(camera_info(Camera(STRAIGHT, *SIZE, np.array(D), model), "any"))
         if model in lacks:
@@ -392,6 +395,49 @@ def test_cameras_are_written_for_other_programs(
         assert camera.model == model
         np.testing.assert_array_equal(camera.K, STRAIGHT)
         np.testing.assert_array_equal(camera.distortion[: len(D)], D)
+
+
+@pytest.mark.parametrize(
+    ("program", "model"),
+    [
+        ("ros", "rational_polynomial"),
+        ("opencv", "rational_polynomial"),
+        ("kalibr", "equidistant"),
+        ("mrcal", "rational_polynomial"),
+    ],
+)
+def test_a_splined_lens_is_written_as_the_nearest_of_the_program(
+    tmp_path: Path, program: CameraProgram, model: str
+) -> None:
+    lens = Camera(STRAIGHT, *SIZE, np.array(SPLINE), "splined_radial")
+    block = {"version": 1, "sigma": {"fx": 2.0}, "names": ["fx"], "covariance": [[4.0]]}
+    source = write(tmp_path, camera_info(lens, "any", {"legcal_camera": block}))
+    _, said, left_out = convert_camera(source, program, tmp_path / "other.txt")
+    written = read_camera(tmp_path / "other.txt")
+    assert written.model == model
+    off = float(said.partition("at most ")[2].partition(" px")[0])
+    assert np.abs(written.distort(field()) - lens.distort(field())).max() <= 1.05 * off < 0.5
+    assert written.covariance is None
+    assert "covariance is left out" in left_out
+
+
+def test_a_spline_agrees_with_the_fisheye_lens_of_opencv_all_over_the_image() -> None:
+    K = np.array([[564.0, 0.0, 651.0], [0.0, 563.4, 497.0], [0.0, 0.0, 1.0]])
+    k = np.array([0.0705, -0.0234, 0.0164, -0.0014])
+    u, v = np.meshgrid(np.linspace(0.0, 1279.0, 41), np.linspace(0.0, 959.0, 31))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    xy = np.asarray(cv2.fisheye.undistortPoints(pixels[:, None], K, k))[:, 0]
+    assert np.degrees(np.arctan(np.linalg.norm(xy, axis=1))).max() > 70.0
+    pixels = np.asarray(cv2.fisheye.distortPoints(xy[:, None], K, k))[:, 0]
+    spline = Camera(K, 1280, 960, np.zeros(6), "splined_radial")
+    names, rays = intrinsic_names(spline), np.column_stack([xy, np.ones(len(xy))])
+    for _ in range(3):  # linear in all but products of focal lengths and coefficients
+        at, _, J = project_with_derivatives(spline, rays, names)
+        step = np.linalg.lstsq(J.reshape(-1, len(names)), (pixels - at).ravel(), rcond=None)[0]
+        values = intrinsic_values(spline) + step
+        spline = with_intrinsics(spline, dict(zip(names, values.tolist(), strict=True)))
+    assert np.linalg.norm(spline.project(rays) - pixels, axis=1).max() < 0.01
+    np.testing.assert_allclose(spline.undistort(spline.distort(xy)), xy, atol=1e-9)
 
 
 def test_the_covariance_of_a_converted_camera_is_kept_where_it_can_be(tmp_path: Path) -> None:

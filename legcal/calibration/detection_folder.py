@@ -67,7 +67,7 @@ from legcal.perception.overlays import (
     marks_of_pairs,
 )
 from legcal.progress import Report
-from legcal.vision.camera import Camera
+from legcal.vision.camera import Camera, spline_pieces
 from legcal.vision.visibility import PredictedLeg
 from legcal.workers import Run
 
@@ -436,7 +436,9 @@ def _outline_editor(detection: Detection) -> OutlineEditor | None:
     cameras = [
         {
             "K": view.camera.K.tolist(),
-            "distortion": view.camera.distortion.tolist(),
+            "distortion": spline_pieces(view.camera)
+            if view.camera.model == "splined_radial"
+            else view.camera.distortion.tolist(),
             "model": view.camera.model,
         }
         for view in measurements.views

@@ -1,4 +1,4 @@
-"""The camera: a pinhole with a distortion model of OpenCV, and its intrinsics by name.
+"""The camera: a pinhole with a distortion model of OpenCV or a splined one, its intrinsics by name.
 
 A distortion model is one entry of ``DISTORTION_MODELS`` and its name in
 :mod:`legcal.vision.distortion`, for use in files, fits and the calibration of cameras.
@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import factorial
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
 
 from legcal.geometry.types import Array
 from legcal.vision.distortion import DistortionModel
@@ -43,6 +45,7 @@ class Distortion:
     with_derivatives: Callable[[Array, Array, Array], tuple[Array, Array]]
     aliases: tuple[str, ...] = ()  # its names in the files of other programs
     is_fisheye: bool = False  # distorts with all coefficients zero
+    is_of_opencv: bool = True  # whether other programs have it
 
 
 def _polynomial_distort(xy: Array, K: Array, coefficients: Array) -> Array:
@@ -84,6 +87,63 @@ def _fisheye_derivatives(xy: Array, K: Array, coefficients: Array) -> tuple[Arra
     return np.asarray(pixels), np.concatenate([by_translation, by_intrinsics], axis=1)
 
 
+# A splined lens images a ray at an angle theta to the axis at theta (1 + h(theta)) focal lengths
+# from the principal point. Its coefficients are h at multiples of 15 deg; h is the even spline of
+# degree 5 through them with h(0) = 0, so that the radius has the slope 1 there.
+_KNOTS = np.radians(15.0 * np.arange(1, 7))
+SPLINE = make_interp_spline(
+    np.concatenate([-_KNOTS[::-1], [0.0], _KNOTS]),
+    np.vstack([np.eye(6)[::-1], np.zeros(6), np.eye(6)]),
+    k=5,
+)
+_ANGLES = np.linspace(0.0, 0.5 * np.pi, 721)[:-1]  # of the table from which undistortion starts
+
+
+def _splined_radius(theta: Array, h: Array) -> tuple[Array, Array]:
+    """Return the radius at angles (n,) to the axis, and its derivative, (n,) each."""
+    t, c, degree = SPLINE.tck
+    spline = BSpline.construct_fast(t, c @ h, degree)
+    times = 1.0 + spline(theta)
+    return theta * times, times + theta * spline(theta, 1)
+
+
+def _splined_distort(xy: Array, K: Array, h: Array) -> Array:
+    r = np.linalg.norm(xy, axis=2, keepdims=True)
+    radius = _splined_radius(np.arctan(r[:, 0, 0]), h)[0][:, None, None]
+    return np.asarray(xy * (radius / np.maximum(r, 1e-300)) @ K[:2, :2].T + K[:2, 2])
+
+
+def _splined_undistort(pixels: Array, K: Array, h: Array) -> Array:
+    """Return the points at pixels: by a table up to the fold of the lens, then Newton's method."""
+    xy = (pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+    radius = np.linalg.norm(xy, axis=2)[:, 0]
+    table = _splined_radius(_ANGLES, h)[0]
+    folds = np.diff(table, append=-np.inf) <= 0.0
+    n = int(np.argmax(folds)) + 1
+    theta = np.interp(radius, table[:n], _ANGLES[:n])
+    for _ in range(3):
+        at, slope = _splined_radius(theta, h)
+        theta = np.clip(theta - (at - radius) / np.maximum(slope, 1e-3), 0.0, _ANGLES[n - 1])
+    return np.asarray(xy * (np.tan(theta) / np.maximum(radius, 1e-300))[:, None, None])
+
+
+def _splined_derivatives(xy: Array, K: Array, h: Array) -> tuple[Array, Array]:
+    r = np.maximum(np.linalg.norm(xy[:, 0], axis=1), 1e-300)
+    outwards, theta = xy[:, 0] / r[:, None], np.arctan(r)
+    radius, slope = _splined_radius(theta, h)
+    along = outwards[:, :, None] * outwards[:, None, :]
+    across = np.where(r[:, None, None] > 1e-9, np.eye(2) - along, np.eye(2))
+    times = np.where(r > 1e-9, radius / r, 1.0)[:, None, None]
+    by_xy = (slope / (1.0 + r**2))[:, None, None] * (np.eye(2) - across) + times * across
+    by_h = outwards[:, :, None] * (theta[:, None] * SPLINE(theta))[:, None, :]
+    f = np.diag(K)[:2]
+    by_f = np.eye(2) * (outwards * radius[:, None])[:, :, None]
+    by_c = np.broadcast_to(np.eye(2), by_f.shape)
+    J = np.concatenate([f[:, None] * by_xy, by_f, by_c, f[:, None] * by_h], axis=2)
+    return _splined_distort(xy, K, h), J.reshape(2 * len(xy), -1)
+
+
+_SPLINED = _splined_distort, _splined_undistort, _splined_derivatives
 _POLYNOMIAL = _polynomial_distort, _polynomial_undistort, _polynomial_derivatives
 _FISHEYE = _fisheye_distort, _fisheye_undistort, _fisheye_derivatives
 DISTORTION_MODELS: Mapping[DistortionModel, Distortion] = {
@@ -107,6 +167,14 @@ DISTORTION_MODELS: Mapping[DistortionModel, Distortion] = {
         *_FISHEYE,
         aliases=("fisheye", "equi"),
         is_fisheye=True,
+    ),
+    "splined_radial": Distortion(
+        ("h15", "h30", "h45", "h60", "h75", "h90"),
+        (6,),
+        1.0,
+        *_SPLINED,
+        is_fisheye=True,
+        is_of_opencv=False,
     ),
 }
 
@@ -303,6 +371,19 @@ def _solved(M: Array, right: Array) -> Array:
     (a, b), (c, d) = M.transpose(1, 2, 0)
     first, second = right.transpose(1, 2, 0) / (a * d - b * c)
     return np.stack([d * first - b * second, a * second - c * first], axis=1).T
+
+
+def splined(camera: Camera) -> Camera:
+    """Return an equidistant camera as a splined one."""
+    h = sum(k * _KNOTS ** (2 * i) for i, k in enumerate(camera.distortion.tolist(), start=1))
+    return replace(camera, distortion=np.asarray(h), model="splined_radial")
+
+
+def spline_pieces(camera: Camera) -> list[list[float]]:
+    """Return h of a splined camera as polynomials from 0, 15, 30, 45, 60 and 75 deg on [rad]."""
+    start = np.concatenate([[0.0], _KNOTS[:-1]])
+    terms = [SPLINE(start, n) @ camera.distortion / factorial(n) for n in range(SPLINE.k + 1)]
+    return np.stack(terms, axis=1).tolist()
 
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:

@@ -19,13 +19,21 @@ import cv2
 import numpy as np
 import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
+from scipy.optimize import least_squares
 
 from legcal.errors import BadValue, DatasetError, UsageError
 from legcal.files.folder import OutputFile
 from legcal.files.published import with_schema
 from legcal.files.schema import FileSchema, content_of, describe, parse_yaml, validate
 from legcal.geometry.types import Array
-from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
+from legcal.vision.camera import (
+    DISTORTION_MODELS,
+    Camera,
+    intrinsic_names,
+    intrinsic_values,
+    project_with_derivatives,
+    with_intrinsics,
+)
 from legcal.vision.distortion import CameraProgram, DistortionModel
 from legcal.vision.image_file import quiet_opencv, size_problem
 
@@ -252,6 +260,7 @@ PARAMETERS: Mapping[str, Mapping[str, tuple[DistortionModel, str]]] = {
 _SIGMAS = (1e-12, 1e6)  # plausible standard deviations of an intrinsic [px, or none]
 _ROUNDING = 1e-9  # rounding of correlations
 _SIGMA_DIGITS = 1e-4  # relative precision of written standard deviations
+_REACHED_PX = 0.1  # error of undistortion from which on a lens model does not reach a pixel
 _SINGULAR = 1e-9  # minimum focal length, in units of the image size
 
 
@@ -642,7 +651,7 @@ def _without_padding(model: DistortionModel, distortion: Array) -> tuple[Distort
 
     Of rational_polynomial five coefficients are those of plumb_bob, and twelve a thin prism.
     """
-    if model == "equidistant":
+    if DISTORTION_MODELS[model].is_fisheye:
         return model, distortion
     if len(distortion) == 14 and not distortion[12:].any():
         distortion = distortion[:12]
@@ -802,7 +811,8 @@ def rough_camera_info(camera: Camera, name: str) -> str:
 def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str]:
     """Write a camera file in the form of a program; return lines that say what was done.
 
-    The covariance of a camera that legcal calibrated is kept for ros, which alone can hold it.
+    The covariance of a camera that legcal calibrated is kept for ros, which alone can hold it. A
+    splined lens, which no other program reads, becomes the nearest one that the program has.
 
     Raises
     ------
@@ -813,16 +823,73 @@ def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str
     """
     CONVERTED.check_place(output)
     camera, block = read_camera(path), calibrated_block(path)
+    lines = [f"written: {output}"]
+    if not DISTORTION_MODELS[camera.model].is_of_opencv:
+        spoken = {"kalibr": _SPOKEN[:1], "mrcal": _SPOKEN[1:]}.get(program, _SPOKEN)
+        splined = camera.model
+        camera, off_px = min((_nearest(camera, model) for model in spoken), key=lambda way: way[1])
+        lines.append(
+            f"Only legcal reads the lens {splined}: written as the nearest {camera.model}, at most "
+            f"{off_px:.2g} px off over the image."
+        )
+        if block:
+            lines.append(f"Its covariance is left out; a session that is to use it needs {path}.")
+        block = None
     more = {CALIBRATED: block} if block and program == "ros" else None
     text = camera_text(camera, program, output.stem, more)
     CONVERTED.write(output, text.replace("\n", f"\n{_MARK}", 1))
-    lines = [f"written: {output}"]
     if block and not more:
         lines.append(
             f"The covariance of the camera is left out, as files of {program} do not hold it; a "
             f"session that is to use it needs {path}."
         )
     return lines
+
+
+_SPOKEN: tuple[DistortionModel, ...] = ("equidistant", "rational_polynomial")
+_SIDES = 33, 25  # places along both sides of the image at which cameras are compared
+
+
+def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
+    """Return the camera of a model that projects like a radial one, and how far it is off [px].
+
+    Least squares of pixels all over the image; the largest distance between them is returned.
+    """
+    u = np.linspace(0.0, camera.width - 1.0, _SIDES[0])
+    v = np.linspace(0.0, camera.height - 1.0, _SIDES[1])
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    xy = camera.undistort(pixels)
+    reached = np.linalg.norm(camera.distort(xy) - pixels, axis=1) < _REACHED_PX
+    xy, pixels = xy[reached], pixels[reached]
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    r = np.linalg.norm(xy, axis=1)
+    radius = np.linalg.norm((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], axis=1)
+    away = np.arctan(r) if DISTORTION_MODELS[model].is_fisheye else r
+    times = radius / np.maximum(away, 1e-9)
+    powers = away[:, None] ** (2.0 * np.arange(1, 5))
+    if model == "rational_polynomial":  # times its denominator
+        powers = np.hstack([powers[:, :3], -times[:, None] * powers[:, :3]])
+    k = np.linalg.lstsq(powers, times - 1.0, rcond=None)[0]
+    radial = k if model == "equidistant" else np.concatenate([k[:2], [0.0, 0.0], k[2:]])
+    start = replace(camera, distortion=radial, model=model, covariance=None)
+    names = intrinsic_names(start)
+
+    def of(values: Array) -> Camera:
+        return with_intrinsics(start, dict(zip(names, values.tolist(), strict=True)))
+
+    def jacobian(values: Array) -> Array:
+        return project_with_derivatives(of(values), rays, names)[2].reshape(-1, len(names))
+
+    best = of(
+        least_squares(
+            lambda values: (of(values).distort(xy) - pixels).ravel(),
+            intrinsic_values(start),
+            jac=jacobian,
+            x_scale="jac",
+            method="lm",
+        ).x
+    )
+    return best, float(np.linalg.norm(best.distort(xy) - pixels, axis=1).max())
 
 
 def camera_text(

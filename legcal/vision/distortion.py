@@ -2,5 +2,7 @@
 
 from typing import Literal
 
-DistortionModel = Literal["plumb_bob", "rational_polynomial", "thin_prism", "equidistant"]
+DistortionModel = Literal[
+    "plumb_bob", "rational_polynomial", "thin_prism", "equidistant", "splined_radial"
+]
 CameraProgram = Literal["ros", "opencv", "kalibr", "mrcal"]

@@ -64,7 +64,9 @@ from legcal.workers import Run, Workers, worker_pool
 
 _STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
 _N_DESCRIBED = 2  # images without the board that are described
-_SAME_PLACE = 0.01  # smallest motion of the board between two images, relative to its diagonal
+# smallest motion of the board between two images, relative to its diagonal, and smallest change of
+# its shape where it is shifted by less than the last number
+_SAME_PLACE, _SAME_SHAPE, _SHIFTED = 0.01, 0.002, 0.05
 
 
 def calibrate_camera(
@@ -86,8 +88,9 @@ def calibrate_camera(
     board : str, Path or Board
         Such as ``chessboard:9x6:25mm`` (squares), or a YAML file with the block ``board`` of a
         dataset. Its size does not matter here, its proportions do.
-    model : {"plumb_bob", "rational_polynomial", "thin_prism", "equidistant"}, optional
-        The distortion model of the lens. Chosen by default: plumb_bob unless a richer model
+    model : str, optional
+        The distortion model of the lens: plumb_bob, rational_polynomial, thin_prism, equidistant or
+        splined_radial. Chosen by default: plumb_bob unless a richer model
         explains images that contradict it, or predicts the images better.
     output : path, optional
         Write a ROS camera_info file there, with the covariance of all intrinsics, which
@@ -278,7 +281,8 @@ def _copies(
 ) -> dict[int, str]:
     """Return a reason for each image with the board in the pose of an earlier image.
 
-    Such images share the errors of corners by lens and print, and add no information.
+    Such images share the errors of corners by lens and print, and add no information, also where
+    the picture is shifted by a few pixels.
     """
     copies: dict[int, str] = {}
     distinct: list[int] = []
@@ -289,10 +293,17 @@ def _copies(
                 continue
             moved = corners[k].px[b] - corners[i].px[a]
             size = float(np.linalg.norm(np.ptp(corners[i].px, axis=0)))
+            shift = moved.mean(axis=0)
+            by, changed = (
+                float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) / size
+                for off in (moved, moved - shift)
+            )
             if not moved.any():
                 copies[k] = f"the same photograph as {paths[i].name}"
-            elif np.sqrt(np.mean(np.sum(moved**2, axis=1))) < _SAME_PLACE * size:
+            elif by < _SAME_PLACE:
                 copies[k] = f"the board stands as in {paths[i].name}"
+            elif by < _SHIFTED and changed < _SAME_SHAPE:
+                copies[k] = f"the board stands as in {paths[i].name}, only shifted in the picture"
             else:
                 continue
             break

@@ -2,7 +2,8 @@
 
 Every model is fitted to all images before any is left out. A richer model is taken where it
 explains images that contradict the simpler one, and others no worse, where it predicts held-out
-images better by a signed-rank test over images, or where all images together make it likelier.
+images better by a signed-rank test over images, or where all images together make it likelier; a
+splined one, which other programs do not read, not for the last reason.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize
 
 SIMPLEST: DistortionModel = "plumb_bob"
-_RICHER: tuple[DistortionModel, ...] = ("equidistant", "rational_polynomial", "thin_prism")
+_SPLINED: DistortionModel = "splined_radial"
+_RICHER: tuple[DistortionModel, ...] = (
+    "equidistant",
+    "rational_polynomial",
+    "thin_prism",
+    _SPLINED,
+)
 _FOLDS = 5
 _RINGS = 6  # rings about the principal point with equal numbers of corners
 _OF_RING = 3  # smallest number of corners of an image in a ring
@@ -134,7 +141,8 @@ def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
             gain = np.log(
                 _mean_squares(first_of_best.residual, even) / _mean_squares(first.residual, even)
             )
-            if not _is_positive(gain) and not _is_likelier(first, first_of_best, even):
+            likelier = model != _SPLINED and _is_likelier(first, first_of_best, even)
+            if not _is_positive(gain) and not likelier:
                 continue
         fit = robust_fit(corners, size, model, first)
         if fit is None:
@@ -146,7 +154,8 @@ def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
             best, first_of_best = ChosenLens(fit, f"{model}: {alone}"), first
             continue
         rich = ChosenLens(fit, "")
-        reason = _lead(best, rich, is_likelier=_is_likelier(first, first_of_best, even))
+        likelier = model != _SPLINED and _is_likelier(first, first_of_best, even)
+        reason = _lead(best, rich, is_likelier=likelier)
         if reason:
             best, first_of_best = replace(rich, reason=reason), first
     return best

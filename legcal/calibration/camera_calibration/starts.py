@@ -18,7 +18,7 @@ from legcal.perception.board_adjustment import (
     adjust_board,
     plane_poses,
 )
-from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names
+from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names, splined
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import ImageSize, quiet_opencv
 
@@ -30,7 +30,11 @@ _ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
 def from_scratch(
     corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> AdjustedBoard | None:
-    """Return the adjustment without a start; None if no start or adjustment succeeds."""
+    """Return the adjustment without a start; None if no start or adjustment succeeds.
+
+    A splined lens starts as an equidistant one with k1.
+    """
+    wanted, model = model, "equidistant" if model == "splined_radial" else model
     start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(corners, size, model)
     start = start or _by_straight_lines(corners, size, model)
     if start is None:
@@ -38,7 +42,8 @@ def from_scratch(
     rough = adjust_board(*start, corners, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
     if rough is None:
         return None
-    return _all_adjusted(rough.camera, rough.T_camera_board, Sheet.flat(corners.points), corners)
+    camera = rough.camera if wanted == model else splined(rough.camera)
+    return _all_adjusted(camera, rough.T_camera_board, Sheet.flat(corners.points), corners)
 
 
 def _all_adjusted(

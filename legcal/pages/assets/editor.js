@@ -15,7 +15,12 @@
 
   // Cameras: points of the sensor plane to pixels, and back by Newton's method.
   const distort = ({ K, model, distortion: d }, [x, y]) => {
-    const [[fx, skew, cx], [, fy, cy]] = K, [k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0, k4 = 0, k5 = 0, k6 = 0] = d;
+    const [[fx, skew, cx], [, fy, cy]] = K, [k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0] = d;
+    if (model === "splined_radial") { // d: polynomials from multiples of 15 deg on
+      const r = Math.hypot(x, y), t = Math.atan(r), step = Math.PI / 12, k = Math.min(Math.floor(t / step), d.length - 1);
+      const far = r > 1e-8 ? (t * (1 + d[k].reduceRight((sum, c) => sum * (t - k * step) + c, 0))) / r : 1;
+      return [fx * far * x + cx, fy * far * y + cy];
+    }
     if (model === "equidistant") {
       const r = Math.hypot(x, y), t = Math.atan(r), t2 = t * t;
       const far = r > 1e-8 ? (t * (1 + t2 * (k1 + t2 * (k2 + t2 * (p1 + t2 * p2))))) / r : 1; // its k3, k4 stand third, fourth
@@ -23,12 +28,13 @@
     }
     if (!d.some((k) => k !== 0)) return [fx * x + skew * y + cx, fy * y + cy];
     const r2 = x * x + y * y, far = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)));
-    return [fx * (x * far + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx, fy * (y * far + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy];
+    return [fx * (x * far + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + s2 * r2)) + cx,
+      fy * (y * far + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + s4 * r2)) + cy];
   };
   const undistort = (camera, [u, v]) => {
     const [[fx, , cx], [, fy, cy]] = camera.K, step = 1e-6;
     let xy = [(u - cx) / fx, (v - cy) / fy];
-    if (camera.model === "equidistant") {
+    if (camera.model === "equidistant" || camera.model === "splined_radial") {
       const r = Math.hypot(...xy), far = r > 1e-8 ? Math.tan(Math.min(r, 1.4)) / r : 1;
       xy = xy.map((x) => x * far);
     }
