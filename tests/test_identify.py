@@ -5,7 +5,6 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from machines import SHIPPED_YAML
 from rich.console import Console
-from thinned import thinned
 
 import legcal
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
-    ranks_of_dataset,
 )
+from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
@@ -128,13 +126,12 @@ def test_the_document_is_that_of_the_report(
     assert document["paper"] == {"ok": found.conditions_hold}
     assert document["board"] is True
     assert document["views"] == [list(view) for view in VIEWS["halves"]]
-    assert document["recommendation"] is None
     assert found == report("halves", images=15, board=True)
 
 
 @pytest.mark.parametrize(
     ("name", "views"),
-    thinned(product(MODELS, [(), SOME]), [("3-upu", ()), ("hexapod", SOME)]),
+    [("3-upu", ()), ("hexapod", SOME)],
 )
 def test_tables_fit_80_columns_and_say_the_verdict(
     name: str,
@@ -151,9 +148,6 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     verdict = legcal.identifiability(loaded(name), chosen, 6)
     said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
     assert said in out
-    assert ("smallest sufficient sets of views" in out) == (not views)
-    if "  *" in out:
-        assert "whose own camera places and poses give the error below" in " ".join(out.split())
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:
@@ -171,7 +165,6 @@ def test_all_problems_of_views_are_refused_at_once() -> None:
 def test_a_dataset_is_judged_by_itself() -> None:
     found = identifiability_of_dataset(example())
     assert found.identifiable
-    assert found.recommendation is None
     assert (found.full.rank, sum(found.images)) == (30, example().measurements.n_rows)
 
 
@@ -217,7 +210,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
-        return ranks_of_dataset(two_images(), choices)[1].rank
+        return Analysis(recorded_session(two_images()), choices).full.rank
 
     alone = rank(Choices())
     assert rank(Choices(fixed=frozenset(names))) == 30

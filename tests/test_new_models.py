@@ -314,7 +314,7 @@ def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> Non
 
 def test_files_that_are_there_stay_without_force(tmp_path: Path) -> None:
     before = texts(made(tmp_path))
-    with pytest.raises(UsageError, match=r"tripod.yaml and .*tripod.urdf already there"):
+    with pytest.raises(UsageError, match=r"tripod.yaml, .*tripod.urdf already there"):
         made(tmp_path, offsets=385)
     paths = tmp_path / "models" / "tripod.yaml", tmp_path / "urdf" / "tripod.urdf"
     assert tuple(path.read_text() for path in paths) == before

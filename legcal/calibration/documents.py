@@ -116,7 +116,7 @@ class LinkBlock(Document):
     link: str
     T_link_frame: Pose  # where R_b or R_e is in it
     joints: list[JointInLink]
-    axes: list[AxisInLink] = Field(default_factory=list)  # left out by earlier versions
+    axes: list[AxisInLink]
 
 
 class Distance(Document):
@@ -133,12 +133,12 @@ class WeakCombination(Document):
     parameters: list[str]
     components: list[Number]
     sigma_m: Number
-    links: WeakInLinks | None = None  # left out by earlier versions
+    links: WeakInLinks
 
     @property
     def in_words(self) -> str:
         """What changes, along the axes of the links where they are known."""
-        return self.direction if self.links is None else self.links.direction
+        return self.links.direction
 
 
 class WeakInLinks(Document):
@@ -233,7 +233,6 @@ class RedundantReadings(ReadingResiduals):
 class ResidualsBlock(FitQuality, SparseDocument):
     """The same of a calibration, with the noise that they show."""
 
-    rms_axes: Number | None
     noise: NoiseBlock
     shared_px: dict[str, NotNegative]
     redundant_readings: RedundantReadings | None = None  # left out where readings cannot disagree
@@ -268,7 +267,6 @@ def left_out_blocks(measurements: Measurements, why: Mapping[int, Rejection]) ->
 class Observations(Document):
     """What the fit was made from."""
 
-    kind: Literal["outlines", "axes"]
     used: int
     total: int
     images: int
@@ -389,7 +387,7 @@ class Heading(Document):
     status: Literal["converged"]
     verdict: str
     trustworthy: bool
-    doubts: list[DoubtBlock] = Field(default_factory=list)  # left out by earlier versions
+    doubts: list[DoubtBlock]
     legs: list[str]  # the order of what follows
 
 
@@ -421,7 +419,7 @@ class Result(Legs, Heading, SparseDocument):
     parameters: Annotated[list[ParameterRow], Field(min_length=1)]
     covariance: Matrix  # of the estimated parameters, in their order
     kinematic: Kinematic
-    links: dict[Link, LinkBlock] | None = None  # left out by earlier versions
+    links: dict[Link, LinkBlock]
     weakest: list[WeakCombination]
     held: list[str]
     views: dict[str, ViewPose]
@@ -429,7 +427,7 @@ class Result(Legs, Heading, SparseDocument):
     gammas: list[Gamma]
     stages: Stages
     residuals: ResidualsBlock
-    observations: Observations | None = None  # left out by earlier versions
+    observations: Observations
     board: BoardPose | None = None  # left out without a board
     platform_board: PlatformBoardPose | None = None  # left out without a board on the platform
     start: str

@@ -217,7 +217,7 @@ def identify(
             "--view",
             metavar="LEG,LEG,...",
             help="The legs that one camera position shows; once for each position. Without any, "
-            "the smallest sufficient sets of views are recommended.",
+            "three positions show all legs.",
         ),
     ] = None,
     images: Annotated[

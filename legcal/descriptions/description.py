@@ -184,7 +184,7 @@ def check_links(described: Description, problems: Problems) -> None:
         return
     A, B = _joints(described)
     apart = float(np.linalg.norm(B.mean(axis=0) - A.mean(axis=0)))
-    if 2.0 * apart >= np.linalg.norm(B - A, axis=1).mean() or not _closes(
+    if 2.0 * apart < np.linalg.norm(B - A, axis=1).mean() or not _closes(
         described, Home.of((0.0, 0.0, 0.0), Rotation.identity())
     ):
         return

@@ -23,6 +23,7 @@ from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
 _HEAD = 1000  # bytes at the beginning of a file that contain its mark
+_SHOWN = 5  # names of files in a sentence
 _MOST_OF_NAME = 40  # maximum letters of a name, which leave room for an addition
 
 
@@ -273,9 +274,12 @@ def new_files(
     there = [name for name in names if os.path.lexists(folder / name)]
     if there and not force:
         replaced = "" if force is None else ", or --force to replace them"
+        found = ", ".join(there[:_SHOWN]) + f" and {len(there) - _SHOWN} more" * (
+            len(there) > _SHOWN
+        )
         raise UsageError(
-            f"{folder}: the {noun} could not be written: found {' and '.join(there)} already "
-            f"there, needed new files; give another folder or name{replaced}."
+            f"{folder}: the {noun} could not be written: found {found} already there, needed "
+            f"new files; give another folder or name{replaced}."
         )
     with result_folder(folder, OutputKind(noun, "", "")) as temporary:
         yield temporary

@@ -13,7 +13,6 @@ from legcal.calibration.identify.report import (
     Identifiability,
     Ranks,
     WeakDirection,
-    views_in_words,
 )
 from legcal.machine.parameters import leg_labels, legs_in_words, list_in_words
 from legcal.pages.document import Table, Verdict
@@ -41,7 +40,6 @@ def identify_table(report: Identifiability) -> Report:
     """Return an identifiability report as text, 80 columns wide."""
     return blocks(
         _heading(report),
-        None if report.recommendation is None else _recommendation(report),
         [conditions_table(report.conditions, report.legs), Text(_LEGEND, style="dim")],
         _weak(report.full) if report.full.weak else None,
         _remedies(report) if report.remedies else None,
@@ -71,28 +69,6 @@ def _heading(report: Identifiability) -> list[str]:
     if report.platform_board:
         lines.append("a calibration board on the platform in every view")
     return lines
-
-
-def _recommendation(report: Identifiability) -> list[Part]:
-    """Return the sufficient sets of views."""
-    if not report.recommendation:
-        return ["No sufficient set of views was found; the report is for all legs in one view."]
-    labels, rows = leg_labels(report.legs), []
-    for view_set in report.recommendation:
-        number = len(view_set.views)
-        views = views_in_words([",".join(labels[name] for name in view) for view in view_set.views])
-        sigma = (
-            "" if view_set.platform_sigma is None else f"{1e3 * view_set.platform_sigma.dX_m:.2g}"
-        )
-        judged = "  *" if view_set.views == report.views else ""
-        words = f"{number} view{'s' * (number != 1)}: {views}"
-        rows.append((words, str(view_set.legs_a_view), sigma + judged))
-    columns = ("smallest sufficient sets of views", ">legs each", "sigma [mm]")
-    legend = "sigma: predicted error of the platform, all sets at the same poses; *: the set of "
-    legend += "this report"
-    if report.platform_sigma is not None:
-        legend += ", whose own camera places and poses give the error below"
-    return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
 def conditions_table(conditions: Sequence[ConditionBlock], leg_names: Sequence[str]) -> Table:

@@ -18,14 +18,12 @@ from legcal.calibration.identify.ranks import (
 )
 from legcal.calibration.identify.remedies import (
     find_remedies,
-    recommend,
 )
 from legcal.calibration.identify.report import (
     ConditionBlock,
     Identifiability,
     PaperBlock,
     Ranks,
-    Recommendation,
 )
 from legcal.calibration.identify.session import (
     THIN,
@@ -67,7 +65,7 @@ from legcal.perception.body_edges import bodies_of
 
 MOST_VIEWS = 50
 MOST_IMAGES = 2000  # of a session; more add nothing and take minutes
-_IMAGES = 15
+_VIEWS, _IMAGES = 3, 15  # where none are given
 _ROUGH = 0.1  # mean leg lengths: above, a calibration rejects a direction
 
 
@@ -147,8 +145,8 @@ def identifiability(
     mechanism : Machine
         The nominal model.
     views : sequence of sequences of str
-        Names of the legs visible from each camera position; without any, the smallest
-        sufficient sets of views are recommended and the first one is judged.
+        Names of the legs visible from each camera position; without any, three positions that show
+        all legs are judged. Where cameras should stand is for :func:`legcal.plan` to say.
     images : int
         Images a view, each of another pose.
     board : bool
@@ -183,7 +181,6 @@ def identifiability(
     multiple.
     """
     legs = read_views(views, mechanism.leg_names, images)
-    recommendation = None
     boards = {"board": board, "platform_board": platform_board}
     if hand_held:
         if not board or not legs:
@@ -195,16 +192,14 @@ def identifiability(
             )
         legs, images = tuple(view for view in legs for _ in range(images)), 1
     elif not legs:
-        recommendation = recommend(mechanism, images, noise, **boards)
-        names = recommendation[0].views if recommendation else (mechanism.leg_names,)
-        legs = read_views(names, mechanism.leg_names, images)
+        legs = read_views([mechanism.leg_names] * _VIEWS, mechanism.leg_names, images)
 
     def planned(images: int) -> Session:
         return planned_session(mechanism, legs, images, **boards, hand_held=hand_held)
 
     choices = Choices.by_tolerances(mechanism, only)
     analysis = Analysis(planned(images), choices, noise=noise)
-    return _report_on(mechanism, analysis, recommendation, None if hand_held else planned)
+    return _report_on(mechanism, analysis, None if hand_held else planned)
 
 
 def identifiability_of_dataset(
@@ -219,22 +214,11 @@ def identifiability_of_dataset(
     Raises DidNotConverge if the forward kinematics at the readings fail.
     """
     analysis = replace(_analysis_of(dataset, choices), noise=noise)
-    report = _report_on(dataset.machine, analysis, None, None)
+    report = _report_on(dataset.machine, analysis, None)
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
     return report.model_copy(update={"notes": (*report.notes, note)})
-
-
-def ranks_of_dataset(
-    dataset: Dataset, choices: Choices = NO_CHOICES
-) -> tuple[tuple[ConditionBlock, ...], Ranks]:
-    """Return the paper's conditions and the rank of the joint fit for a dataset.
-
-    As :func:`identifiability_of_dataset`, without remedies.
-    """
-    analysis = _analysis_of(dataset, choices)
-    return _named_conditions(dataset.machine, analysis.session), analysis.full
 
 
 def _named_conditions(machine: Machine, session: Session) -> tuple[ConditionBlock, ...]:
@@ -280,7 +264,6 @@ def check_identifiable(
 def _report_on(
     machine: Machine,
     analysis: Analysis,
-    recommendation: tuple[Recommendation, ...] | None,
     replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
     session = analysis.session
@@ -313,7 +296,6 @@ def _report_on(
         platform_board=len(on_platform) == session.n_views,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
         remedies=() if full.complete else find_remedies(analysis, replanned),
-        recommendation=recommendation,
         notes=tuple(notes),
         scale_is_open=bool(session.actuators) and is_scale_open(analysis),
         parts=analysis.parts or None,

@@ -10,17 +10,6 @@ from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.files.schema import Document, SparseDocument
 from legcal.paper.conditions import Condition
 
-_TIMES = {2: "two", 3: "three", 4: "four"}
-
-
-def views_in_words(views: Sequence[str]) -> str:
-    """Return views one after the other, equal ones once: ``1,2,3 from two places``."""
-    said = []
-    for view in dict.fromkeys(views):
-        times = list(views).count(view)
-        said.append(view if times == 1 else f"{view} from {_TIMES.get(times, times)} places")
-    return "; ".join(said)
-
 
 @dataclass(frozen=True)
 class Ranks:
@@ -58,17 +47,6 @@ class RmsMotion:
 
     dX_m: float  # displacement of the origin of R_e [m]
     dE_rad: float  # rotation [rad]
-
-
-@dataclass(frozen=True)
-class Recommendation:
-    """A set of views that satisfies the paper's conditions and the ranks."""
-
-    # the legs that each camera position shows: neighbours around the base
-    views: tuple[tuple[str, ...], ...]
-    legs_a_view: int
-    # predicted standard deviation of the platform; None where the motors do not determine its pose
-    platform_sigma: RmsMotion | None
 
 
 @dataclass(frozen=True)
@@ -143,8 +121,6 @@ class Identifiability(SparseDocument):
     remedies: tuple[
         Remedy, ...
     ]  # changes that would determine the undetermined directions; each was tried
-    # the smallest sets of views, fewest first; None where views were given
-    recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]
     # whether only radii determine the scale: readings are angles, and no length is stated
     scale_is_open: bool = False
