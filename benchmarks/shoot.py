@@ -56,9 +56,7 @@ def main() -> None:
         plan = args.plan or folder / "plan"
         if args.plan is None:
             n = args.planned or args.images
-            planned = legcal.plan(
-                args.machine, images=n, cameras=args.cameras, camera=args.camera
-            )
+            planned = legcal.plan(args.machine, images=n, cameras=args.cameras, camera=args.camera)
             write_session(planned, plan)
         for seed in range(args.first, args.first + args.runs):
             here = folder / str(seed)

@@ -1,6 +1,7 @@
 """Each doubt is raised by what it is about, and every answer of a calibration follows the list."""
 
 import ast
+import io
 import json
 import re
 import shutil
@@ -18,6 +19,7 @@ from csv_rows import read_rows, write_rows
 from hexapod_example import Run
 from lxml import html
 from numpy.testing import assert_allclose
+from rich.console import Console
 from simulated import simulated
 
 from legcal import (
@@ -39,7 +41,7 @@ from legcal.calibration.verdict import judge
 from legcal.errors import DatasetError
 from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
-from legcal.report.calibration import next_steps
+from legcal.report.calibration import next_steps, summary
 from legcal.simulation.settings import Level
 
 pytestmark = pytest.mark.usefixtures("without_steps")
@@ -319,6 +321,25 @@ def test_verdict_document_summary_and_next_step_follow_any_doubt(
         assert found.verdict.sentence in found.summary()
         first = next_steps(found, "out", "")[0]
         assert first.what == "Something is wrong. Mend it, and calibrate again."
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 8])
+def test_the_first_screen_has_24_lines_of_80_columns(
+    count: int, healthy: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    what = "the readings of leg3 scatter by 0.117 mm where 0.002 mm are stated, as commands would"
+    remedy = "read the encoders in place of the commands, or state encoder_sigma: 0.117 mm"
+    doubts = tuple(Doubt("readings", what, remedy, 1e-6, 1e-6, False) for _ in range(count))
+    monkeypatch.setattr(verdict, "doubts_of", lambda *_: doubts)
+    found = _judged(healthy)
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(summary(found, Path("out"), "legcal calibrate dataset -o out"))
+    lines = console.export_text().splitlines()
+    assert len(lines) <= 24
+    assert " ".join(" ".join(lines).split()).startswith(found.verdict.sentence)
+    assert max(map(len, lines)) <= 80
+    assert ("Next: " in "".join(lines)) == (count == 0)
+    assert "Written to out." in " ".join(lines)
 
 
 @pytest.mark.parametrize("spoil", [_nothing, BACKLASH])

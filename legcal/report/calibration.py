@@ -50,28 +50,27 @@ def summary(
         colour = "red"
     verdict = Text(calibration.verdict.sentence, style=f"bold {colour}")
     written = f"Written to {output}."
-    # The remedies of doubts stand in the verdict and beside each doubt
-    following = [one for one in next_steps(calibration, str(output), command) if one.command]
-    following_lines = [
-        Text(printable(line), overflow="ignore")
-        for one in following[:1]
-        for line in (f"Next: {one.what[0].lower()}{one.what[1:]}", f"  {one.command}")
-    ]
+    following = list[str | Text]()  # of doubts it stands in the verdict and beside each of them
+    if calibration.verdict.trustworthy:
+        steps = next_steps(calibration, str(output), command)
+        first = next(one for one in steps if one.command)
+        following = [f"Next: {first.what[0].lower()}{first.what[1:]}"]
+        following.append(Text(printable(f"  {first.command}"), overflow="ignore"))
     if not verbose:
         platform = None if result.platform is None else platform_table(result.platform)
         changes = _largest_changes(result) if calibration.verdict.trustworthy else None
         taken = [calibration.verdict.sentence, *([""] * 5 if platform else [])]
         taken += [
             *([""] * (_LARGEST + 2) if changes else []),
-            *([""] * 3 if following_lines else []),
+            *(["", *map(str, following)] if following else []),
         ]
         brief = [*brief_sentences(result), *(f"Note: {note}" for note in result.notes)]
         last = f"{written} All parameters: --verbose, or the files there."
         room = _SCREEN - sum(map(_height, [*taken, last])) - 1
-        return report(verdict, platform, changes, [*_first(brief, room), last], following_lines)
+        return report(verdict, platform, changes, [*_first(brief, room), last], following)
     shown = [parameters.as_table(title) for title, parameters in tables(result)]
     lines = [*sentences(result, verbose=True), written, verdict]
-    return report(*shown, lines, following_lines)
+    return report(*shown, lines, following)
 
 
 def _first(lines: Sequence[str], room: int) -> list[str]:
