@@ -285,11 +285,21 @@ def camera_table(calibration: CameraCalibration, output: Path) -> Report:
         unit = " px" if intrinsic_unit(name) else ""
         numbers.append((name, f"{value:.{3 if unit else 5}f}{unit}", f"{sigma:.2g}{unit}"))
     warnings = [Text(f"warning: {warning}", style="yellow") for warning in calibration.warnings]
+    noise = f"Noise of corners: {calibration.noise_px:.3f} px, "
+    if calibration.noise_length_px:
+        noise += (
+            f"correlated over {calibration.noise_length_px:.0f} px, so that "
+            f"{100.0 * calibration.effective_corners:.0f} % of the corners are independent; the "
+            f"standard deviations count {calibration.error_ratio:.1f} times the claimed errors."
+        )
+    else:
+        noise += "without a correlation of neighbours."
     return report(
         title,
         table("image", ">corners", ">residual", ">tilt", rows=images),
         table("", ">value", ">sigma", rows=numbers),
         _model_and_sheet(calibration),
+        noise,
         [*warnings, f"Written to {output}."],
     )
 

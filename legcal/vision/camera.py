@@ -383,7 +383,7 @@ def spline_pieces(camera: Camera) -> list[list[float]]:
     """Return h of a splined camera as polynomials from 0, 15, 30, 45, 60 and 75 deg on [rad]."""
     start = np.concatenate([[0.0], _KNOTS[:-1]])
     terms = [SPLINE(start, n) @ camera.distortion / factorial(n) for n in range(SPLINE.k + 1)]
-    return np.stack(terms, axis=1).tolist()
+    return [[float(term[k]) for term in terms] for k in range(len(start))]
 
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:

@@ -827,7 +827,9 @@ def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str
     if not DISTORTION_MODELS[camera.model].is_of_opencv:
         spoken = {"kalibr": _SPOKEN[:1], "mrcal": _SPOKEN[1:]}.get(program, _SPOKEN)
         splined = camera.model
-        camera, off_px = min((_nearest(camera, model) for model in spoken), key=lambda way: way[1])
+        ways = [_nearest(camera, model) for model in spoken]
+        off_px = min(off for _, off in ways)
+        camera = next(nearest for nearest, off in ways if off == off_px)
         lines.append(
             f"Only legcal reads the lens {splined}: written as the nearest {camera.model}, at most "
             f"{off_px:.2g} px off over the image."
@@ -880,15 +882,11 @@ def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
     def jacobian(values: Array) -> Array:
         return project_with_derivatives(of(values), rays, names)[2].reshape(-1, len(names))
 
-    best = of(
-        least_squares(
-            lambda values: (of(values).distort(xy) - pixels).ravel(),
-            intrinsic_values(start),
-            jac=jacobian,
-            x_scale="jac",
-            method="lm",
-        ).x
-    )
+    def residual(values: Array) -> Array:
+        return np.ravel(of(values).distort(xy) - pixels)
+
+    values = intrinsic_values(start)
+    best = of(least_squares(residual, values, jac=jacobian, x_scale="jac", method="lm").x)
     return best, float(np.linalg.norm(best.distort(xy) - pixels, axis=1).max())
 
 

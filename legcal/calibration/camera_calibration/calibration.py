@@ -15,6 +15,7 @@ from legcal.calibration.camera_calibration.consensus import MIN_CORNERS
 from legcal.calibration.camera_calibration.diagnostics import (
     MIN_IMAGES,
     coverage,
+    noise_correlation,
     refuse_divided,
     refuse_undetermined,
     tilts,
@@ -324,6 +325,7 @@ def _result(
     }
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
+    length_px, effective = noise_correlation(fitted)
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
@@ -348,6 +350,8 @@ def _result(
         images=tuple(images),
         rms_px=adjusted.rms_px(),
         noise_px=float(np.sqrt(square.sum() / n_dof)),
+        noise_length_px=length_px,
+        effective_corners=effective,
         coverage=coverage(fitted),
         sheet=fitted.sheet,
         sheet_covariance=fitted.all_covariance[-len(SHEET) :, -len(SHEET) :],

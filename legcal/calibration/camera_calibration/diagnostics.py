@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
+from scipy.spatial.distance import pdist, squareform
 
 from legcal.calibration.camera_calibration.consensus import RobustFit
 from legcal.data.measurements import few
@@ -27,6 +28,7 @@ _MAX_RATIO = 25.0  # largest ratio of squared errors to the scatter of corners
 _MAX_PIXEL_RATIO = 0.01  # pixels of sensors are square
 _MAX_PRINT_RATIO, _MAX_BEND = 0.015, 0.02  # three and two standard deviations of the priors
 _SIGNIFICANT = 4.0  # standard deviations
+_BESIDE = 1.05  # of the smallest distance of corners on the board: next to each other
 _OPEN_PRIOR = 0.5  # sigma of an undetermined print ratio, relative to its prior
 _IMAGES_OF_PART = 2  # images with corners in a covered part of the image
 _PARTS = (
@@ -52,6 +54,33 @@ def coverage(fit: RobustFit) -> float:
     hull = cv2.convexHull(fit.corners.px.astype(np.float32))
     camera = fit.adjusted.camera
     return float(cv2.contourArea(hull)) / (camera.width * camera.height)
+
+
+def noise_correlation(fit: RobustFit) -> tuple[float, float]:
+    """Return the correlation length of residuals in an image [px], and the effective corners.
+
+    These are as a share of all: N / sum_ij exp(-d_ij / length), for a correlation that falls
+    exponentially with the distance, through that of corners next to each other on the board. The
+    length is zero where that correlation is not significant.
+    """
+    corners, residual = fit.corners, fit.adjusted.residual
+    products, apart_px, between = list[Array](), list[Array](), list[Array]()
+    for i in range(len(fit.images)):
+        of_image = corners.image == i
+        px, r = corners.px[of_image], residual[of_image]
+        on_board = squareform(pdist(corners.points[of_image]))
+        least = on_board[on_board > 0.0].min()
+        a, b = np.nonzero(np.triu(on_board > 0.0) & (on_board < _BESIDE * least))
+        products.append(np.sum(r[a] * r[b], axis=1))
+        apart_px.append(np.linalg.norm(px[a] - px[b], axis=1))
+        between.append(squareform(pdist(px)))
+    product = np.concatenate(products)
+    correlation = float(product.mean() / np.mean(np.sum(residual**2, axis=1)))
+    if correlation * np.sqrt(2.0 * len(product)) < _SIGNIFICANT:
+        return 0.0, 1.0
+    pitch = float(np.median(np.concatenate(apart_px)))
+    length = -pitch / float(np.log(min(correlation, 0.99)))
+    return length, len(residual) / sum(float(np.exp(-d / length).sum()) for d in between)
 
 
 def refuse_undetermined(fit: RobustFit, names: Sequence[str], left_out: Sequence[str] = ()) -> None:

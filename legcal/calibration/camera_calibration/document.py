@@ -69,6 +69,9 @@ class CameraCalibration:
     images: tuple[BoardImage, ...]  # all images in the given order
     rms_px: float  # root mean square of the residuals, both coordinates together [px]
     noise_px: float  # scatter of either coordinate of a corner, one standard deviation [px]
+    # correlation length of that in an image [px], 0 if none is seen; effective share of the corners
+    noise_length_px: float
+    effective_corners: float
     coverage: float  # share of the image inside the convex hull of all corners
     warnings: tuple[str, ...]  # warnings, one sentence each
     # (4,): bending of the board along x and y and its twist [m], relative excess width of the print
