@@ -83,7 +83,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.machine.leg import ParameterId
 from legcal.paper.criteria import Criteria
-from legcal.perception.diagnostics import hint_notes
+from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import (
     MeasuredImages,
@@ -97,6 +97,8 @@ from legcal.workers import Workers, worker_pool
 
 _TEETH, _UNLIKELY = 5, 60.0  # hypotheses that are fitted, and evidence against them at most
 _GUESSES = 3  # horns on another tooth at which images are measured, if those before show no legs
+# Share of the outlines of an image, and of a leg, below which a mistake may have lost them
+_LEAST_OF_IMAGE, _LEAST_OF_LEG = 0.5, 0.33
 
 
 def calibrate(
@@ -417,8 +419,20 @@ def _estimate(
 
 
 def _leaves_out_many(estimate: Estimate) -> bool:
-    """Whether the fit uses so few outlines that common mistakes are tried."""
-    return used_share(estimate.solution.outlines) < 1.0 - MAX_LEFT_OUT
+    """Whether the fit uses so few outlines that common mistakes are tried.
+
+    A mistake in readings, cameras or the model loses most of some images or legs; stripes of
+    reflection lose outlines everywhere.
+    """
+    o = estimate.solution.outlines
+    if used_share(o) >= 1.0 - MAX_LEFT_OUT:
+        return False
+    shown = o.choose(is_measurable(o))
+    images, legs = (
+        np.bincount(of, shown.used)[np.unique(of)] / np.bincount(of)[np.unique(of)]
+        for of in (shown.row, shown.leg)
+    )
+    return bool(np.mean(images < _LEAST_OF_IMAGE) > MAX_LEFT_OUT or legs.min() < _LEAST_OF_LEG)
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
