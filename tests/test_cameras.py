@@ -426,9 +426,9 @@ def test_a_spline_agrees_with_the_fisheye_lens_of_opencv_all_over_the_image() ->
     k = np.array([0.0705, -0.0234, 0.0164, -0.0014])
     u, v = np.meshgrid(np.linspace(0.0, 1279.0, 41), np.linspace(0.0, 959.0, 31))
     pixels = np.column_stack([u.ravel(), v.ravel()])
-    xy = np.asarray(cv2.fisheye.undistortPoints(pixels[:, None], K, k))[:, 0]
+    xy: Array = np.asarray(cv2.fisheye.undistortPoints(pixels[:, None], K, k), np.float64)[:, 0]
     assert np.degrees(np.arctan(np.linalg.norm(xy, axis=1))).max() > 70.0
-    pixels = np.asarray(cv2.fisheye.distortPoints(xy[:, None], K, k))[:, 0]
+    pixels = np.asarray(cv2.fisheye.distortPoints(xy[:, None], K, k), np.float64)[:, 0]
     spline = Camera(K, 1280, 960, np.zeros(6), "splined_radial")
     names, rays = intrinsic_names(spline), np.column_stack([xy, np.ones(len(xy))])
     for _ in range(3):  # linear in all but products of focal lengths and coefficients

@@ -69,7 +69,7 @@ def summary(
         room = _SCREEN - sum(map(_height, [*taken, last])) - 1
         return report(verdict, platform, changes, [*_first(brief, room), last], following)
     shown = [parameters.as_table(title) for title, parameters in tables(result)]
-    lines = [*sentences(result, verbose=True), written, verdict]
+    lines: list[str | Text] = [*sentences(result, verbose=True), written, verdict]
     return report(*shown, lines, following)
 
 
