@@ -2,7 +2,7 @@
 
 python benchmarks/identify.py [RUNS]
 
-For the views that are recommended: rank of the joint fit, and the standard
+For three views of all legs: rank of the joint fit, and the standard
 deviation of the worst direction that counts as determined and of the best that does not, in
 leg lengths (the limit is 1). Then the time of the analysis alone and of the whole command.
 """

@@ -110,8 +110,6 @@ def one_run(machine: Machine, seed: int) -> Run:
         position=np.array([T.translation for T in poses]),
         rotation=np.array([T.rotation.as_matrix() for T in poses]),
         oriented=np.ones(POSES, dtype=np.bool_),
-        position_sigma=None,
-        angle_sigma=None,
         numbers=np.arange(1, POSES + 1),
     )
     at = tool.translation.tolist() if lost.shape[1] else None

@@ -4,7 +4,6 @@ from .calibration.doctor import doctor as doctor
 from .calibration.evaluation import evaluate as evaluate
 from .calibration.identify.identifiability import identifiability as identifiability
 from .calibration.location.document import Location as Location
-from .calibration.location.document import load_location as load_location
 from .calibration.location.document import write_location as write_location
 from .calibration.location.locate import locate as locate
 from .calibration.location.tool_poses import ToolPoses as ToolPoses

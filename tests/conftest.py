@@ -69,6 +69,16 @@ def _temporary_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _sessions_are_simulated_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Share what is simulated among all processes that run tests."""
+    from simulated import keep_simulated
+
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    keep_simulated(shared / "simulated")
+
+
 @pytest.fixture
 def answered_signals() -> Iterator[None]:
     """Answer signals as Python does, also where the tests were started with them ignored."""

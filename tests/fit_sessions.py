@@ -12,6 +12,7 @@ from functools import cache
 
 import numpy as np
 from hexapod_sessions import disturbed_hexapod, paper_session, plain_scene
+from machines import from_vector
 from outline_sessions import closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -41,7 +42,6 @@ from legcal.machine.leg import (
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     free_coordinates,
-    from_vector,
     geometries,
     moved_legs,
     to_vector,

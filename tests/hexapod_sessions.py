@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from machines import from_vector
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.axes import LegAxes, axes_from_outlines, axes_of_table
@@ -17,7 +18,7 @@ from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import point_like_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.parameters import from_vector, to_vector
+from legcal.machine.parameters import to_vector
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import (
     OutlineNoise,

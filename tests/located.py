@@ -79,8 +79,6 @@ def located(
         + noise * SIGMA_POSITION * chance.normal(size=(len(tools), 3)),
         rotation=turn @ np.array([T.rotation.as_matrix() for T in tools]),
         oriented=np.ones(len(tools), dtype=np.bool_),
-        position_sigma=None,
-        angle_sigma=None,
         numbers=np.arange(1, len(tools) + 1),
     )
     return Located(machine, BASE, TOOL, platform, poses)

@@ -215,5 +215,5 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "tool-poses": _tool_poses,
     "result": _result,
     "formats": _formats,
-    **{style: _written(style) for style in ("mjcf bodies", "loop_joint", "constraint", "gepetto")},
+    **{style: _written(style) for style in ("mjcf bodies", "loop_joint", "gepetto")},
 }

@@ -18,7 +18,6 @@ FORMATS = (
     "mjcf defaults",
     "loop_joint",
     "isaac",
-    "constraint",
     "gepetto",
 )
 
@@ -141,18 +140,12 @@ def _with_loops(machine: Machine, style: str) -> str:
         for end in ends:
             _remove(robot, end)
         attributes = [f'xyz="{p.get("xyz")}" rpy="{p.get("rpy")}"' for p in places]
-        if style == "constraint":
-            text = f'<constraint name="loop{i}" type="{kind}">'
-            for side, end, place in zip(("parent", "child"), ends, attributes, strict=True):
-                text += f'<{side} link="{end.parent}"/><{side}_origin {place}/>'
-            text += "</constraint>"
-        else:
-            second = "link1" if style == "isaac" else "link2"
-            text = (
-                f'<loop_joint name="loop{i}" type="{kind}">'
-                f'<link1 link="{ends[0].parent}" {attributes[0]}/>'
-                f'<{second} link="{ends[1].parent}" {attributes[1]}/></loop_joint>'
-            )
+        second = "link1" if style == "isaac" else "link2"
+        text = (
+            f'<loop_joint name="loop{i}" type="{kind}">'
+            f'<link1 link="{ends[0].parent}" {attributes[0]}/>'
+            f'<{second} link="{ends[1].parent}" {attributes[1]}/></loop_joint>'
+        )
         robot.append(etree.fromstring(text))
     for j in machine.motors:
         motor = machine.legs[j].prismatic
@@ -219,32 +212,3 @@ def _group(machine: Machine, first: Any) -> list[Any]:
 def _letter(joint: Any) -> str | None:
     axes = dict(zip("XYZ", np.eye(3), strict=True))
     return next((k for k, axis in axes.items() if np.allclose(axis, joint.axis)), None)
-
-
-def with_loops_at_joints(machine: Machine, tag: str) -> str:
-    """Return the URDF of legs without S, closed by their revolute or universal platform joints."""
-    robot = etree.fromstring(machine.urdf.content)
-    above = {j.child: j for j in machine.urdf.joints.values()}
-    for i, closure in enumerate(machine.chain.closures):
-        end, seat = above[closure.frame_1], above[closure.frame_2]
-        joints = [above[end.parent]]
-        while above[joints[-1].parent].type == "revolute":
-            joints.append(above[joints[-1].parent])
-        first, last = joints[-1], joints[0]
-        for joint in (end, seat, *joints):
-            _remove(robot, joint)
-        sides = []
-        for name, joint in (("link1", first), ("link2", seat)):
-            place = etree.fromstring(origin(joint.T_parent_origin))
-            sides.append((name, joint.parent, f'xyz="{place.get("xyz")}" rpy="{place.get("rpy")}"'))
-        axes = numbers(first.axis), numbers(last.axis)
-        kind = "revolute" if len(joints) == 1 else "universal"
-        if tag == "loop_joint":
-            text = "".join(f'<{name} link="{link}" {at}/>' for name, link, at in sides)
-            text += f'<axis xyz="{axes[0]}"/>'
-        else:
-            text = ""
-            for side, (_, link, at), axis in zip(("parent", "child"), sides, axes, strict=True):
-                text += f'<{side} link="{link}"/><{side}_origin {at}/><{side}_axis xyz="{axis}"/>'
-        robot.append(etree.fromstring(f'<{tag} name="loop{i}" type="{kind}">{text}</{tag}>'))
-    return etree.tostring(robot, encoding="unicode")

@@ -1064,6 +1064,7 @@ def _formats() -> Iterable[Refusal]:
     link1 = '<link1 link="leg1_tube"'
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
+        ("universal", ('type="spherical"', 'type="universal"'), ("line", "needed one of")),
         ("no-type", ('type="spherical"', ""), ("line", "the type ''")),
         ("twice", ('name="loop1"', 'name="loop0"'), ("line", "'loop0', which another")),
         ("link", (link1, link1.replace("tube", "tub")), ("line", "mean 'leg1_tube'")),
@@ -1082,16 +1083,6 @@ def _formats() -> Iterable[Refusal]:
         "loops-and-yaml", "inspect {in}/machine.urdf",
         ("which is not read beside a mechanism YAML",), "loop_joint", (beside,),
     )  # fmt: skip
-    spherical = 'type="spherical"'
-    constraints: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
-        ("universal", (spherical, 'type="universal"'), ("line", "two axes")),
-        ("planar", (spherical, 'type="planar"'), ("line", "'planar'", "needed one of")),
-        ("one-link", ('<child link="base"/>', ""), ("line", "names 1 links, needed two")),
-        ("axis", (f"{spherical}>", 'type="revolute"><axis xyz="0 0 0"/>'), ("line", "zero axis")),
-        ("frame", (f"{spherical}>", 'type="revolute"><axis xyz="0 0 1" frame="parent"/>'),
-         ("line", "frame 'parent' alone")),
-    ]  # fmt: skip
-    yield from _of_file("constraints", "machine.urdf", "constraint", constraints)
     gepetto: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("axes", ("joint_type:\n- UJOINT_XY", "joint_type:\n- UJOINT_XX"),
          ("'UJOINT_XX'", "SPHERICAL")),
@@ -1338,7 +1329,6 @@ def _without_none(entry: dict[str, Any]) -> dict[str, Any]:
 
 def _poses() -> Iterable[Refusal]:
     p = "hexapod.csv"
-    sigma = swap(p, "\n", ",0.5\n", -1)
     joint = "leg1_prismatic"
     rows: Rows = [
         ("no-y", header(p, "y", None), ("'y'",)),
@@ -1353,7 +1343,6 @@ def _poses() -> Iterable[Refusal]:
         ("half", cell(p, 2, qx=""), ("row 2", "qx")),
         ("norm", cell(p, 2, qx="2.0"), ("row 2", "0.001")),
         ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
-        ("angle-sigma", (sigma, swap(p, "0.5", "angle_sigma")), ("angle_sigma", "0.5")),
         ("twice", doubled(p), ("row 25", "row 1")),
         ("no-rows", kept(p, 0), ("no row",)),
         ("two-poses", kept(p, 2), ("2", "3")),

@@ -1,7 +1,12 @@
 """Small simulated datasets for tests."""
 
+import contextlib
 import json
+import os
+import pickle
+import shutil
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -44,10 +49,38 @@ def standing(model: str, views: int = 2, camera: Path | None = None) -> tuple[Vi
 def simulated(
     folder: Path, model: str, *, views: int = 2, camera: Path | None = None, **changes: object
 ) -> SimulatedDataset:
-    """Simulate a shipped machine before cameras at known places: a search is half of the time."""
+    """Simulate a shipped machine before cameras at known places: a search is half of the time.
+
+    Outlines that were simulated before, by any process of these tests, are copied.
+    """
     # cameras are placed to see a board
     seen_from = views if changes.get("board") else standing(model, views, camera)
-    return simulate(model, folder, settings(views=seen_from, **changes))
+    given = settings(views=seen_from, **changes)
+    read = camera is not None or isinstance(given.poses, Path)  # a file, which may have changed
+    if given.level != Level.OUTLINES or read or not _MADE:
+        return simulate(model, folder, given)
+    kept = _MADE[0] / sha256(pickle.dumps((model, views, repr(changes)))).hexdigest()
+    if not kept.is_dir():
+        made = simulate(model, folder, given)
+        other = kept.with_name(f"{kept.name}-{os.getpid()}")
+        shutil.copytree(folder, other / "files")
+        (other / "made").write_bytes(pickle.dumps(made))
+        with contextlib.suppress(OSError):  # another process was faster
+            other.rename(kept)
+        return made
+    earlier: SimulatedDataset = pickle.loads((kept / "made").read_bytes())
+    shutil.copytree(kept / "files", folder)
+    truth = folder / earlier.truth_path.relative_to(earlier.folder)
+    return replace(earlier, folder=folder, truth_path=truth)
+
+
+_MADE: list[Path] = []  # the folder of what was simulated
+
+
+def keep_simulated(folder: Path) -> None:
+    """Have sessions kept in a folder that all processes of these tests share."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _MADE[:] = [folder]
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

@@ -21,7 +21,6 @@ from boards import (
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
-from thinned import thinned
 
 from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.measurements import Measurements, View
@@ -461,7 +460,7 @@ def test_two_poses_that_explain_a_board_alike_are_refused_or_told_apart_by_more_
     assert _turn(pose, T) < np.deg2rad(2.0)
 
 
-@pytest.mark.parametrize("shift", thinned([0.001, 0.01], [0.001]))
+@pytest.mark.parametrize("shift", [0.001])
 def test_a_board_that_moved_in_an_image_is_named_with_how_far(shift: float) -> None:
     T = before(CHARUCO, 0.6)
     moved = RigidTransform.from_translation([shift, 0.0, 0.0]) * T

@@ -87,7 +87,7 @@ def test_every_number_of_the_camera_is_recovered_within_its_sigma(model: Distort
     assert np.abs(again - corners).max() < 3.0
 
 
-@pytest.mark.parametrize(("n_images", "seed"), thinned([(5, 31), (10, 36)], [(5, 31)]))
+@pytest.mark.parametrize(("n_images", "seed"), [(5, 31)])
 def test_boards_that_all_lean_alike_give_the_camera_within_its_sigma(
     n_images: int, seed: int
 ) -> None:
@@ -234,20 +234,6 @@ def test_two_groups_of_one_size_are_refused_and_named() -> None:
         refuse_divided(few, [f"{k}.jpg" for k in range(12)])
 
 
-def test_images_choose_the_lens_model() -> None:
-    """A fisheye, which plumb_bob follows in the middle only."""
-    seen = seen_corners(CAMERAS["equidistant"], 8, 1)
-    chosen = chosen_lens(seen, SIZE)
-    assert chosen is not None
-    assert chosen.fit.adjusted.camera.model == "equidistant"
-    assert "plumb_bob" in chosen.reason
-    assert chosen.fit.left_out == {}
-    assert np.abs(pulls(chosen.fit, "equidistant")).max() < 3.0
-    assert chosen.validated_px is not None
-    residual_px = np.sqrt(np.mean(np.sum(chosen.fit.adjusted.residual**2, axis=1)))
-    assert residual_px < chosen.validated_px < 1.5 * residual_px
-
-
 @pytest.mark.system
 @pytest.mark.parametrize(
     "model", ["equidistant", pytest.param("rational_polynomial", marks=pytest.mark.slow)]
@@ -264,10 +250,14 @@ def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
     assert "part of the image that the others do not" in plain.left_out[18]
     chosen = chosen_lens(seen, WIDE_SIZE)
     assert chosen is not None
-    assert chosen.fit.adjusted.camera.model == model
-    assert chosen.fit.left_out == {}
-    assert "19 images agree on it" in chosen.reason
     fit = chosen.fit
+    assert fit.adjusted.camera.model == model
+    assert fit.left_out == {}
+    assert "19 images agree on it" in chosen.reason
+    assert "plumb_bob" in chosen.reason
+    assert chosen.validated_px is not None
+    residual_px = np.sqrt(np.mean(np.sum(fit.adjusted.residual**2, axis=1)))
+    assert residual_px < chosen.validated_px < 1.5 * residual_px
     errors = projection_errors(truth, fit.adjusted.camera, fit.covariance)
     assert np.quantile(errors, 0.9) < 3.0  # corners of the image may be far from any board
     assert sigmas(fit)[:4].max() < 0.3
@@ -287,7 +277,7 @@ def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_o
     assert "leave out --model" in " ".join(given.warnings)
 
 
-@pytest.mark.parametrize("model", thinned(["plumb_bob", "equidistant"], ["plumb_bob"]))
+@pytest.mark.parametrize("model", ["plumb_bob"])
 def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection(
     model: DistortionModel,
 ) -> None:

@@ -18,6 +18,7 @@ from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Run
 from lxml import html
+from numpy.testing import assert_allclose
 from rich.console import Console
 from simulated import simulated
 
@@ -32,6 +33,7 @@ from legcal import (
 from legcal.calibration import doubts, verdict
 from legcal.calibration.doubts import Doubt, model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
+from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, FocalLength
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
@@ -143,6 +145,7 @@ def _tolerance_and_hint(found: dict[str, Any]) -> None:
 
 
 _stated_wrongly = _yaml(_tolerance_and_hint)
+_travel_known_to_a_thousandth = _yaml(lambda found: found.update(tolerance={"travel": "0.1 %"}))
 
 
 @pytest.mark.parametrize(
@@ -200,6 +203,20 @@ def test_the_witness_of_the_scale_that_others_contradict_is_named_alone(
         assert doubt.sigma_dX_m > calibration.platform.sigma.mean_displacement
 
 
+def test_an_error_of_all_travel_is_stated_beside_sigma_as_large_as_it_may_be(
+    healthy: Calibration, calibrated: Callable[[Spoil], Calibration]
+) -> None:
+    stated = calibrated(_travel_known_to_a_thousandth)
+    assert "travel of the motors alone; an error of 0.20% of the" in healthy.verdict.sentence
+    assert "an error of 0.10% of the travel (1 sigma) moves" in stated.verdict.sentence
+    by_default, halved = (
+        next(effect.error for effect in found.platform.effects if effect.what == ALL_READINGS)
+        for found in (healthy, stated)
+        if found.platform is not None
+    )
+    assert_allclose(halved.displacement, 0.5 * by_default.displacement, rtol=0.05)
+
+
 def test_a_stated_length_that_is_the_nominal_one_is_asked_about(session: Path) -> None:
     nominal = _length(load_dataset(session).machine, "leg2")
     beside_travel = calibrate(session, priors=[nominal])
@@ -222,12 +239,13 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
 
 def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
     solution = healthy.solution
-    focal = next(s for s in solution.sensitivities if "focal" in s.what)
+    (shared,) = solution.sensitivities
+    focal = replace(shared, what=FITTED_CAMERA, steps=0.01 * shared.steps)
     fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
     wrong = FocalLength("c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
         "camera_doubts": (wrong,),
-        "sensitivities": (*solution.sensitivities, replace(focal, what=FITTED_CAMERA)),
+        "sensitivities": (shared, focal),
     }
     found = _judged(healthy, **changes)
     (doubt,) = found.doubts
@@ -235,7 +253,7 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
     effect = found.platform.effects[-1].error
     assert (doubt.code, doubt.sigma_dX_m) == ("camera", effect.mean_displacement)
     assert model_error(found.doubts) == (effect.mean_displacement, effect.mean_rotation)
-    large = replace(focal, what=FITTED_CAMERA, steps=1e3 * focal.steps)
+    large = replace(focal, steps=1e4 * focal.steps)
     found = _judged(healthy, **changes | {"sensitivities": (large,)})
     assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
     assert found.verdict.is_to_be_refused
@@ -366,9 +384,10 @@ def test_tolerances_are_stated_with_units_or_by_the_kind_of_machine(
 ) -> None:
     folder = _copy(session, tmp_path)
     stated = {"joints": "0.3 mm", "axes": "0.5 deg", "lengths": 1e-4, "zeros": "5 deg"}
+    stated["travel"] = "0.02%"
     _update(folder, {"tolerance": stated})
     tolerance = load_dataset(folder).machine.tolerance
-    assert tolerance == Tolerance(3e-4, np.radians(0.5), 1e-4, None, np.radians(5.0))
+    assert tolerance == Tolerance(3e-4, np.radians(0.5), 1e-4, None, np.radians(5.0), 2e-4)
     model = next((folder / "models").glob("*.yaml"))
     mechanism = yaml.safe_load(model.read_text())
     mechanism["legcal"]["machine_kind"] = "printed"
@@ -379,6 +398,8 @@ def test_tolerances_are_stated_with_units_or_by_the_kind_of_machine(
     refused: list[tuple[dict[str, Any], str]] = [
         ({"tolerance": {"joints": "1 deg"}}, "tolerance.joints.*needed a value in m"),
         ({"tolerance": {"joints": -1.0}}, "tolerance.joints.*above zero"),
+        ({"tolerance": {"travel": "0.1 mm"}}, "tolerance.travel.*part of the travel"),
+        ({"tolerance": {"travel": 0.02}}, "tolerance.travel.*per cent"),
         ({"machine_kind": "wooden"}, "machine_kind.*printed"),
         ({"tolerance": {"joints": 1e-3}, "machine_kind": "bought"}, "needed one of them"),
     ]

@@ -24,7 +24,6 @@ from layouts import Layout, write_machine
 from lxml import etree
 from machines import planar
 from scipy.spatial.transform import RigidTransform, Rotation
-from thinned import thinned
 
 import legcal
 from legcal import load_mechanism
@@ -110,10 +109,7 @@ def module_at(path: Path) -> ModuleType:
 
 @pytest.mark.parametrize(
     "name",
-    thinned(
-        KINEMATICS,
-        ["delta"],
-    ),
+    ["delta"],
 )
 def test_kinematics_in_python_are_those_of_the_model(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
@@ -244,7 +240,7 @@ def test_kinematics_for_matlab_run_in_octave_and_are_those_of_the_model(
 # --- models of other programs -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-upu"]))
+@pytest.mark.parametrize("name", ["3-upu"])
 def test_a_urdf_with_its_loops_is_the_same_machine_without_a_yaml(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:
@@ -287,7 +283,7 @@ def closed_in_mujoco(model: Any, data: Any, machine: Machine, q: Array) -> Rigid
     return RigidTransform.from_components(body.xpos, Rotation.from_matrix(body.xmat.reshape(3, 3)))
 
 
-@pytest.mark.parametrize("name", thinned(KINEMATICS, ["3-rpr", "3-upu", "tricept", "delta"]))
+@pytest.mark.parametrize("name", ["3-rpr", "3-upu", "tricept", "delta"])
 def test_mujoco_loads_the_mjcf_closed_and_has_the_same_forward_kinematics(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:
@@ -342,7 +338,7 @@ def test_genhexkins_has_the_readings_of_the_model(
         assert (joints >= limits).all()
 
 
-@pytest.mark.parametrize("name", thinned((*NAMES, *ACTUATED), ["3-rpr"]))
+@pytest.mark.parametrize("name", ["3-rpr"])
 def test_corrected_commands_bring_the_machine_where_it_should_be(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path
 ) -> None:

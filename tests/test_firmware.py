@@ -185,6 +185,21 @@ def test_the_firmware_is_told_by_its_header_and_its_codes(tmp_path: Path) -> Non
     assert "radius of the bed" in notes[0]
 
 
+def test_files_that_a_configuration_names_are_read_in_their_place(tmp_path: Path) -> None:
+    (tmp_path / "axes").mkdir()
+    printer = KLIPPER.index("[printer]")
+    (tmp_path / "axes" / "towers.cfg").write_text(KLIPPER[:printer])
+    (tmp_path / "axes" / "inner.cfg").write_text("[include towers.cfg]\n")
+    (tmp_path / "z-bed.cfg").write_text("[bed_mesh]\nspeed: 100\n")
+    named = "[include ./axes/in*.cfg] # towers\n[include z-*.cfg]\n[include no/*.cfg]\n"
+    file = tmp_path / "printer.cfg"
+    assert firmware_table(file, named + KLIPPER[printer:]) == firmware_table(file, KLIPPER)
+    setp = LINUXCNC.partition("[HAL]\n")[2].partition("[JOINT_0]")[0]
+    (tmp_path / "delta.hal").write_text(setp)
+    ini = LINUXCNC.replace(setp, "HALFILE = delta.hal\n")
+    assert firmware_table(file, ini) == firmware_table(file, LINUXCNC)
+
+
 def test_a_byte_order_mark_is_no_part_of_a_configuration(tmp_path: Path) -> None:
     assert machine_of("\ufeff" + KLIPPER.lstrip(), tmp_path).n_legs == 6
 
@@ -413,8 +428,8 @@ REFUSED = [
     (without(KLIPPER, "arm_length: 330"), {}, ("no arm_length in [stepper_a]", "rods")),
     (without(KLIPPER, "delta_radius"), {}, ("no delta_radius in [printer]", "carriage")),
     (without(KLIPPER_ARMS, "shoulder_height"), {}, ("no shoulder_height in [printer]",)),
-    (f"[include delta.cfg]\n{without(KLIPPER, 'delta_radius')}", {},
-     ("no delta_radius in [printer]", "[include delta.cfg] is not followed: give its sections")),
+    (f"[include delta.cfg]\n{KLIPPER}", {}, ("included file", "delta.cfg", "no such file")),
+    (f"[include printer.txt]\n{KLIPPER}", {}, ("[include printer.txt]", "includes itself")),
     (without(KLIPPER, "kinematics"), {}, ("kinematics nowhere", "section [printer]")),
     (KLIPPER.replace("delta\n", "corexy\n"), {}, ("corexy", "delta or rotary_delta")),
     (KLIPPER.replace("330.25", "long"), {}, ("arm_length in [stepper_a]", "'long'")),

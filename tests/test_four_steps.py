@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 from hexapod_sessions import PaperSession, extreme_poses, nominal_of
+from machines import from_vector
 from staged_sessions import Observed, errors, exact_session, noisy_session, shipped, staged
 from thinned import thinned
 
@@ -16,7 +16,7 @@ from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegKind, point_like_legs
-from legcal.machine.parameters import from_vector, to_vector
+from legcal.machine.parameters import to_vector
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_base_steps, run_platform_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
@@ -50,7 +50,7 @@ def noisy(
 
 
 @pytest.mark.parametrize("criteria", CRITERIA)
-@pytest.mark.parametrize("name", thinned([*EVEN, *DETERMINED], ["3-rpr", "3-rps", "tricept"]))
+@pytest.mark.parametrize("name", ["3-rpr", "3-rps", "tricept"])
 def test_exact_axes_give_the_machine_from_3_mm_and_1_degree(name: str, criteria: Criteria) -> None:
     observed = exact(name)
     before = np.abs(observed.errors(observed.nominal.legs))
@@ -100,7 +100,7 @@ PRINTED: dict[str, list[tuple[Any, ...]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", thinned(PRINTED, ["hexapod", "3-rps", "tricept"]))
+@pytest.mark.parametrize("name", ["hexapod", "3-rps", "tricept"])
 def test_printed_criteria_keep_their_numbers(name: str) -> None:
     found = shipped(name, noise=0.25, n_poses=10).run("literal").legs
     for j, A, B, q0, axis in PRINTED[name]:
@@ -200,34 +200,13 @@ def in_other_frames(axes: LegAxes, R: Array) -> LegAxes:
     )
 
 
-CHANGES = ("cameras", "legs", "views")
-
-
-@pytest.mark.parametrize(
-    ("change", "criteria"),
-    thinned(product(CHANGES, CRITERIA), [("cameras", "literal"), ("legs", "default")]),
-)
-def test_turned_cameras_and_other_orders_change_nothing(change: str, criteria: Criteria) -> None:
+def test_turned_cameras_change_nothing() -> None:
+    """Nor do other orders of legs and views, by test_calibrate.py."""
     observed = shipped("3-rps", noise=0.1)
-    nominal, axes, m = observed.nominal, observed.axes, observed.measurements
-    order, legs = np.array([1, 2, 0]), np.arange(3)
-    if change == "cameras":
-        turns = np.array([T.rotation.as_matrix() for T in observed.T_camera_Rb])
-        axes = in_other_frames(axes, turns[m.view[axes.row]])
-    elif change == "legs":
-        legs, place = order, np.argsort(order)
-        axes, m = replace(axes, leg=place[axes.leg]), replace(m, q=m.q[:, order])
-        nominal = replace(
-            nominal,
-            leg_names=tuple(nominal.leg_names[j] for j in order),
-            legs=tuple(nominal.legs[j] for j in order),
-            frame_legs=tuple(int(place[j]) for j in nominal.frame_legs),
-        )
-    else:
-        m = replace(m, views=tuple(m.views[v] for v in order), view=np.argsort(order)[m.view])
-    first = observed.run(criteria)
-    second = replace(observed, nominal=nominal, axes=axes, measurements=m).run(criteria)
-    for one, other in zip([first.legs[j] for j in legs], second.legs, strict=True):
+    turns = np.array([T.rotation.as_matrix() for T in observed.T_camera_Rb])
+    of_rows = turns[observed.measurements.view[observed.axes.row]]
+    turned = replace(observed, axes=in_other_frames(observed.axes, of_rows))
+    for one, other in zip(observed.run("literal").legs, turned.run("literal").legs, strict=True):
         for a, b in ((one.A, other.A), (one.B, other.B), (one.q0, other.q0)):
             assert np.allclose(a, b, rtol=0.0, atol=1e-6)
         assert one.base_axis is not None

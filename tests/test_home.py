@@ -87,7 +87,7 @@ def test_a_rounded_home_closes_in_every_class(
 # --- without a home -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", thinned(SHIPPED, ["hexapod", "3-rpr", "3-upu", "tricept"]))
+@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "3-upu", "tricept"])
 def test_without_a_home_one_at_mid_travel_above_the_base_is_found(
     name: str, tmp_path: Path
 ) -> None:

@@ -5,7 +5,6 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from machines import SHIPPED_YAML
 from rich.console import Console
-from thinned import thinned
 
 import legcal
 from legcal.calibration.identify.identifiability import (
     check_identifiable,
     identifiability_of_dataset,
-    ranks_of_dataset,
 )
+from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
@@ -85,27 +83,15 @@ def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("views", "images", "ranks", "needed"),
-    [
-        ("weak joint", 6, (30, 30), ()),
-        ("halves", 15, (30, 30), ("eq12",)),
-        ("paper", 6, (30, 30), ()),
-        ("weak joint", 1, (26, 30), ("full",)),
-    ],
+    ("views", "images", "ranks"),
+    [("weak joint", 6, (30, 30)), ("halves", 15, (30, 30)), ("weak joint", 1, (26, 30))],
 )
-def test_a_board_does_what_the_report_says(
-    views: str, images: int, ranks: tuple[int, int], needed: tuple[str, ...]
+def test_a_board_raises_the_rank_and_takes_the_place_of_a_condition(
+    views: str, images: int, ranks: tuple[int, int]
 ) -> None:
     without, given = (report(views, images=images, board=board) for board in (False, True))
-    assert (without.board.without, without.board.with_board) == (
-        given.board.without, given.board.with_board,
-    )  # fmt: skip
-    board = without.board
-    assert (board.without.full_rank, board.with_board.full_rank) == ranks
     assert (without.full.rank, given.full.rank) == ranks
-    assert (board.present, given.board.present) == (False, True)
-    assert board.needed_for == needed
-    assert len(board.mends) == ranks[1] - ranks[0]
+    assert (without.board, given.board) == (False, True)
     assert [c.needed for c in (without.conditions[0], given.conditions[0])] == [None, False]
     assert not given.conditions[0].fails
 
@@ -115,7 +101,7 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     assert (len(found.views), set(found.images)) == (45, {1})
     assert found.full.rank == 30
     assert found.conditions_hold
-    assert "two_directions" in found.board.needed_for
+    assert found.board
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
 
 
@@ -138,18 +124,14 @@ def test_the_document_is_that_of_the_report(
     }  # fmt: skip
     assert "needed" not in document["conditions"][1]
     assert document["paper"] == {"ok": found.conditions_hold}
-    assert document["board"]["with"] == {
-        "full_rank": 30, "identifiable": True,
-    }  # fmt: skip
-    assert document["board"]["present"] is True
+    assert document["board"] is True
     assert document["views"] == [list(view) for view in VIEWS["halves"]]
-    assert document["recommendation"] is None
     assert found == report("halves", images=15, board=True)
 
 
 @pytest.mark.parametrize(
     ("name", "views"),
-    thinned(product(MODELS, [(), SOME]), [("3-upu", ()), ("hexapod", SOME)]),
+    [("3-upu", ()), ("hexapod", SOME)],
 )
 def test_tables_fit_80_columns_and_say_the_verdict(
     name: str,
@@ -166,9 +148,6 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     verdict = legcal.identifiability(loaded(name), chosen, 6)
     said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
     assert said in out
-    assert ("smallest sufficient sets of views" in out) == (not views)
-    if "  *" in out:
-        assert "whose own camera places and poses give the error below" in " ".join(out.split())
 
 
 def test_all_problems_of_views_are_refused_at_once() -> None:
@@ -186,16 +165,7 @@ def test_all_problems_of_views_are_refused_at_once() -> None:
 def test_a_dataset_is_judged_by_itself() -> None:
     found = identifiability_of_dataset(example())
     assert found.identifiable
-    assert found.recommendation is None
     assert (found.full.rank, sum(found.images)) == (30, example().measurements.n_rows)
-    (camera,) = found.intrinsics
-    assert (camera.camera, camera.determined) == ("c1", True)  # one for all views
-    assert found.document()["intrinsics"][0]["sigma"] == camera.sigma
-    assert "determine its intrinsics too (predicted sigma: fx 0." in said(found)
-    (camera,) = identifiability_of_dataset(two_images()).intrinsics
-    assert not camera.determined
-    assert None in camera.sigma.values()
-    assert "calibrate it with legcal camera" in said(identifiability_of_dataset(two_images()))
 
 
 def test_a_dataset_with_a_board_is_judged_with_it() -> None:
@@ -209,7 +179,7 @@ def test_a_dataset_with_a_board_is_judged_with_it() -> None:
     shown = recorded_session(replace(with_board, corners=one)).board
     np.testing.assert_array_equal(shown, [False, True, False])
     found = identifiability_of_dataset(with_board)
-    assert found.board.present
+    assert found.board
     assert found.conditions[0].needed is False
 
 
@@ -240,7 +210,7 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
-        return ranks_of_dataset(two_images(), choices)[1].rank
+        return Analysis(recorded_session(two_images()), choices).full.rank
 
     alone = rank(Choices())
     assert rank(Choices(fixed=frozenset(names))) == 30

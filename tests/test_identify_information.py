@@ -9,11 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import Layout, write_machine
 from machines import MACHINES, with_round_arms
-from thinned import thinned
 from uncertainty import compared
 
 import legcal
-from legcal.calibration.identify.ranks import Analysis, expected_intrinsics, is_scale_open
+from legcal.calibration.identify.ranks import Analysis, is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.descriptions.new_model import create_model
@@ -99,16 +98,13 @@ def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None
         sigma_q=size * session.sigma_q,
     )
     found = [Analysis(each) for each in (session, other)]
-    (one,), (two,) = (expected_intrinsics(each) for each in found)
-    sigmas = [np.array(list(each.sigma.values()), dtype=np.float64) for each in (one, two)]
-    np.testing.assert_allclose(sigmas[1], sigmas[0], rtol=1e-3)
     singular = [np.linalg.svd(each.information, compute_uv=False) for each in found]
     np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize(
     "name",
-    thinned(sorted(MACHINES), ["3-RPR", "6-UPS", "Tricept", "hexapod with a strut"]),
+    ["3-RPR", "6-UPS", "Tricept", "hexapod with a strut"],
 )
 def test_planned_poses_close_every_leg_inside_its_travel(
     name: str, tmp_path_factory: pytest.TempPathFactory

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_legs import closed_leg
 from staged_sessions import exact_session
-from thinned import thinned
 
 import legcal
 from legcal import identifiability
@@ -214,35 +213,19 @@ def test_what_does_not_move_the_platform_is_harmless(
     assert not any(direction.harmless for direction in one.full.weak)
 
 
-@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-upu"]))
-def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str) -> None:
+@pytest.mark.parametrize("name", ["hexapod", "3-upu"])
+def test_every_shipped_model_is_identifiable_from_three_places(name: str) -> None:
     found = identifiability(model(name))
-    assert found.recommendation
-    assert found.views == found.recommendation[0].views
+    assert found.views == (model(name).leg_names,) * 3
     assert found.conditions_hold
     assert found.identifiable
     harmless = 6 if name == "3-upu" else 0
     assert found.full.rank == found.full.of - harmless
-    first = found.recommendation[0]
-    assert first.platform_sigma is not None
     assert found.platform_sigma is not None
     if name == "hexapod":
-        sizes = [(len(r.views), r.legs_a_view) for r in found.recommendation]
-        assert sizes == [(1, 6), (2, 4), (4, 3)]
-        best = found.recommendation[1].platform_sigma
-        rest = identifiability(model(name), [model(name).leg_names[k : k + 4] for k in (0, 2)])
-        assert best is not None
-        assert rest.platform_sigma is not None
-        assert best.dX_m < 1.05 * rest.platform_sigma.dX_m
         boards = identifiability(model(name), platform_board=True)
-        assert boards.recommendation
-        with_board = boards.recommendation[0].platform_sigma
         assert boards.platform_sigma is not None
-        assert with_board is not None
-        # The best of several places of a camera, with the board as without.
-        assert first.platform_sigma.dX_m <= found.platform_sigma.dX_m
-        assert with_board.dX_m <= boards.platform_sigma.dX_m
-        assert with_board.dX_m < 0.95 * first.platform_sigma.dX_m
+        assert boards.platform_sigma.dX_m < 0.95 * found.platform_sigma.dX_m
 
 
 def test_remedies_were_tried_and_are_true() -> None:

@@ -135,7 +135,6 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.predicted",
         "joint_fit.problem",
         "joint_fit.variables",
-        "link_joints",
         "location.document",
         "location.locate",
         "ordered_dataset",

@@ -137,31 +137,27 @@ def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path:
     everything = list(range(len(rows)))
     found = compared(everything, other, made.truth_path)
     document = found.document()
-    n, off = document["left_out"], [row["row"] - 1 for row in document["unreached"]]
+    n, off = document["left_out"], [row - 1 for row in document["unreached"]]
     assert 0 < n < 6
     assert len(off) == 2 * n  # both views show every pose
     assert len(found.displacement) == document["poses"] == 6 - n
-    assert [row["image"] for row in document["unreached"]] == [f"{k}.png" for k in off]
     assert {rows[k]["pose"] for k in everything if k not in off}.isdisjoint(
         rows[k]["pose"] for k in off
     )
     swapped = compared(everything, made.truth_path, other)
-    for one, by in ((found, "model"), (swapped, "reference")):
-        assert {who for row in one.unreached for who in row.by} == {by}
-        assert [row.row - 1 for row in one.unreached] == off
+    assert [row - 1 for row in swapped.unreached] == off
     shown = _printed(accuracy_table(found))
     assert f"{n} of 6 poses are left out" in shown
-    assert all(re.search(rf"{k + 1} +c\d +{k}.png +model", shown) for k in off)
 
     rest = compared([k for k in everything if k not in off], other, made.truth_path)
     assert rest.document()["left_out"] == 0
     np.testing.assert_allclose(rest.displacement, found.displacement, atol=1e-9)
-    with pytest.raises(DidNotConverge, match=r"the model does not reach rows 1, 2") as refusal:
+    with pytest.raises(DidNotConverge, match="no row whose readings both reach") as refusal:
         compared(off, other, made.truth_path)
     assert refusal.value.exit_code == 1
     (short, *legs) = truth.legs
     shorter_than_nothing = replace(truth, legs=(replace(short, q0=-1.0), *legs))
-    with pytest.raises(DidNotConverge, match="the model does not reach row"):
+    with pytest.raises(DidNotConverge, match="no row whose readings both reach"):
         evaluate(shorter_than_nothing, truth, dataset=made.folder)
 
 

@@ -135,14 +135,11 @@ FIXED: dict[str, tuple[list[str], list[str], tuple[int, ...]]] = {
 
 @pytest.mark.parametrize(
     ("kind", "layout"),
-    thinned(  # each layout, the fixed leg at each place of the frame
-        product(FIXED, LAYOUTS),
-        [
-            ("TriVariant, the fixed leg first", "cut behind the slider"),
-            ("SP", "hung from the platform"),
-            ("RP", "hung from the base"),
-        ],
-    ),
+    [
+        ("TriVariant, the fixed leg first", "cut behind the slider"),
+        ("SP", "hung from the platform"),
+        ("RP", "hung from the base"),
+    ],
 )
 def test_exact_outlines_give_the_machine_whatever_defines_its_frame(
     kind: str, layout: str, tmp_path: Path

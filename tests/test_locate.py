@@ -29,12 +29,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal import (
     Location,
     ToolPoses,
-    load_location,
     load_mechanism,
     locate,
     write_location,
 )
-from legcal.calibration.location.document import location_document, write_located_model
+from legcal.calibration.location.document import write_located_model
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
@@ -148,9 +147,6 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
     assert right.p_value is not None
     assert right.p_value > 1e-3
     assert right.dof == 36
-    beside = locate(hexapod.machine, hexapod.poses, **KNOWN, encoder_sigma="50um")
-    assert np.all(beside.sigma > right.sigma)
-    assert beside.noise.reading == pytest.approx(50e-6)
 
 
 def _position(change: Callable[[Array], Array], n: int = 6, **more: Any) -> Located:
@@ -175,13 +171,6 @@ def _w_first() -> Located:
     quaternions = Rotation.from_matrix(hexapod.poses.rotation).as_quat()
     wrong = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
     return replace(hexapod, poses=replace(hexapod.poses, rotation=wrong))
-
-
-def _inverse() -> Located:
-    hexapod = located("hexapod", 6)
-    back = np.swapaxes(hexapod.poses.rotation, 1, 2)
-    there = -np.einsum("nij,nj->ni", back, hexapod.poses.position)
-    return replace(hexapod, poses=replace(hexapod.poses, rotation=back, position=there))
 
 
 def _four_of_twelve() -> Located:
@@ -222,42 +211,34 @@ def _loose() -> Located:
     return replace(hexapod, machine=replace(hexapod.machine, mobility=7))
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.parametrize(
     ("spoiled", "options", "kind", "named"),
     [
         (lambda: near_home("hexapod", 10, 0.02, (0, 0, 1)), {}, NotIdentifiable,
-         ("tool in the platform along (0, 0, 1)", "two axes", "tilted")),
-        (lambda: near_home("hexapod", 10, 0.02, (0, 0, 0)), {}, NotIdentifiable, ("do not turn",)),
+         ("tool in the platform along (0, 0, 1)", "another axis")),
+        (lambda: near_home("hexapod", 10, 0.02, (0, 0, 0)), {}, NotIdentifiable, ("another axis",)),
         (lambda: near_home("hexapod", 10, 0.0, (0, 0, 1)), {}, NotIdentifiable,
-         ("all turn about one axis", "stay in place")),
-        (_along_a_line, {}, NotIdentifiable, ("displacements in 3 directions",)),
+         ("these 10 poses",)),
+        (_along_a_line, {}, NotIdentifiable, ("displaced in another direction",)),
         (lambda: _rows([0]), {}, NotIdentifiable, ("1 pose", "3 poses")),
         (lambda: _rows([0] * 5), {}, NotIdentifiable, ("5 rows at 1 different reading",)),
         (lambda: _rows([0, 1, 2], oriented=False), {}, NotIdentifiable, ("4 poses", "positions")),
         (lambda: _position(np.copy, 20, oriented=np.arange(20) == 4), {}, NotIdentifiable,
          ("orientations of 20 rows", "--angle-sigma")),
-        (lambda: _position(_displaced, 4), {}, NotIdentifiable, ("scatter of",)),
+        (lambda: _position(_displaced, 4), {}, NotIdentifiable, ("measure them better",)),
         (lambda: _position(lambda p: 1e3 * p), {}, DatasetError,
-         ("millimetres", "1000")),
-        (_w_first, {}, DatasetError, ("w, x, y, z",)),
-        (_mirrored, {}, DatasetError, ("left-handed axes", "mirror")),
-        pytest.param(_inverse, {}, DatasetError, ("world in the tool",), marks=SLOW),
+         ("positions in metres",)),
+        (_w_first, {}, DatasetError, ("quaternions x, y, z, w",)),
+        (_mirrored, {}, DatasetError, ("right-handed axes",)),
         (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
         (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
         (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),
         (_loose, {}, LegcalError, ("the pose cannot be computed from readings",)),
         (lambda: _rows([0, 1, 2]), {"position_sigma": 0.0}, UsageError, ("position sigma", "0 m")),
         (lambda: _rows([0, 1, 2]), {"angle_sigma": 0.5}, UsageError, ("angle sigma", "0.5 rad")),
-        (lambda: _rows([0, 1, 2]), {"encoder_sigma": float("nan")}, UsageError, ("nan",)),
-        (lambda: _rows([0, 1, 2]), {"encoder_sigma": "0.5deg"}, UsageError, ("0.5deg", "mm")),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 1.0)}, UsageError, ("three numbers",)),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 0.0, float("inf"))}, UsageError,
          ("tool position",)),
-        (lambda: _position(np.copy, 4, position_sigma=np.full(4, 1e-5)),
-         {"position_sigma": 1e-5}, UsageError, ("column position_sigma", "option")),
     ],
 )  # fmt: skip
 def test_what_cannot_be_located_is_refused_with_what_is_wrong(
@@ -274,20 +255,17 @@ def test_what_cannot_be_located_is_refused_with_what_is_wrong(
 
 
 def test_a_table_says_the_same_as_arrays(tmp_path: Path) -> None:
-    """In any order of columns, with sigmas, and orientations of some rows only."""
+    """In any order of columns, and with orientations of some rows only."""
     hexapod, path = located("hexapod", 5), tmp_path / "poses.csv"
     rows = write_poses(path, hexapod)
-    more = {"position_sigma": "2e-5", "angle_sigma": "1e-4", "name": "first"}
-    rows = [dict(reversed(list((more | row).items()))) for row in rows]
-    rows[2].update(qx="", qy="", qz="", qw="", angle_sigma="")
+    rows = [dict(reversed(list(({"name": "first"} | row).items()))) for row in rows]
+    rows[2].update(qx="", qy="", qz="", qw="")
     write_rows(path, rows)
     poses = replace(
         hexapod.poses,
         oriented=np.arange(5) != 2,
-        position_sigma=np.full(5, 2e-5),
-        angle_sigma=np.full(5, 1e-4),
     )
-    read, given = (locate(hexapod.machine, x) for x in (path, poses))
+    read, given = (locate(hexapod.machine, x, **KNOWN) for x in (path, poses))
     np.testing.assert_allclose(read.covariance, given.covariance, rtol=1e-9)
     np.testing.assert_allclose(frames_error(read), frames_error(given), atol=1e-12)
     assert [row.rotation is None for row in read.rows] == [False, False, True, False, False]
@@ -323,60 +301,20 @@ def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
     names = [Path(p).relative_to(tmp_path).as_posix() for p in document.pop("written")]
     assert names == ["out/models/hexapod.yaml", "out/urdf/hexapod.urdf", "a.yaml"]
     assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == document
-    assert (
-        run(monkeypatch, "locate", *words, "--encoder-sigma", "1um", "--tool-position", "0,0,5mm")
-        == 0
-    )
-    shown = " ".join(capsys.readouterr().out.split())
-    for words_shown in ("Row 5 was left out: 8", "errors of the readings"):
-        assert words_shown in shown
+    assert run(monkeypatch, "locate", *words, "--tool-position", "0,0,5mm") == 0
+    assert "Row 5 was left out: 8" in " ".join(capsys.readouterr().out.split())
     assert run(monkeypatch, "locate", *words, "--position-sigma", "0.001mm") == 1
     assert "Doubtful" in capsys.readouterr().out
-    assert load_location(tmp_path / "a.yaml").status == "doubtful"
+    assert yaml.safe_load((tmp_path / "a.yaml").read_text())["status"] == "doubtful"
 
 
-@pytest.mark.parametrize("which", ["found", "in_part"])
-def test_a_location_comes_back_from_its_file(
-    which: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    location: Location = request.getfixturevalue(which)
-    write_location(location, str(tmp_path / "a.yaml"))
-    again = load_location(tmp_path / "a.yaml")
-    before, after = location_document(location), location_document(again)
-    for frame in ("T_world_base", "T_platform_tool"):
-        one, two = before.pop(frame), after.pop(frame)
-        np.testing.assert_allclose(one.pop("quat_xyzw"), two.pop("quat_xyzw"), atol=1e-15)
-        assert one == two
-    assert before == after
-    np.testing.assert_array_equal(again.covariance, location.covariance)
-    assert (again.rows, again.held) == (location.rows, location.held)
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"covariance": {"names": ["x"], "matrix": [[1.0]]}}, ("covariance", "another matrix")),
-        ({"status": "fine"}, ("status", "'fine'")),
-        ({"residuals": {}}, ("residuals.chi2",)),
-        ({"more": 1}, ("more", "unknown key")),
-        ({"legcal_location": None}, ("'legcal_location'",)),
-    ],
-)
-def test_files_that_are_no_location_are_refused_and_kept(
-    found: Location, tmp_path: Path, change: dict[str, Any], named: tuple[str, ...]
-) -> None:
+def test_other_files_are_kept(found: Location, tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
-    document = {k: v for k, v in (location_document(found) | change).items() if v is not None}
-    path.write_text(yaml.safe_dump(document))
-    with pytest.raises(DatasetError) as refused:
-        load_location(path)
-    assert [word for word in named if word not in str(refused.value)] == []
-    if "legcal_location" in change:
-        before = path.read_text()
-        for place in (path, tmp_path):
-            with pytest.raises(UsageError, match="found a"):
-                write_location(found, place)
-        assert path.read_text() == before
+    path.write_text("other: 1\n")
+    for place in (path, tmp_path):
+        with pytest.raises(UsageError, match="found a"):
+            write_location(found, place)
+    assert path.read_text() == "other: 1\n"
 
 
 @pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept"])

@@ -7,10 +7,12 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, files
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from model_formats import FORMATS, with_loops_at_joints, write_format
+import yaml
+from model_formats import FORMATS, write_format
 from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
@@ -72,19 +74,6 @@ def test_every_format_gives_the_same_analysis(name: str, machine: str, tmp_path:
     assert_same_analysis(found, expected)
 
 
-@pytest.mark.parametrize(
-    ("machine", "tag"),
-    [("3-rpr", "loop_joint"), ("3-rpr", "constraint"), ("3-upu", "constraint")],
-)
-def test_loops_are_closed_by_revolute_and_universal_joints(
-    machine: str, tag: str, tmp_path: Path
-) -> None:
-    expected = machine_of(machine)
-    path = tmp_path / "machine.urdf"
-    path.write_text(with_loops_at_joints(expected, tag))
-    assert_same_analysis(replace(load_mechanism(path), home=expected.home), expected)
-
-
 @pytest.mark.parametrize("name", ["mjcf sites", "loop_joint", "gepetto"])
 def test_a_calibrated_model_of_any_format_is_complete(name: str, tmp_path: Path) -> None:
     nominal = load_mechanism(write_format(machine_of("hexapod"), name, tmp_path))
@@ -118,6 +107,27 @@ def test_what_is_written_down_loads_with_an_equal_analysis(
     assert_same_analysis(written, found)
     for key in ("leg_names", "frame_legs", "platform_joint"):
         assert getattr(written, key) == getattr(found, key)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"machine_kind": "printed"},
+        {"tolerance": {"joints": "0.3 mm", "lengths": 1e-4, "zeros": "0.2 mm"}, "spline_teeth": 25},
+        {"tolerance": {"axes": "0.5 deg", "zeros": 1e-3}},
+    ],
+)
+def test_a_copied_model_says_how_well_the_machine_is_built(
+    stated: dict[str, Any], tmp_path: Path
+) -> None:
+    path, _ = write_model(machine_of("hexapod"), tmp_path / "from")
+    document = yaml.safe_load(path.read_text())
+    document["legcal"] |= stated
+    path.write_text(yaml.safe_dump(document))
+    machine = load_mechanism(path)
+    copied = load_mechanism(write_model(machine, tmp_path / "to")[0])
+    assert machine.tolerance != machine_of("hexapod").tolerance
+    assert (copied.tolerance, copied.spline_teeth) == (machine.tolerance, machine.spline_teeth)
 
 
 def test_a_urdf_that_needs_no_change_is_copied_and_nothing_written_over(tmp_path: Path) -> None:
@@ -211,7 +221,7 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
     root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), XmlProblems(path)
     reader = MjcfReader(root, problems)
     reader.read_bodies()
-    pairs = [close_loop(loop, reader.tree, reader.poses)[0] for loop in reader.loops()]
+    pairs = [close_loop(loop, reader.tree)[0] for loop in reader.loops()]
     problems.raise_if_any()
     chain = ClosedChain(reader.tree.robot("machine").decode(), [])
     q = chain.neutral()

@@ -76,7 +76,6 @@ def small_search() -> Iterator[None]:
         patch.setattr(planner, "POSES_EACH", 2)
         patch.setattr(planner, "ROUNDS", 1)
         patch.setattr(camera_places, "_N_AZIMUTHS", 5)
-        patch.setattr(camera_places, "_ACROSS", 3)
         yield
 
 
@@ -135,19 +134,13 @@ def test_a_planned_session_is_a_dataset_and_simulation_shoots_it(planned: Plan, 
     assert taken.view.tolist() == m.view.tolist()
 
 
-def test_the_expected_error_is_that_of_a_calibration_which_says_so(
-    planned: Plan, shot: Path
-) -> None:
+def test_the_expected_error_is_that_of_a_calibration(planned: Plan, shot: Path) -> None:
     found = legcal.calibrate(shot / "shot", output=shot / "out")
     assert found.platform is not None
     assert found.platform.workspace is not None
     assert planned.error is not None
     stated = found.platform.workspace.mean_displacement
     assert planned.error.mean_displacement == pytest.approx(stated, rel=0.25)
-    assert any("times the plan" in note for note in found.notes)
-    (shot / "shot" / "plan.json").write_text("{")
-    again = legcal.calibrate(shot / "shot")
-    assert any("plan.json cannot be read" in note for note in again.notes)
     for text in ("{", "[]", "{}"):
         (shot / "shot" / "plan.json").write_text(text)
         settings = SimulationSettings(plan=shot / "shot", level=Level.OUTLINES)
@@ -354,8 +347,8 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
         DidNotConverge,
         "; plan with a smaller length",
     ),
-    (FAR | {"bounds": np.array([[5.0, 6.0]] * 3)}, NotVisible, "bounds towards"),
-    (FAR | {"bounds": np.array([[0.3, 0.31]] * 3)}, NotVisible, "bounds away"),
+    (FAR | {"bounds": np.array([[5.0, 6.0]] * 3)}, NotVisible, "widen --bounds"),
+    (FAR | {"bounds": np.array([[0.3, 0.31]] * 3)}, NotVisible, "widen --bounds"),
 ]
 
 

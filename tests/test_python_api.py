@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 import legcal
-from legcal.errors import OutOfResources, UsageError
+from legcal.errors import UsageError
 from legcal.simulation.settings import Level
 
 
@@ -58,12 +58,6 @@ def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run
     assert table[-1] == list(table)[-1]
     assert len(table) == len(loaded.result.parameters)
     assert repr(table).count("\n") == len(table)
-
-
-def test_pandas_is_asked_for_by_name(example_run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
-    with pytest.raises(OutOfResources, match="pip install pandas"):
-        example_run.calibration.table().to_pandas()
 
 
 def test_a_figure_shows_the_sigma_of_every_parameter(example_run: Run) -> None:

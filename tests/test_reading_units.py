@@ -117,7 +117,6 @@ def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_t
         lambda: load(sigma),
         lambda: load(dict.fromkeys(machine.motor_names, sigma)),
         lambda: legcal.plan(machine, encoder_sigma=sigma),
-        lambda: legcal.locate(machine, "none.csv", encoder_sigma=f"{1e6 * sigma:.0f}um"),
         lambda: legcal.simulate(machine, tmp_path / "out", noisy),
     ]
     for give in ways:

@@ -11,7 +11,6 @@ import leg_pictures as lp
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
-from thinned import thinned
 
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, unmeasured
@@ -263,7 +262,7 @@ def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
 # The camera of a view.
 
 
-@pytest.mark.parametrize("n_legs", thinned([3, 4, 6], [3, 6]))
+@pytest.mark.parametrize("n_legs", [3, 6])
 def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
     for seed in range(2):
         pictures, T = _scene(seed, n_legs, 4, joint_error=2e-3, **HARD)
@@ -449,7 +448,7 @@ def test_pictures_of_other_things_give_no_pose() -> None:
     assert not place_camera([clutter] * 2, 6).is_convincing
 
 
-@pytest.mark.parametrize("missing", thinned([0.2, 0.45], [0.45]))
+@pytest.mark.parametrize("missing", [0.45])
 def test_mirrored_pictures_are_recognised_as_such(missing: float) -> None:
     pictures, _ = _scene(20, 6, 3, joint_error=2e-3, **{**HARD, "missing": missing})
     own, other = place_camera(pictures, 6), place_camera(mirrored(pictures), 6)

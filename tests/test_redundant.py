@@ -16,7 +16,6 @@ from machines import displaced, of_types, planar, ring
 from outline_sessions import made
 from scipy.spatial.transform import RigidTransform
 from simulated import settings
-from thinned import thinned
 
 import legcal
 from legcal.calibration.joint_fit.fit import refine
@@ -35,13 +34,22 @@ from legcal.machine.kinematics import (
     platform_in_base,
 )
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, slider_columns
+from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries
-from legcal.machine.redundancy import reading_residuals
 from legcal.planning.places import default_setting
 from legcal.planning.poses import surely_reached
 from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import given_poses
+
+
+def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
+    """Return the residuals of readings q (n_legs,) at a pose [m], zero for legs without motor.
+
+    Without redundant motors they vanish at the pose of forward kinematics, up to rounding.
+    """
+    motors, residuals = list(machine.motors), np.zeros(machine.n_legs)
+    residuals[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
+    return residuals
 
 
 def _concurrent() -> MachineSpec:
@@ -131,9 +139,7 @@ def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() 
         Follower(machine)
 
 
-@pytest.mark.parametrize(
-    "name", thinned(["7-UPS", "4-RPR", "2-RPS + 2-SPS + rod"], ["4-RPR", "2-RPS + 2-SPS + rod"])
-)
+@pytest.mark.parametrize("name", ["4-RPR", "2-RPS + 2-SPS + rod"])
 def test_poses_are_those_of_least_squares(name: str) -> None:
     machine = machine_of(name)
     rng, motors = np.random.default_rng(1), list(machine.motors)
@@ -190,9 +196,7 @@ def test_readings_that_contradict_each_other_are_refused_with_the_motor(tmp_path
         given_poses(machine, path)
 
 
-@pytest.mark.parametrize(
-    ("kind", "off"), thinned([("7-ups", 1e-3), ("7-pss", -2e-3)], [("7-ups", 1e-3)])
-)
+@pytest.mark.parametrize(("kind", "off"), [("7-ups", 1e-3)])
 def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     kind: str, off: float, tmp_path: Path
 ) -> None:
@@ -211,10 +215,8 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
 
 
-@pytest.mark.parametrize("slip", [3e-4, 1e-3])
-def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(
-    slip: float, tmp_path: Path
-) -> None:
+def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(tmp_path: Path) -> None:
+    slip = 3e-4
     session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=8)
     m = session.measurements
     later = m.pose >= 4

@@ -1,7 +1,6 @@
 """Photographs: exact outlines, light as it falls, every mechanism, the same bits every time."""
 
 import math
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +110,7 @@ def clean(placed: list[PlacedSolid], **changes: Any) -> Array:
 
 @pytest.mark.parametrize(
     ("lens", "radius"),
-    thinned(
-        product(LENSES, [0.02, 0.12]), [("pinhole", 0.02), ("barrel", 0.02), ("fisheye", 0.12)]
-    ),
+    [("pinhole", 0.02), ("barrel", 0.02), ("fisheye", 0.12)],
 )
 def test_outlines_are_where_the_tangent_planes_are(lens: str, radius: float) -> None:
     camera = LENSES[lens]
@@ -167,7 +164,7 @@ def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
     assert np.mean(np.abs(lit[0] - lit[1]) > 2e-3) < 0.01  # at creases alone
 
 
-@pytest.mark.parametrize("size", thinned([0.0, 0.3], [0.3]))
+@pytest.mark.parametrize("size", [0.3])
 def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: float) -> None:
     wall = solid(Box((3.0, 3.0, 0.02)), RigidTransform.from_translation([0.0, 0.0, 1.51]))
     ball = solid(Sphere(0.08), RigidTransform.from_translation([-0.1, 0.0, 1.0]))
@@ -375,7 +372,7 @@ def outward_errors(levels: Array) -> Array:
     return np.asarray((covered.sum(axis=1) - 0.5) * STEP - REACH)
 
 
-@pytest.mark.parametrize("name", thinned(["hexapod", "tricept"], ["tricept"]))
+@pytest.mark.parametrize("name", ["tricept"])
 def test_clean_photographs_show_the_true_outlines_on_both_sides(name: str, tmp_path: Path) -> None:
     dataset = photographs(name, tmp_path, (640, 480), Appearance.clean())
     truth, (view,) = true_outlines(dataset), dataset.measurements.views

@@ -113,18 +113,12 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
     assert not list((session / "images").glob("*k02*"))
     with talking(session, watched) as dialogue:  # goes on where it was left
         heard(dialogue, "Photograph 2 of 5: camera at c1, pose c1_k02")
-        read = [1e3 * float(x) for x in list(commanded[1].values())[2:]]
-        dialogue.words.put(" ".join(f"{x + 0.25:.4f}" for x in read))
-        heard(dialogue, "gets these readings")
         (watched / "2.JPG").write_bytes(photograph("c1_k02"))
         assert "6 of 6 legs" in heard(dialogue, "2.JPG is c1 c1_k02")
         dialogue.words.put("skip")
         heard(dialogue, "pose c1_k04")
     rows = read_rows(session / "measurements.csv")
-    assert rows[0] == commanded[0]
-    assert [float(x) for x in list(rows[1].values())[2:]] == pytest.approx(
-        [1e-3 * (x + 0.25) for x in read], abs=1e-7
-    )
+    assert rows == commanded[:2]
     loaded = load_dataset(session)  # with the photographs checked
     assert loaded.measurements.image == ("images/c1_k01.jpg", "images/c1_k02.jpg")
     assert len(list(watched.iterdir())) == 8  # copied, not moved

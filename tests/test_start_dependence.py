@@ -30,7 +30,7 @@ OUTLINES = {
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("name", thinned(OUTLINES, ["hexapod"]))
+@pytest.mark.parametrize("name", ["hexapod"])
 def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> None:
     folder = session_folder(name, OUTLINES[name], tmp_path)
     first = calibrated(folder, "nominal", steps=False)

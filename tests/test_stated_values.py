@@ -211,8 +211,8 @@ def test_wrong_fixed_values_are_refused_with_those_of_the_measurements(
     assert found.format(true=true[wrong]) in problem
 
 
-@pytest.mark.parametrize("scale", thinned([1.0, 4.0], [4.0]))
-@pytest.mark.parametrize("part", thinned(["offset", "platform", "radius"], ["platform"]))
+@pytest.mark.parametrize("scale", [4.0])
+@pytest.mark.parametrize("part", ["platform"])
 def test_right_fixed_values_are_accepted_whatever_outlines_claim(part: str, scale: float) -> None:
     exact = machine_session("hexapod", n_poses=10)
     measurements, outlines = exact.noisy(5)
@@ -239,7 +239,7 @@ def test_a_fit_that_priors_keep_from_converging_names_them() -> None:
     assert "leg2.base.x" in found.value.problems[0]
 
 
-@pytest.mark.parametrize("factor", thinned([0.9, 1.1], [1.1]))
+@pytest.mark.parametrize("factor", [1.1])
 def test_a_wrong_encoder_scale_shows_in_the_radii(factor: float) -> None:
     session = machine_session("hexapod", n_poses=10)
     measurements, outlines = session.noisy(6)
@@ -260,7 +260,7 @@ def _sized(seen: BoardCorners, factor: float) -> BoardCorners:
     return replace(seen, boards=(other,))
 
 
-@pytest.mark.parametrize("factor", thinned([0.5, 1.02], [1.02]))
+@pytest.mark.parametrize("factor", [1.02])
 def test_a_board_of_other_dimensions_is_refused(factor: float) -> None:
     session = machine_session("hexapod")
     measurements, outlines = session.noisy(7)

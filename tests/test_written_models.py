@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 import yaml
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
 from lxml import etree
-from machines import MACHINES, SHIPPED, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
+from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types, ring
 from scipy.spatial.transform import RigidTransform
-from thinned import thinned
 
 from legcal import load_mechanism
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
@@ -296,7 +294,7 @@ def _check(nominal: Machine, folder: Path, seed: int = 3) -> Machine:
     return true
 
 
-@pytest.mark.parametrize("name", thinned(SHIPPED, ["hexapod-rod", "3-upu-tilted", "tricept"]))
+@pytest.mark.parametrize("name", ["hexapod-rod", "3-upu-tilted", "tricept"])
 def test_a_true_model_of_a_shipped_one_has_the_drawn_numbers(name: str, tmp_path: Path) -> None:
     nominal = load_mechanism(name)
     true = _check(nominal, tmp_path)
@@ -309,14 +307,11 @@ def test_a_true_model_of_a_shipped_one_has_the_drawn_numbers(name: str, tmp_path
 
 @pytest.mark.parametrize(
     ("machine", "layout"),
-    thinned(
-        product(["6-UPS", "3-UPU", "Tricept"], LAYOUTS),
-        [
-            ("6-UPS", "S as revolutes, hung from the platform"),
-            ("Tricept", "cut behind the slider"),
-            ("Tricept", "carried by leg 2"),
-        ],
-    ),
+    [
+        ("6-UPS", "S as revolutes, hung from the platform"),
+        ("Tricept", "cut behind the slider"),
+        ("Tricept", "carried by leg 2"),
+    ],
 )
 def test_a_true_model_can_be_written_in_any_tree(machine: str, layout: str, tmp_path: Path) -> None:
     path = write_machine(tmp_path / "nominal", MACHINES[machine](), LAYOUTS[layout])

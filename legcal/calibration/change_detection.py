@@ -15,18 +15,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.covariances import whitener
-from legcal.geometry.lines import normal_basis
-from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorColumns, Line
-from legcal.machine.leg import Leg, LegKind, with_platform_points
+from legcal.machine.leg import Leg, LegColumns, LegKind
 from legcal.machine.model import Machine
-from legcal.machine.parameters import Parametrization, geometries, twist_after, vector_of
+from legcal.machine.parameters import (
+    Parametrization,
+    geometries,
+    in_joint_frames,
+    moved_legs,
+    vector_of,
+)
 from legcal.machine.rods import actuator_index, actuators_of
 
 _STEP = 1e-6  # step of numerical derivatives [rad, mean leg lengths]
@@ -200,6 +203,11 @@ def _p_value(statistic: float, dof: int, noise_dof: int) -> float:
     return float(fdtrc(dof, max(noise_dof, 1), statistic / dof)) if dof > 0 else 0.0
 
 
+_Moved = Callable[[float], Sequence[Leg]]  # the legs after a step of a component
+# part, and the name, unit, link of the axes and motion of its components
+_Possible = tuple[str, list[tuple[str, str, str, _Moved]]]
+
+
 def possible_changes(
     machine: Machine, parametrization: Parametrization
 ) -> tuple[tuple[Change, ...], ...]:
@@ -208,57 +216,33 @@ def possible_changes(
     Joints move along the axes of the links of base and platform. Changes of a motor that moves
     joints at A affect all its rods.
     """
-    legs, frame_legs = geometries(machine), machine.frame_legs
+    legs = geometries(machine)
     single, of_joints, of_legs = list[Change](), list[Change](), list[Change]()
-    parts = [
-        (name, [j], _of_leg(machine, name, leg))
-        for j, (name, leg) in enumerate(zip(machine.leg_names, legs, strict=True))
-    ]
-    actuator_of_leg = actuator_index(legs)
+    metre = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
+    rods = list(zip(actuator_index(legs), range(len(legs)), strict=True))
+    parts = [(leg.name, _of_leg(machine, legs, j)) for j, leg in enumerate(machine.legs)]
     parts += [
-        (
-            actuator.joint,
-            [j for j, other in enumerate(actuator_of_leg) if other == a],
-            _of_actuator(actuator),
-        )
+        (actuator.joint, _of_actuator(legs, actuator, [j for other, j in rods if other == a]))
         for a, actuator in enumerate(actuators_of(legs))
     ]
-
-    def derivative(affected: Sequence[int], moved: _Moved, k: int, unit: str) -> Array:
-        """Return the derivative of the parameters by component k of a change, (p,)."""
-        size = _STEP * (machine.size if unit == "m" else 1.0)
-        before, after = (
-            _in_frames_of_joints(
-                [moved(leg, k, step) if j in affected else leg for j, leg in enumerate(legs)],
-                frame_legs,
-            )
-            for step in (-size, size)
-        )
-        change = vector_of(parametrization, after, legs) - vector_of(parametrization, before, legs)
-        return np.asarray(change / (2.0 * size))
-
-    for name, affected, changes in parts:
+    for name, changes in parts:
         of_part = list[Change]()
-        for part, components, units, link, moved in changes:
-            columns = np.column_stack(
-                [derivative(affected, moved, k, unit) for k, unit in enumerate(units)]
-            )
-            is_length = np.array([unit == "m" for unit in (*parametrization.units, *units)])
-            metre = np.where(is_length, machine.size, 1.0)
-            relative = columns * metre[-len(units) :] / metre[: len(columns), None]
-            moves = np.any(np.abs(relative) > _STEP, axis=0)
-            if moves.any():
-                indices = np.flatnonzero(moves).tolist()
-                of_part.append(
-                    Change(
-                        part,
-                        name,
-                        tuple(components[k] for k in indices),
-                        tuple(units[k] for k in indices),
-                        (link,) * len(indices),
-                        columns[:, moves],
+        for part, components in changes:
+            shown = list[tuple[str, str, str, Array]]()
+            for component, unit, link, moved in components:
+                size = _STEP * (machine.size if unit == "m" else 1.0)
+                before, after = (
+                    vector_of(
+                        parametrization, in_joint_frames(moved(step), machine.frame_legs), legs
                     )
+                    for step in (-size, size)
                 )
+                column = (after - before) / (2.0 * size)
+                if np.any(np.abs(column) * size > _STEP * _STEP * metre):
+                    shown.append((component, unit, link, column))
+            if shown:
+                names, units, links, columns = zip(*shown, strict=True)
+                of_part.append(Change(part, name, names, units, links, np.column_stack(columns)))
         single += [change for change in of_part if len(change.components) == 1]
         of_joints += [change for change in of_part if len(change.components) > 1]
         if len(of_part) > 1:
@@ -266,123 +250,76 @@ def possible_changes(
     return tuple(single), tuple(of_joints), tuple(of_legs)
 
 
-_Moved = Callable[[Leg, int, float], Leg]  # leg with component k changed by a step
-# part, components, units, link of the axes, change
-_Possible = tuple[str, tuple[str, ...], tuple[str, ...], str, _Moved]
-_METRES, _RADIANS = ("m",) * 3, ("rad",) * 2
+def _along(legs: Sequence[Leg], which: Sequence[int], columns: slice, direction: Array) -> _Moved:
+    """Return the motion of some of the numbers of legs (:class:`LegColumns`) along a direction."""
+    place = np.arange(len(legs) * LegColumns.COUNT).reshape(len(legs), LegColumns.COUNT)
+
+    def moved(step: float) -> Sequence[Leg]:
+        change = np.zeros(place.shape)
+        change[list(which), columns] = step * direction
+        return moved_legs(legs, place, change.ravel())
+
+    return moved
 
 
-def _of_actuator(actuator: Actuator) -> list[_Possible]:
+def _of_actuator(legs: Sequence[Leg], actuator: Actuator, rods: Sequence[int]) -> list[_Possible]:
     """Return the possible changes of a motor that moves joints at A: zero, axis and arm."""
 
-    def zero_moved(leg: Leg, _: int, step: float) -> Leg:
-        step_of_reading = np.array([step])
-        axis, turn = leg.base_axis, actuator.rotations(step_of_reading)[0]
-        moved = actuator
-        if actuator.arm is not None:
-            line = Line(
-                actuator.at(actuator.arm.line.point, step_of_reading)[0],
-                turn @ actuator.arm.line.axis,
+    def zero_moved(step: float) -> Sequence[Leg]:
+        reading = np.array([step])
+        turn, arm = actuator.rotations(reading)[0], actuator.arm
+        if arm is not None:
+            line = Line(actuator.at(arm.line.point, reading)[0], turn @ arm.line.axis)
+            arm = replace(arm, line=line)
+        return [
+            leg
+            if j not in rods
+            else replace(
+                leg,
+                A=actuator.at(leg.A, reading)[0],
+                base_axis=None if leg.base_axis is None else turn @ leg.base_axis,
+                actuator=replace(actuator, arm=arm),
             )
-            moved = replace(actuator, arm=replace(actuator.arm, line=line))
-        return replace(
-            leg,
-            A=actuator.at(leg.A, step_of_reading)[0],
-            base_axis=None if axis is None else turn @ axis,
-            actuator=moved,
-        )
+            for j, leg in enumerate(legs)
+        ]
 
-    def moved_from(first: int) -> _Moved:
-        def moved(leg: Leg, k: int, step: float) -> Leg:
-            change = np.zeros(ActuatorColumns.COUNT)
-            change[first + k] = step
-            return replace(leg, actuator=actuator.moved(change))
+    def of_line(part: str, columns: slice) -> _Possible:
+        units = ("rad", "rad", "m", "m")[: columns.stop - columns.start]
+        names = ("1", "2", "place 1", "place 2")
+        directions = zip(names, units, np.eye(len(units)), strict=False)
+        return part, [(n, u, "", _along(legs, rods, columns, x)) for n, u, x in directions]
 
-        return moved
-
-    joint = actuator.joint
-    changes: list[_Possible] = [("zero", (f"{joint}.zero",), (actuator.unit,), "", zero_moved)]
-    numbers, units = ("1", "2", "place 1", "place 2"), (*_RADIANS, *_METRES[:2])
+    zero: _Possible = ("zero", [(f"{actuator.joint}.zero", actuator.unit, "", zero_moved)])
     if not actuator.turns:
-        return [*changes, ("direction", ("1", "2"), _RADIANS, "", moved_from(0))]
-    changes.append(("axis", numbers, units, "", moved_from(0)))
-    if actuator.arm is not None:
-        line = ActuatorColumns.ARM.start - ActuatorColumns.AXIS.start
-        changes.append(("arm line", numbers, units, "", moved_from(line)))
-    return changes
+        return [zero, of_line("direction", ActuatorColumns.AXIS)]
+    arm_line = [] if actuator.arm is None else [of_line("arm line", ActuatorColumns.ARM)]
+    return [zero, of_line("axis", ActuatorColumns.LINE), *arm_line]
 
 
-def _of_leg(machine: Machine, name: str, leg: Leg) -> list[_Possible]:
+def _of_leg(machine: Machine, legs: Sequence[Leg], j: int) -> list[_Possible]:
     """Return the possible changes of a leg."""
-    changes = list[_Possible]()
-    xyz = ("x", "y", "z")
-    # Rows are the axes of the links in R_b and R_e.
-    base = machine.T_base_Rb.rotation.as_matrix()
-    platform = machine.T_platform_Re.rotation.as_matrix()
-
-    def longer(leg: Leg, _: int, step: float) -> Leg:
-        return replace(leg, q0=leg.q0 + step)
-
+    leg, name, changes = legs[j], machine.leg_names[j], list[_Possible]()
     if leg.kind is not LegKind.PASSIVE:
-        length_name = "length" if leg.kind is LegKind.CONSTANT else "offset"
-        changes.append((length_name, (f"{name}.{length_name}",), ("m",), "", longer))
-
-    def base_moved(leg: Leg, k: int, step: float) -> Leg:
-        return replace(leg, A=leg.A + step * base[k])
-
-    def platform_moved(leg: Leg, k: int, step: float) -> Leg:
-        return replace(leg, B=leg.B + step * platform[k])
-
-    changes += [
-        ("base joint", xyz, _METRES, machine.base, base_moved),
-        ("platform joint", xyz, _METRES, machine.platform, platform_moved),
-    ]
-    a, b = leg.base_axis, leg.platform_axis
-    if a is not None:
-
-        def base_turned(leg: Leg, k: int, step: float) -> Leg:
-            return replace(leg, base_axis=_about(a, k, step).apply(a))
-
-        changes.append(("base axis", ("1", "2"), _RADIANS, "", base_turned))
-    if b is not None:
-
-        def platform_turned(leg: Leg, k: int, step: float) -> Leg:
-            turn = _about(b, k, step)
-            return replace(leg, platform_axis=turn.apply(b), twist=twist_after(leg, turn))
-
-        changes.append(("platform axis", ("1", "2"), _RADIANS, "", platform_turned))
+        length = "length" if leg.kind is LegKind.CONSTANT else "offset"
+        columns = slice(LegColumns.LENGTH, LegColumns.LENGTH + 1)
+        moved = _along(legs, [j], columns, np.ones(1))
+        changes.append((length, [(f"{name}.{length}", "m", "", moved)]))
+    for part, link, T, columns in (  # rows of T are the axes of the links in R_b and R_e
+        ("base joint", machine.base, machine.T_base_Rb, LegColumns.A),
+        ("platform joint", machine.platform, machine.T_platform_Re, LegColumns.B),
+    ):
+        axes = zip("xyz", T.rotation.as_matrix(), strict=True)
+        changes.append((part, [(x, "m", link, _along(legs, [j], columns, v)) for x, v in axes]))
+    for part, axis, columns in (
+        ("base axis", leg.base_axis, LegColumns.BASE_AXIS),
+        ("platform axis", leg.platform_axis, LegColumns.PLATFORM_AXIS),
+    ):
+        turns = zip("12", np.eye(2), strict=True)
+        if axis is not None:
+            changes.append(
+                (part, [(x, "rad", "", _along(legs, [j], columns, v)) for x, v in turns])
+            )
     return changes
-
-
-def _about(axis: Array, k: int, step: float) -> Rotation:
-    """Return a small rotation about one of the two normals of an axis."""
-    return Rotation.from_rotvec(step * normal_basis(axis)[k])
-
-
-def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
-    """Return legs in the frames R_b and R_e defined by their joint centres."""
-    frames = list(frame_legs)
-    legs = with_platform_points(legs, frame_legs)
-    base = frame_on_points(np.array([leg.A for leg in legs])[frames]).inv()
-    platform = frame_on_points(np.array([leg.B for leg in legs])[frames]).inv()
-
-    turn_base, turn_platform = base.rotation, platform.rotation
-
-    def turned(T: Rotation, axis: Array | None) -> Array | None:
-        return None if axis is None else T.apply(axis)
-
-    return tuple(
-        replace(
-            leg,
-            A=base.apply(leg.A),
-            B=platform.apply(leg.B),
-            actuator=None if leg.actuator is None else leg.actuator.in_frame(base.as_matrix()),
-            base_axis=turned(turn_base, leg.base_axis),
-            platform_axis=turned(turn_platform, leg.platform_axis),
-            twist=twist_after(leg, turn_platform),
-        )
-        for leg in legs
-    )
 
 
 def _together(name: str, changes: Sequence[Change]) -> Change:

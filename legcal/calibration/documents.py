@@ -116,7 +116,7 @@ class LinkBlock(Document):
     link: str
     T_link_frame: Pose  # where R_b or R_e is in it
     joints: list[JointInLink]
-    axes: list[AxisInLink] = Field(default_factory=list)  # left out by earlier versions
+    axes: list[AxisInLink]
 
 
 class Distance(Document):
@@ -126,25 +126,6 @@ class Distance(Document):
     dE_rad: NotNegative
 
 
-class ComparedJoint(Document):
-    """The centre of a joint in two models, in the link of the first [m]."""
-
-    leg: str
-    xyz: Triple
-    reference: Triple  # its R_b or R_e laid on that of the model
-    difference: Triple
-    defined: list[bool]  # coordinates x, y, z that agree by the definition of the frame
-    defines: FrameMark | None
-
-
-class ComparedLink(Document):
-    """The joints of two models on base or platform, R_b or R_e of the reference on the model's."""
-
-    link: str  # of the model
-    frames_apart: Distance  # of the frames, each in the link of its own model
-    joints: list[ComparedJoint]
-
-
 class WeakCombination(Document):
     """A combination of parameters that is known badly."""
 
@@ -152,12 +133,12 @@ class WeakCombination(Document):
     parameters: list[str]
     components: list[Number]
     sigma_m: Number
-    links: WeakInLinks | None = None  # left out by earlier versions
+    links: WeakInLinks
 
     @property
     def in_words(self) -> str:
         """What changes, along the axes of the links where they are known."""
-        return self.direction if self.links is None else self.links.direction
+        return self.links.direction
 
 
 class WeakInLinks(Document):
@@ -252,7 +233,6 @@ class RedundantReadings(ReadingResiduals):
 class ResidualsBlock(FitQuality, SparseDocument):
     """The same of a calibration, with the noise that they show."""
 
-    rms_axes: Number | None
     noise: NoiseBlock
     shared_px: dict[str, NotNegative]
     redundant_readings: RedundantReadings | None = None  # left out where readings cannot disagree
@@ -287,7 +267,6 @@ def left_out_blocks(measurements: Measurements, why: Mapping[int, Rejection]) ->
 class Observations(Document):
     """What the fit was made from."""
 
-    kind: Literal["outlines", "axes"]
     used: int
     total: int
     images: int
@@ -367,16 +346,6 @@ class PlatformBlock(Document):
     sensitivities: list[SensitivityRow]
 
 
-class HoldoutPlatform(Document):
-    """The pose by readings against that by an image alone, root mean squares."""
-
-    poses: int
-    dX_m: Number
-    expected_dX_m: Number
-    dE_rad: Number
-    expected_dE_rad: Number
-
-
 class Holdout(Document):
     """How well the fit predicts the held-out images."""
 
@@ -387,7 +356,6 @@ class Holdout(Document):
     rms_px: Number | None
     expected_px: Number | None
     views: dict[str, Number]
-    platform: HoldoutPlatform | None
 
 
 class DiagnosisBlock(Document):
@@ -419,7 +387,7 @@ class Heading(Document):
     status: Literal["converged"]
     verdict: str
     trustworthy: bool
-    doubts: list[DoubtBlock] = Field(default_factory=list)  # left out by earlier versions
+    doubts: list[DoubtBlock]
     legs: list[str]  # the order of what follows
 
 
@@ -451,7 +419,7 @@ class Result(Legs, Heading, SparseDocument):
     parameters: Annotated[list[ParameterRow], Field(min_length=1)]
     covariance: Matrix  # of the estimated parameters, in their order
     kinematic: Kinematic
-    links: dict[Link, LinkBlock] | None = None  # left out by earlier versions
+    links: dict[Link, LinkBlock]
     weakest: list[WeakCombination]
     held: list[str]
     views: dict[str, ViewPose]
@@ -459,7 +427,7 @@ class Result(Legs, Heading, SparseDocument):
     gammas: list[Gamma]
     stages: Stages
     residuals: ResidualsBlock
-    observations: Observations | None = None  # left out by earlier versions
+    observations: Observations
     board: BoardPose | None = None  # left out without a board
     platform_board: PlatformBoardPose | None = None  # left out without a board on the platform
     start: str
@@ -557,15 +525,6 @@ class ComparedParameter(Document):
     difference: float
 
 
-class UnreachedRow(Document):
-    """A row of ``measurements.csv`` whose readings a model does not reach."""
-
-    row: int  # counted from 1, without the header
-    view: str
-    image: str  # what other tables call it where it has none
-    by: list[Literal["model", "reference"]]  # who does not reach it
-
-
 class EvaluationDocument(SparseDocument):
     """What ``legcal evaluate --json`` prints; null where no pose is compared."""
 
@@ -574,8 +533,5 @@ class EvaluationDocument(SparseDocument):
     dX_max_m: float | None
     poses: int  # that are compared
     left_out: int  # poses that are not, since one of the models does not reach them
-    unreached: list[UnreachedRow]  # the rows of these
-    # Of the readings of a dataset by model and reference; left out where these cannot disagree
-    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None = None
+    unreached: list[int]  # the rows of these, counted from 1
     parameters: list[ComparedParameter]
-    links: dict[Link, ComparedLink]

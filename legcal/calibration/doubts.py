@@ -51,7 +51,6 @@ from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.parameters import geometries, vector_of
-from legcal.machine.tolerance import NOT_STATED
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
@@ -382,7 +381,7 @@ class _Evidence:
         beyond = (self.change[at] - excess * nominal) / np.hypot(tolerance, self.sigma[at])
         n, level = len(at) - 1, -float(ndtri(0.5 * SCALE_BY_CHANCE))
         part = np.sqrt(np.sum(beyond**2) / n) * -float(stdtrit(n, 0.5 * SCALE_BY_CHANCE)) / level
-        sigma *= max(float(part), 1.0 if self.dataset.machine.tolerance != NOT_STATED else 0.0)
+        sigma *= max(float(part), 1.0 if self.dataset.machine.tolerance.says_parts else 0.0)
         names, of_problem = list(self.nominal), self.problem.legs.parametrization.names
         by_parameter = np.zeros(len(of_problem))
         by_parameter[[of_problem.index(names[i]) for i in at.tolist()]] = by_change
@@ -648,12 +647,5 @@ def _held_out(held_out: HeldOut | None) -> list[Doubt]:
         f"images that were kept aside lie {held_out.rms_px:.3f} px from their prediction, where "
         f"{held_out.expected_px:.3f} px were expected"
     )
-    pair = held_out.platform
-    return [
-        Doubt(
-            "held_out",
-            what,
-            "look at the worst outlines, and for play, bending or a camera that moved",
-            *((None, None) if pair is None else (pair.dX_m, pair.dE_rad)),
-        )
-    ]
+    remedy = "look at the worst outlines, and for play, bending or a camera that moved"
+    return [Doubt("held_out", what, remedy)]

@@ -33,7 +33,6 @@ from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution, in_file_order
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
-from legcal.calibration.outlier_images import outlier_images
 from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_BIAS_PX
 from legcal.causes import Cause
 from legcal.data.corners import Corners
@@ -70,6 +69,7 @@ from legcal.perception.placement import Placement, placed_arms
 # Least common bias of all outlines in photographs [px]: limb shading outside of the model acts like
 # a change of the radii, so that residuals never show it.
 LIMB_BIAS = {"bias of many edges": LIMB_BIAS_PX}
+MIN_REJECTED, MIN_REJECTED_LEGS = 0.5, 2  # share of outlines, and whole legs, of an outlier image
 # Settings for a session with a suspected mistake: other starts and more iterations would not help,
 # and contradictions to stated values are expected.
 TRIAL = replace(DEFAULT_SETTINGS, other_starts=0, judges_stated_values=False, max_iterations=40)
@@ -93,7 +93,7 @@ class Estimate:
     @cached_property
     def outliers(self) -> dict[int, Cause]:
         """Causes for images that contradict the fit, by row."""
-        return outlier_images(self.fitted.measurements, self.fitted.machine, self.solution)
+        return outlier_images(self.solution.outlines)
 
     def in_file_order(self) -> Estimate:
         """Return a copy with legs, views and images in the order of the files."""
@@ -107,6 +107,27 @@ class Estimate:
             solution=in_file_order(self.solution, order, dataset),
             corners=None if self.corners is None else restore(self.corners),
         )
+
+
+def outlier_images(outlines: Outlines) -> dict[int, Cause]:
+    """Return the images most of whose outlines a fit rejects, of two legs all, by row.
+
+    Wrong readings of photographs are told before any fit, where legs are recognised.
+    """
+    rejected, causes = outlines.rejected_for(Reason.DISAGREES), dict[int, Cause]()
+    for row in np.unique(outlines.row[rejected]).tolist():
+        judged = (outlines.row == row) & (rejected | outlines.used)
+        n, n_out = int(judged.sum()), int(rejected[judged].sum())
+        legs = set(outlines.leg[judged & rejected].tolist())
+        legs -= set(outlines.leg[judged & outlines.used].tolist())
+        if n_out >= MIN_REJECTED * n and len(legs) >= MIN_REJECTED_LEGS:
+            causes[row] = Cause(
+                "{} of its {} outlines disagree with the fit and were left out; check its "
+                "readings, which image belongs to which row, and that nobody moved camera or "
+                "machine.",
+                (n_out, n),
+            )
+    return causes
 
 
 def fit_outlines(

@@ -8,22 +8,14 @@ the rotation between the two orientations.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.documents import (
-    ComparedLink,
-    ComparedParameter,
-    EvaluationDocument,
-    ReadingResiduals,
-    UnreachedRow,
-)
-from legcal.calibration.link_joints import compared_joints
+from legcal.calibration.documents import ComparedParameter, EvaluationDocument
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.measurements import few, row_names
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.motions import components, motions_of, product
 from legcal.geometry.types import Array
@@ -33,10 +25,7 @@ from legcal.machine.kinematics import followed_poses, platforms_in_base, pose_di
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of, vector_of
-from legcal.machine.redundancy import reading_residuals
-from legcal.vision.board import Link
 
-WHO: tuple[Literal["model", "reference"], ...] = ("model", "reference")
 MAX_DRAWS = 20  # largest number of draws to replace poses that the reference does not reach
 FIRST_POSES = 10  # poses of the first draw; the only one if the reference reaches none of them
 
@@ -55,18 +44,9 @@ class Evaluation:
     # are turns of the reference's axis, so that the reference has zero there
     values: Array
     references: Array
-    # by ``base`` and ``platform`` the joint centres in the links of the model, with R_b and R_e of
-    # both models aligned [m], and the original distance of the frames
-    links: dict[Link, ComparedLink]
     # number of poses of the dataset left out, since one of the models does not reach them
     n_left_out: int = 0
-    # the rows of the dataset with these poses, and the models that do not reach them
-    unreached: tuple[UnreachedRow, ...] = ()
-    # by ``model`` and ``reference`` the residuals of redundant readings at the compared poses; None
-    # without a dataset or without redundant readings
-    redundant_readings: dict[Literal["model", "reference"], ReadingResiduals] | None = None
-    # whether motors move joints of the base; these are compared at zero readings
-    joints_move: bool = False
+    unreached: tuple[int, ...] = ()  # the rows of these, from 1
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal evaluate --json`` prints."""
@@ -79,12 +59,10 @@ class Evaluation:
             poses=len(dX),
             left_out=self.n_left_out,
             unreached=list(self.unreached),
-            redundant_readings=self.redundant_readings,
             parameters=[
                 ComparedParameter(name=name, value=v, reference=r, difference=v - r)
                 for name, v, r in numbers
             ],
-            links=self.links,
         ).document()
 
 
@@ -126,8 +104,7 @@ def evaluate(
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
     n_left_out = 0
-    unreached: tuple[UnreachedRow, ...] = ()
-    redundant: dict[Literal["model", "reference"], ReadingResiduals] | None = None
+    unreached: tuple[int, ...] = ()
     if not (machine.is_determined and truth.is_determined):
         pass  # readings do not determine the platform
     elif dataset is None:
@@ -137,10 +114,15 @@ def evaluate(
         q = _readings_of(session, machine)
         poses_of_models = [_poses_at(model, q) for model in (machine, truth)]
         missed = [[T is None for T in poses_of_model] for poses_of_model in poses_of_models]
-        unreached = _unreached(session, missed)
-        n_left_out = sum(map(max, zip(*missed, strict=True)))
+        is_left_out = np.any(missed, axis=0)
+        n_left_out = int(is_left_out.sum())
+        unreached = tuple((1 + np.flatnonzero(is_left_out[session.measurements.pose])).tolist())
         if n_left_out == len(q):
-            raise DidNotConverge(_why_none(session, unreached))
+            raise DidNotConverge(
+                f"{session.table_path}: the models could not be compared: found no row whose "
+                "readings both reach, needed one; check that readings and models belong to the "
+                "same machine, and legcal.home, or leave out --dataset."
+            )
         poses, reference_poses = (
             [
                 T
@@ -149,10 +131,6 @@ def evaluate(
             ]
             for poses_of_model in poses_of_models
         )
-        if machine.is_redundant:
-            reached = np.flatnonzero(~np.any(missed, axis=0))
-            models = zip(WHO, (machine, truth), (poses, reference_poses), strict=True)
-            redundant = {who: _residuals(session, model, T, q[reached]) for who, model, T in models}
     displacement, rotation = pose_differences(
         platforms_in_base(machine, poses),
         platforms_in_base(truth, reference_poses),
@@ -166,11 +144,8 @@ def evaluate(
         parametrization.units,
         vector_of(parametrization, geometries(machine), origin),
         vector_of(parametrization, origin, origin),
-        compared_joints(machine, truth),
         n_left_out,
         unreached,
-        redundant,
-        bool(machine.actuators),
     )
 
 
@@ -212,21 +187,6 @@ def _readings_of(dataset: Dataset, machine: Machine) -> Array:
     return dataset.measurements.q_of_poses[:, legs]
 
 
-def _residuals(
-    dataset: Dataset, machine: Machine, poses: Sequence[RigidTransform], q: Array
-) -> ReadingResiduals:
-    """Return the residuals of redundant readings (n_poses, n_legs) at poses T_base_platform."""
-    motors = list(machine.motors)
-    legs = [machine.legs[j] for j in motors]
-    rows = zip(poses, q, strict=True)
-    residuals = np.array([reading_residuals(machine, T, row)[motors] for T, row in rows])
-    sigma = dataset.measurements.sigma_of(legs)
-    moved = residuals / [leg.reading_of(1.0) for leg in legs]
-    rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (residuals / sigma, moved))
-    expected = float(np.sqrt(1.0 - machine.mobility / len(motors)))
-    return ReadingResiduals(rms=rms, rms_expected=expected, rms_m=rms_m)
-
-
 def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
     """Return T_base_platform at rows of readings; None for rows that the machine cannot reach."""
     lengths = machine.lengths_at(q[:, list(machine.motors)], machine.motors)
@@ -236,30 +196,6 @@ def _poses_at(machine: Machine, q: Array) -> list[RigidTransform | None]:
     for k, (T, failure) in zip(possible, followed, strict=True):
         poses[k] = T if failure is None else None
     return poses
-
-
-def _unreached(dataset: Dataset, missed: Sequence[Sequence[bool]]) -> tuple[UnreachedRow, ...]:
-    m = dataset.measurements
-    names = row_names(m)
-    return tuple(
-        UnreachedRow(row=row + 1, view=m.views[m.view[row]].name, image=names[row], by=by)
-        for row, pose in enumerate(m.pose.tolist())
-        if (by := [who for who, off in zip(WHO, missed, strict=True) if off[pose]])
-    )
-
-
-def _why_none(dataset: Dataset, unreached: Sequence[UnreachedRow]) -> str:
-    """Return the error of two models that share no reachable reading of a dataset."""
-    by = [
-        f"the {who} does not reach row{'s' * (len(rows) > 1)} {few(rows)}"
-        for who in WHO
-        if (rows := [str(row.row) for row in unreached if who in row.by])
-    ]
-    return (
-        f"{dataset.table_path}: the models could not be compared: found that {' and '.join(by)}, "
-        "needed a row whose readings both reach; check that readings and models belong to the "
-        "same machine, and legcal.home, or leave out --dataset."
-    )
 
 
 def _near(

@@ -17,10 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import (
     AxisInLink,
-    ComparedJoint,
-    ComparedLink,
     CoordinateStatus,
-    Distance,
     FrameMark,
     JointInLink,
     Kinematic,
@@ -259,41 +256,6 @@ def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakI
         parameters=list(significant),
         components=list(significant.values()),
     )
-
-
-def compared_joints(machine: Machine, reference: Machine) -> dict[Link, ComparedLink]:
-    """Return the joints of two models of a machine in the links of the first [m].
-
-    R_b and R_e of both models are aligned, as in eq (20), since their poses in the links cannot be
-    observed.
-    """
-    links: dict[Link, ComparedLink] = {}
-    for side in LINKS:
-        frame, other = _LinkFrame.of(machine, side), _LinkFrame.of(reference, side)
-        ours = np.asarray(frame.T_link_frame.apply(frame.points))
-        theirs = np.asarray(frame.T_link_frame.apply(other.points))
-        T_apart = frame.T_link_frame.inv() * other.T_link_frame
-        shift = frame.T_link_frame.translation - other.T_link_frame.translation
-        links[side] = ComparedLink(
-            link=frame.link,
-            frames_apart=Distance(
-                dX_m=float(np.linalg.norm(shift)), dE_rad=float(T_apart.rotation.magnitude())
-            ),
-            joints=[
-                ComparedJoint(
-                    leg=leg,
-                    xyz=ours[j].tolist(),
-                    reference=theirs[j].tolist(),
-                    difference=((frame.points[j] - other.points[j]) @ frame.R.T).tolist(),
-                    defined=[
-                        coordinate_status == "frame" for coordinate_status in frame.statuses(j, {})
-                    ],
-                    defines=frame.defines(j),
-                )
-                for j, leg in enumerate(frame.legs)
-            ],
-        )
-    return links
 
 
 def mark_in_words(side: str, status: str, defines: FrameMark | None) -> str:

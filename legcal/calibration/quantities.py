@@ -93,7 +93,7 @@ def frame_of(name: str) -> str:
 
 def joints_of(result: Result, *sides: Link) -> Iterator[Quantity]:
     """Yield the coordinates of the joints in the links of the model."""
-    for side, block in (result.links or {}).items():
+    for side, block in result.links.items():
         for joint in block.joints if side in (sides or FRAMES) else ():
             for k, axis in enumerate("xyz"):
                 numbers = joint.xyz[k], joint.nominal[k], joint.sigma[k]
@@ -103,7 +103,7 @@ def joints_of(result: Result, *sides: Link) -> Iterator[Quantity]:
 
 def turns_of(result: Result) -> Iterator[Quantity]:
     """Yield the turns of the axes of joints from the nominal ones, about the axes of the links."""
-    for side, block in (result.links or {}).items():
+    for side, block in result.links.items():
         for turned in block.axes:
             status = "fixed" if turned.sigma is None else "estimated"
             for k, axis in enumerate("xyz"):

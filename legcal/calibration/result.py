@@ -175,7 +175,7 @@ class Calibration(Summarised):
 
     @cached_property
     def residuals(self) -> OutlineResiduals:
-        """How far each outline is from the fit; empty where axes were given."""
+        """How far each outline is from the fit."""
         solution = self.solution
         return outline_residuals(solution.posterior, self.dataset, solution.outlines)
 
@@ -329,7 +329,6 @@ def _observations(calibration: Calibration) -> Observations:
         if not used
     )
     return Observations(
-        kind="outlines",
         used=int(outlines.used.sum()),
         total=len(outlines),
         images=calibration.dataset.measurements.n_rows,

@@ -26,7 +26,6 @@ from legcal.calibration.documents import (
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.parameter_choices import KnownIntrinsics
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.link_joints import joints_in_links
 from legcal.calibration.result import Calibration
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import write_corners
@@ -46,7 +45,7 @@ from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.home import home_of_legs
-from legcal.machine.leg import ARMS, AXES, Leg, ParameterId, with_radii
+from legcal.machine.leg import AXES, Leg, ParameterId, with_radii
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
@@ -253,11 +252,6 @@ def load_result(given: str | Path) -> EarlierResult:
     fixed = {row.name for row in document.parameters if row.status == "fixed"}
     not_fixed = [i for i, name in enumerate(parametrization.names) if name not in fixed]
     turns = turns_between(parametrization, legs, nominal_legs)
-    if document.links is None:
-        links = joints_in_links(
-            machine, document.parameters, document.kinematic, document.nominal_axes
-        )
-        document = document.model_copy(update={"links": links})
     return EarlierResult(
         folder=path.parent,
         document=document,
@@ -377,10 +371,7 @@ def _check_same_model(
         if ParameterId.parse(name).kind not in by_angles
         and not abs(values.get(name, number) - number) <= ROUNDING * machine.size
     ]
-    optional = ("twist", *ARMS)  # missing in results of earlier versions
-    different += [
-        n for n in numbers if n not in values and ParameterId.parse(n).kind not in optional
-    ]
+    different += [name for name in numbers if name not in values]
     for side, axes in nominal_axes(machine.leg_names, legs).items():
         for leg, axis in axes.items():
             nominal = document.nominal_axes.get(side, {}).get(leg)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from html import escape
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -30,21 +29,17 @@ from legcal.calibration.quantities import (
     turns_of,
 )
 from legcal.data.reasons import reason_in_words
-from legcal.errors import OutOfResources
 from legcal.machine.parameters import list_in_words
 from legcal.pages.document import Number, Table
 from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
 from legcal.vision.board import Link
-
-if TYPE_CHECKING:
-    import pandas
 
 
 @dataclass(frozen=True)
 class ParameterTable:
     """The parameters of a calibration in mm, degrees and pixels; iterating yields rows as dicts.
 
-    ``pandas.DataFrame(table)`` and :meth:`to_pandas` make a data frame of it.
+    ``pandas.DataFrame(table)`` makes a data frame of it.
     """
 
     columns: tuple[str, ...]
@@ -137,23 +132,6 @@ class ParameterTable:
         ]
         return Table(columns, rows, title)
 
-    def to_pandas(self) -> pandas.DataFrame:
-        """Return a data frame, a row a parameter.
-
-        Raises
-        ------
-        OutOfResources
-            If pandas is not installed, which legcal itself does not need.
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise OutOfResources(
-                "The data frame could not be made: found no pandas, which legcal itself does not "
-                "need; install it (pip install pandas), or take the rows as dicts: list(table)."
-            ) from error
-        return pandas.DataFrame(list(self.rows), columns=list(self.columns))
-
     def __repr__(self) -> str:
         cells = [self.columns, *self.cells()]
         width = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
@@ -164,20 +142,6 @@ class ParameterTable:
             ).rstrip()
             for row in cells
         )
-
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
-        body = "".join(
-            "<tr>"
-            + "".join(
-                f'<td style="text-align:{"right" if name in NUMBERS else "left"}">'
-                f"{escape(text)}</td>"
-                for name, text in zip(self.columns, row, strict=True)
-            )
-            + "</tr>"
-            for row in self.cells()
-        )
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _numbers(q: Quantity) -> tuple[Any, ...]:
@@ -207,8 +171,6 @@ def tables(result: Result) -> list[tuple[str, ParameterTable]]:
 
     Joints in the links of base and platform, then all that is no coordinate of a joint.
     """
-    if result.links is None:  # of an earlier version
-        return [("Parameters", ParameterTable.of(result))]
     found = []
     for side, block in result.links.items():
         joints = ParameterTable.of_joints(result, side).without("joint", "link", "unit")
@@ -264,26 +226,12 @@ def summary(result: Result) -> str:
     return "\n\n".join([*shown, "\n".join(sentences(result)), result.verdict])
 
 
-def summary_html(result: Result) -> str:
-    """Return the same as HTML."""
-    colour = "green" if result.trustworthy else "firebrick"
-    lines = "".join(f"<li>{escape(line)}</li>" for line in sentences(result))
-    return (
-        f'<p style="color:{colour}"><b>{escape(result.verdict)}</b></p><ul>{lines}</ul>'
-        + "".join(
-            f"<details><summary>{escape(title)}</summary>{table._repr_html_()}</details>"
-            for title, table in tables(result)
-        )
-    )
-
-
 def few_lines(name: str, result: Result) -> str:
     """Return what an interactive session shows of a result: at most ten lines."""
     estimated = sum(row.status == "estimated" for row in result.parameters)
     found = [f"{estimated} of {len(result.parameters)} parameters estimated"]
     seen = result.observations
-    if seen is not None:
-        found.append(f"{seen.used} of {seen.total} {seen.kind} of {seen.images} images used")
+    found.append(f"{seen.used} of {seen.total} outlines of {seen.images} images used")
     found.append(f"{len(result.notes)} note{'s' * (len(result.notes) != 1)}")
     return "\n".join(
         [
@@ -323,9 +271,6 @@ class Summarised:
         """Return a figure of the standard deviations of parameters, and of the platform."""
         return uncertainty_figure(self.result).markup()
 
-    def _repr_html_(self) -> str:
-        return summary_html(self.result)
-
 
 def doubt_lines(result: Result) -> list[str]:
     """Return what speaks against the result, each with its effect on the platform and its remedy.
@@ -343,8 +288,6 @@ def doubt_lines(result: Result) -> list[str]:
 
 def _observation_lines(result: Result) -> list[str]:
     seen = result.observations
-    if seen is None:
-        return []
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
     rejected = ", ".join(f"{count} {reason_in_words(reason)}" for reason, count in most)
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
@@ -393,7 +336,7 @@ def _of_board(link: Link, board: BoardBlock | None) -> list[str]:
 def _steps_lines(result: Result) -> list[str]:
     steps = result.stages.staged
     if isinstance(steps, NoSteps):
-        if result.observations is not None and result.observations.total == 0:
+        if result.observations.total == 0:
             return ["The four steps need legs in sight: there is no staged.yaml."]
         return [f"The four steps alone gave no result, and no staged.yaml: {steps.failure}"]
     left_out = (
@@ -413,8 +356,6 @@ def _fit_line(result: Result) -> str:
     parts = [f"{found.dof} degrees of freedom"]
     if found.rms_px is not None:
         parts.append(f"{found.rms_px:.3f} px rms")
-    if found.rms_axes is not None:
-        parts.append(f"axes off by {found.rms_axes:.3f} of their standard deviations, rms")
     if found.redundant_readings is not None:
         parts.append(f"readings of redundant motors {residuals_in_words(found.redundant_readings)}")
     line = (
@@ -437,9 +378,9 @@ def _direction_lines(result: Result, n_worst: int | None = None) -> list[str]:
     """Return which combinations of parameters are least certain, and which are held."""
     weakest = result.weakest[:n_worst]
     worst = [f"{weak.in_words} ({1e3 * weak.sigma_m:.3f} mm)" for weak in weakest]
-    where = "in R_b and R_e" if any(one.links is None for one in weakest) else "in the links"
     least = (
-        f"Least certain combination{'s' * (len(worst) > 1)} (1 sigma, {where}): {'; '.join(worst)}."
+        f"Least certain combination{'s' * (len(worst) > 1)} (1 sigma, in the links): "
+        f"{'; '.join(worst)}."
     )
     lines = [least] if worst else []
     if result.held:
@@ -476,19 +417,10 @@ def _holdout_lines(found: Holdout) -> list[str]:
     if found.rms_px is None or found.expected_px is None:
         return [f"Held out: {of} show no outline that could be compared."]
     views = ", ".join(f"{name} {rms:.3f}" for name, rms in found.views.items())
-    lines = [
+    return [
         f"Held out: {of}: {found.outlines - found.wrong} of {found.outlines} outlines are "
         f"{found.rms_px:.3f} px (rms) from their prediction by the others, "
         f"{found.expected_px:.3f} px were expected ({views})."
-    ]
-    pair = found.platform
-    if pair is None:
-        return [*lines, "They show too few legs at once to determine the platform's pose alone."]
-    return [
-        *lines,
-        f"At the platform, its pose by what {pair.poses} of {found.poses} poses show alone is "
-        f"{mm_deg(pair.dX_m, pair.dE_rad)} (rms) from that by the readings; "
-        f"{mm_deg(pair.expected_dX_m, pair.expected_dE_rad)} were expected.",
     ]
 
 

@@ -14,9 +14,6 @@ ARM_POINT_SIGMA = 0.01
 # Of the direction of a body against the line of its joints [rad]: joint centres lie within some
 # tenths of a millimetre of the axis of a part half a metre long.
 LEAN_SIGMA = 5e-4
-# Of the travel of all motors alike, as a part of it: screws of tolerance class 10 (ISO 3408) may be
-# 0.07 % off, belts more. Not in the fit, where readings are exact, but stated beside its sigma.
-TRAVEL_SIGMA = 0.001
 # Of the twist of a leg about its nominal one [deg].
 TWIST_SIGMA_DEG = 1.0
 # Of all kinematic parameters about the nominal model, while the first minimum is searched.

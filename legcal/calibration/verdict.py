@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -33,22 +32,22 @@ from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
-from legcal.data.dataset import PLAN_NAME, POSES_NAME, Dataset
+from legcal.data.dataset import POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
 from legcal.data.measurements import few, few_views
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.reading import read_json
 from legcal.files.table import Column, read_table
 from legcal.geometry.types import IntArray
+from legcal.machine.tolerance import Tolerance
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
+NEGLIGIBLE = 0.3  # of the predicted error: it adds less than a twentieth to that
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
 _ALONG = 9  # points along an outline
 _ROUNDED = 0.51e-4  # [mm or deg] of the commands there
-AS_PLANNED = 1.3  # largest ratio of predicted and planned error without a remark
 
 
 def judge(
@@ -96,8 +95,9 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, reported)
     else:
         change, sigma, found = _change_of_platform(platform)
-        by_radii, by_readings = _share_of_scale(platform), _error_of_readings(platform, solution)
-        found += "".join(f"; {clause}" for clause in (by_radii, by_readings) if clause)
+        by_radii = _share_of_scale(platform)
+        by_travel = _error_of_travel(platform, solution, machine.tolerance)
+        found += "".join(f"; {clause}" for clause in (by_radii, by_travel) if clause)
         if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
@@ -138,7 +138,6 @@ def judge(
             *commanded(dataset),
             *_asked_lengths(dataset, solution, doubts),
             *_untested(dataset, sequences, session, platform),
-            *closeness(dataset.folder, measurements.n_rows, platform),
         ),
         held_out,
         corners,
@@ -249,17 +248,21 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
     )
 
 
-def _error_of_readings(platform: PlatformAccuracy, solution: Solution) -> str:
-    """Return a clause on what all readings may be wrong by, where that is more than the rest."""
+def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance) -> str:
+    """Return a clause on what an error of all travel does, "" where that is negligible."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
     parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
-    if not parts or parts[0].mean_displacement <= predicted:
+    if not parts or parts[0].mean_displacement <= NEGLIGIBLE * predicted:
         return ""
-    witnesses = scale_witnesses(solution.posterior.problem)
-    rests = f"{witnesses[0]} alone" if len(witnesses) == 1 else few(witnesses)
+    problem = solution.posterior.problem
+    witnesses = scale_witnesses(problem)
+    rests = f"{witnesses[0]} alone; " if len(witnesses) == 1 else f"{few(witnesses)}; of "
+    assumed = "" if tolerance.travel else ", assumed: state tolerance: {travel: ...}"
     return (
-        f"the scale rests on {rests}, and an error that all readings share, as of screws or belts, "
-        f"may add {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)} (1 sigma)"
+        f"the scale rests on {rests}an error of {problem.legs.sigma_travel:.2%} of the travel "
+        f"(1 sigma{assumed}) "
+        + ("" if len(witnesses) == 1 else "what these leave ")
+        + f"moves the platform by {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)}"
     )
 
 
@@ -293,46 +296,6 @@ def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
 
 
 # The plan of a session
-
-
-def closeness(folder: Path, n_images: int, platform: PlatformAccuracy | None) -> tuple[str, ...]:
-    """Return a sentence on the error of a planned session; () without a plan."""
-    file = folder / PLAN_NAME
-    try:
-        plan = read_json(file)
-    except FileNotFoundError:
-        return ()
-    except (OSError, ValueError, DatasetError):
-        return (
-            f"{file} cannot be read, so that the result cannot be compared with its plan; copy the "
-            "file from the planned session.",
-        )
-    try:
-        planned, expected = int(plan["images"]), plan["expected"]
-        dX, dE = float(expected["dX_m"]), float(expected["dE_rad"])
-        added_to = plan.get("given")
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return ()
-    if platform is None or platform.workspace is None or not dX > 0.0:
-        return ()
-    if added_to:
-        return (
-            f"The session was planned to add to {added_to}, whose images the plan counts on: put "
-            "its views and rows there, and calibrate both together.",
-        )
-    predicted = platform.workspace
-    ratio = predicted.mean_displacement / dX
-    sentence = (
-        "Predicted error over the workspace: "
-        f"{mm_deg(predicted.mean_displacement, predicted.mean_rotation)} with {n_images} images, "
-        f"{ratio:.2f} times the plan ({mm_deg(dX, dE)} with {planned} images)."
-    )
-    if ratio > AS_PLANNED:
-        sentence += (
-            " Images that are missing or show fewer legs, or edges that are noisier than planned, "
-            "make the difference: see legcal detect, and plan with --noise of this result."
-        )
-    return (sentence,)
 
 
 def commanded(dataset: Dataset) -> tuple[str, ...]:

@@ -217,7 +217,7 @@ def identify(
             "--view",
             metavar="LEG,LEG,...",
             help="The legs that one camera position shows; once for each position. Without any, "
-            "the smallest sufficient sets of views are recommended.",
+            "three positions show all legs.",
         ),
     ] = None,
     images: Annotated[
@@ -311,10 +311,6 @@ def locate(
         str | None,
         typer.Option(help="Sigma of an orientation, 0.01deg; by default from the residuals."),
     ] = None,
-    encoder_sigma: Annotated[
-        str | None,
-        typer.Option(help="Sigma of a reading, 2um, or 0.01deg for motors that turn; default 0."),
-    ] = None,
     tool_position: Annotated[
         str | None,
         typer.Option(
@@ -349,7 +345,6 @@ def locate(
         poses,
         position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
         angle_sigma=quantity(angle_sigma, ANGLE, "--angle-sigma"),
-        encoder_sigma=encoder_sigma or 0.0,
         tool_position=None if tool_position is None else _point(tool_position),
     )
     written = []

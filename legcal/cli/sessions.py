@@ -263,10 +263,7 @@ def shoot(
         ),
     ] = None,
 ) -> None:
-    """Guide a session: name the next pose, check each photograph, and predict the error so far.
-
-    Type readings in mm or deg where they differ from the pose that is asked.
-    """
+    """Guide a session: name the next pose, check each photograph, and predict the error so far."""
     import threading
 
     from legcal.files.quantity import LENGTH, parse_quantity
@@ -295,7 +292,7 @@ def shoot(
             for line in sys.stdin or ():
                 dialogue.words.put(line)
 
-    typer.echo(f"Type readings in mm or deg where they differ from those asked; or {WORDS}.")
+    typer.echo(f"Words: {WORDS}.")
     threading.Thread(target=listen, daemon=True).start()
     if port is not None:
         check_address(Address(LOCAL, port))

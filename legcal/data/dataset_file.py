@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import yaml
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -19,16 +20,21 @@ from pydantic import (
     field_validator,
 )
 
+from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
 from legcal.errors import Code, DatasetError, Problem, UsageError
 from legcal.files.motions import MotionEntry
+from legcal.files.published import with_schema
 from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
+from legcal.files.table import format_table
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.model import Machine
 from legcal.machine.parameters import list_in_words
 from legcal.machine.tolerance import BuiltEntry
 from legcal.vision.board import Link
 
+MEASUREMENTS = "measurements.csv"
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m] plausible standard deviations of an encoder
 _Text = Annotated[str, Strict(), WithJsonSchema({"type": "string"})]
 _BOUNDS = ("minimum", "maximum")
@@ -306,3 +312,29 @@ def read_override(
 def listed(texts: Iterable[str]) -> list[str]:
     """Return texts as a list; a single text counts as one element."""
     return [texts] if isinstance(texts, str) else [str(text) for text in texts]
+
+
+def dataset_texts(
+    machine: Machine,
+    model: str,  # path of its YAML in the dataset
+    views: Mapping[str, Any],
+    rows: Iterable[Sequence[Any]],  # of *columns* and readings
+    encoder_sigma: float | dict[str, float],
+    blocks: Mapping[str, Any],
+    columns: Sequence[str] = ("view", "image", "pose"),
+) -> dict[str, str]:
+    """Return ``dataset.yaml`` and ``measurements.csv`` of a session, by their names."""
+    document = {
+        "legcal_dataset": 1,
+        "mechanism": model,
+        "measurements": MEASUREMENTS,
+        "encoder_sigma": encoder_sigma,
+        "views": dict(views),
+        **blocks,
+    }
+    text = yaml.safe_dump(
+        document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
+    )
+    joints = [column.name for column in reading_columns(machine.legs)]
+    table = format_table([*columns, *joints], rows)
+    return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}

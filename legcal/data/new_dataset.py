@@ -16,9 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
-
 from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset_file import MEASUREMENTS, dataset_texts
 from legcal.data.measurements import few, few_views, reading_columns
 from legcal.data.photograph_matching import (
     Matching,
@@ -32,11 +31,9 @@ from legcal.data.photograph_matching import (
 from legcal.data.reading_units import are_commands, default_unit, sigma_in, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import OutputKind, check_path, holds_files, result_folder
-from legcal.files.published import with_schema
+from legcal.files.folder import OutputKind, check_path, holds_files, new_files, result_folder
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
-from legcal.files.table import format_table
 from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -59,7 +56,6 @@ _EXAMPLE_KIND = OutputKind("example", "", "legcal_dataset")
 _EXAMPLE_FILES = (
     "dataset.yaml", "measurements.csv", "camera_info.yaml", "images", "models", "urdf"
 )  # fmt: skip
-MEASUREMENTS = "measurements.csv"
 ONE_VIEW = "c1"
 MIN_SIGMA = 2.5e-6  # [mean leg lengths] minimum default noise of readings
 _CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
@@ -331,41 +327,27 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         for _, photograph in new.matching.pairs
         if not photograph.path.resolve().is_relative_to(new.destination.resolve())
     }
-    existing = [
-        name for name in [*dataset_files, *linked] if os.path.lexists(new.destination / name)
-    ]
     contents = {
         names[camera]: new.made_cameras[camera].encode()
         if camera in new.made_cameras
         else camera.read_bytes()
         for camera in cameras
     }
-    if existing and not force:
-        raise UsageError(
-            f"{new.destination}: the dataset could not be written: found {few(existing)} already "
-            "there, needed new files; give another folder with -o, or --force to replace them."
-        )
-    header = ["view", "image", *(["pose"] if new.poses else []), *new.joints]
     rows = [
         [view, new.place(photograph), *(new.poses[k : k + 1]), *new.readings.q[k].tolist()]
         for (k, photograph), view in zip(new.matching.pairs, new.views, strict=True)
     ]
-    document = {
-        "legcal_dataset": 1,
-        "mechanism": new.model,
-        "measurements": MEASUREMENTS,
-        "encoder_sigma": new.encoder_sigma,
-        "views": {view: {"camera": names[camera]} for view, camera in new.cameras.items()},
-    }
-    with result_folder(new.destination, DATASET_FOLDER) as folder:
+    views = {view: {"camera": names[camera]} for view, camera in new.cameras.items()}
+    columns = ["view", "image", *(["pose"] if new.poses else [])]
+    texts = dataset_texts(new.machine, new.model, views, rows, new.encoder_sigma, {}, columns)
+    contents |= {name: text.encode() for name, text in texts.items()}
+    names_to_write = [*dataset_files, *linked]
+    with new_files(new.destination, "dataset", names_to_write, force=force) as folder:
         for name, content in contents.items():
             (folder / name).write_bytes(content)
         for name, path in linked.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             _link(path, folder / name)
-        (folder / MEASUREMENTS).write_text(format_table(header, rows), encoding="utf-8")
-        text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
-        (folder / DATASET_YAML).write_text(with_schema("dataset", text), encoding="utf-8")
     return [new.destination / name for name in dataset_files]
 
 

@@ -11,6 +11,7 @@ parallel rods for one. The effector is therefore assumed from :data:`EFFECTOR`, 
 
 from __future__ import annotations
 
+import glob
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -68,8 +69,10 @@ def firmware_table(
     Raises
     ------
     ModelError
-        With a sentence for each number that is missing or impossible.
+        With a sentence for each number that is missing or impossible, and for a file that cannot
+        be included.
     """
+    text = _with_named_files(path, text)
     for reads in _DELTAS:
         if (read := reads(path, text)) is not None:
             if read.unit is None and read.firmware.name != "linuxcnc":
@@ -105,15 +108,44 @@ def _unit(path: Path, stated: str | None, given: str | None) -> str:
 
 # --- text of each firmware ----------------------------------------------------------------------
 
+_INCLUDE = re.compile(r"^\[include\s+([^\]]+)\].*$", re.MULTILINE)  # of Klipper
+_HALFILE = re.compile(r"^\s*HALFILE\s*=\s*(\S+)", re.MULTILINE)  # of LinuxCNC
+
+
+def _with_named_files(path: Path, text: str, outer: tuple[Path, ...] = ()) -> str:
+    """Return a configuration with the files that it names: includes in their place."""
+    outer = (*outer, path.resolve())
+
+    def included(match: re.Match[str]) -> str:
+        pattern = match[1].strip()
+        several = glob.has_magic(pattern)
+        found = glob.glob(str(path.parent / pattern)) if several else [str(path.parent / pattern)]
+        texts = []
+        for file in map(Path, sorted(found)):
+            if file.resolve() in outer:
+                raise ModelError(
+                    f"{path}: [include {pattern}] could not be followed: found a file that "
+                    "includes itself, needed one that does not; remove the line."
+                )
+            of_file = content_of(file, "included file", ModelError).decode(errors="replace")
+            texts.append(_with_named_files(file, of_file, outer))
+        return "\n".join(texts)
+
+    text = _INCLUDE.sub(included, text)
+    for name in _HALFILE.findall(text):
+        if not name.startswith("LIB:") and (path.parent / name).is_file():
+            of_file = content_of(path.parent / name, "HAL file", ModelError)
+            text += "\n" + of_file.decode(errors="replace")
+    return text
+
 
 def _klipper(path: Path, text: str) -> Configuration | None:
     """Return the numbers of a printer.cfg; those of its SAVE_CONFIG block count."""
-    section, values, words, includes = "", dict[str, float](), dict[str, str](), list[str]()
+    section, values, words = "", dict[str, float](), dict[str, str]()
     for line in text.splitlines():
         line = re.split(r"[#;]", line.removeprefix("#*#"), maxsplit=1)[0].strip()
         if match := re.fullmatch(r"\[(.+)\]", line):
             section = match[1].strip()
-            includes += [f"[{section}]"] * section.startswith("include ")
         elif match := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", line):
             key = f"{section}.{match[1].lower()}"
             words[key] = match[2]
@@ -123,14 +155,12 @@ def _klipper(path: Path, text: str) -> Configuration | None:
                 values.pop(key, None)
     if not any(key.startswith(("printer.", "stepper_a.")) for key in words):
         return None
-    left_out = [f"{', '.join(includes)} is not followed: give its sections."] if includes else []
     kinematics = words.get("printer.kinematics")
     if kinematics not in ("delta", "rotary_delta"):
         raise ModelError(
             f"{path}: the Klipper configuration could not be used: found kinematics "
             f"{kinematics or 'nowhere'}, needed delta or rotary_delta; give the file with the "
             "section [printer] and the sections [stepper_a] to [stepper_c] of a Delta."
-            + "".join(f" {sentence}" for sentence in left_out)
         )
     firmware = _named("klipper", turns=kinematics == "rotary_delta")
     for p in firmware.parameters:
@@ -140,7 +170,7 @@ def _klipper(path: Path, text: str) -> Configuration | None:
                 "number; correct it."
             )
     printable = values.get("printer.print_radius")
-    return Configuration(firmware, values, printable=printable, notes=left_out)
+    return Configuration(firmware, values, printable=printable)
 
 
 def _named(name: str, *, turns: bool = False) -> Firmware:
@@ -566,7 +596,7 @@ def length_unit(word: str) -> str | None:
 
 
 def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | None:
-    """Return the table of a HAL file, or of an INI file with the HAL files that it names."""
+    """Return the table of a HAL file, or of an INI file with the lines of its HAL files."""
     if not re.search(r"^\s*#?\s*\[(KINS|TRAJ|JOINT_\d)\]|^\s*setp\s+genhex", text, re.MULTILINE):
         return None
     entries = ini_entries(text)
@@ -574,18 +604,13 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     if kinematics != "genhexkins":
         raise ModelError(
             f"{path}: the LinuxCNC configuration could not be used: found KINEMATICS = "
-            f"{kinematics}, needed genhexkins, or the HAL file with the setp lines of "
-            "lineardeltakins or rotarydeltakins; describe another machine in a table (legcal new "
-            "--template)."
+            f"{kinematics}, needed genhexkins, or setp lines of lineardeltakins or "
+            "rotarydeltakins in it or a HAL file that it names; describe another machine in a "
+            "table (legcal new --template)."
         )
-    pins = text
-    for name in re.findall(r"^\s*HALFILE\s*=\s*(\S+)", text, re.MULTILINE):
-        beside = path.parent / name
-        if not name.startswith("LIB:") and beside.is_file():
-            pins += "\n" + content_of(beside, "HAL file").decode(errors="replace")
     numbers = {
         match[1]: float(match[2])
-        for match in re.finditer(rf"^\s*setp\s+genhexkins\.(\S+)\s+({NUMBER})", pins, re.MULTILINE)
+        for match in re.finditer(rf"^\s*setp\s+genhexkins\.(\S+)\s+({NUMBER})", text, re.MULTILINE)
     }
     joints, missing = {}, list[str]()
     for side in ("base", "platform"):

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError
+from legcal.errors import ModelError, Problems
 from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross, distance_to_line
@@ -173,29 +173,30 @@ def joints_from_base(described: Description) -> Description:
     return replace(described, legs=legs, home=home, notes=(*described.notes, note))
 
 
-def look_like_base(described: Description) -> list[str]:
-    """Return the problem of platform joints that seem to be given in the base link, if any.
+def check_links(described: Description, problems: Problems) -> None:
+    """Note platform joints that seem to be given in the base link.
 
     They do if all motors are within their travel with both links coincident, the platform joints
     are away from those of the base, and the stated home is not this pose.
     """
     measured = [leg for leg in described.legs if leg.offset is not None and leg.travel is not None]
     if len(measured) < _MANY or (described.home is not None and _closes(described, described.home)):
-        return []
-    origin = Home.of((0.0, 0.0, 0.0), Rotation.identity())
+        return
     A, B = _joints(described)
     apart = float(np.linalg.norm(B.mean(axis=0) - A.mean(axis=0)))
-    lengths = np.linalg.norm(B - A, axis=1)
-    if 2.0 * apart < lengths.mean() or not _closes(described, origin):
-        return []
-    middle = np.round(1e3 * B.mean(axis=0), 2) + 0.0
-    return [
-        f"{described.source}: platform_joints could not be used: found joints around "
-        f"({', '.join(f'{x:g}' for x in middle)}) mm, as far from the base joints as legs are "
-        "long, which look like coordinates of the base at home, needed coordinates of the "
-        "platform; write platform_in: base in the table (in a CSV a column platform_in), or "
-        "platform_in: platform if they are right."
-    ]
+    if 2.0 * apart < np.linalg.norm(B - A, axis=1).mean() or not _closes(
+        described, Home.of((0.0, 0.0, 0.0), Rotation.identity())
+    ):
+        return
+    middle = ", ".join(f"{x:g}" for x in np.round(1e3 * B.mean(axis=0), 2) + 0.0)
+    problems.add(
+        "platform_joints could not be used",
+        f"joints around ({middle}) mm, as far from the base joints as legs are long, which look "
+        "like coordinates of the base at home",
+        "coordinates of the platform",
+        "write platform_in: base in the table (in a CSV a column platform_in), or platform_in: "
+        "platform if they are right",
+    )
 
 
 def _joints(described: Description) -> tuple[Array, Array]:

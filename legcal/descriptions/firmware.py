@@ -243,8 +243,8 @@ _KLIPPER_AFTER = (
     f"G28; {_BED}level it by a bed_mesh, because DELTA_CALIBRATE replaces radius and angles"
 )
 _DUET_AFTER = (
-    "replace the same values in config.g and delete those of config-override.g, then M999 and "
-    f"G28; {_BED}calibrate the endstops alone (G30 S3)"
+    "replace the same values in config.g and delete those of config-override.g, keep the tilt of "
+    f"the bed (A and B of M666), then M999 and G28; {_BED}calibrate the endstops alone (G30 S3)"
 )
 
 _LINUXCNC_AFTER = (

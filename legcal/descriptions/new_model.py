@@ -8,7 +8,6 @@ that sink with the reading, and two parallel rods on each. For further numbers, 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.resources import files
@@ -20,9 +19,9 @@ import numpy as np
 
 from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
 from legcal.descriptions.table import BESIDE, described_machine, read_description
-from legcal.errors import LegcalError, OutOfResources, Problem, UsageError
-from legcal.files.folder import temporary_folder, write_atomically
-from legcal.files.published import with_schema, write_schemas
+from legcal.errors import LegcalError, Problem, UsageError
+from legcal.files.folder import new_files
+from legcal.files.published import with_schema
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import plain_name
 from legcal.geometry.lines import cross, normal_basis
@@ -330,25 +329,13 @@ def write_template(folder: Path, given: Dimensions, *, force: bool = False) -> l
     except ValueError as error:
         raise UsageError(f"The name of the template could not be used: {error}") from error
     table = family_table(replace(given, family=family, name=name))
-    tables = {folder / f"{name}.yaml": with_schema("table", _yaml(table))}
+    tables = {f"{name}.yaml": with_schema("table", _yaml(table))}
     if "actuators" not in table:
-        tables[folder / f"{name}.csv"] = _csv(table)
-    there = [str(path) for path in tables if os.path.lexists(path)]
-    if there and not force:
-        raise UsageError(
-            f"{folder}: the template could not be written: found {' and '.join(there)} already "
-            "there, needed new files; give another --name or --output, or --force to replace them."
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path, content in tables.items():
-            write_atomically(path, content.encode())
-    except OSError as error:
-        raise OutOfResources(
-            f"{folder}: the template could not be written: found '{error.strerror}', needed a "
-            "folder that takes it; free space, correct permissions, or give another --output."
-        ) from error
-    return list(tables)
+        tables[f"{name}.csv"] = _csv(table)
+    with new_files(folder, "template", tables, force=force) as temporary:
+        for file, content in tables.items():
+            (temporary / file).write_bytes(content.encode())
+    return [folder / file for file in tables]
 
 
 def _yaml(table: dict[str, Any]) -> str:
@@ -611,59 +598,14 @@ class Created:
 def create_model(described: Description, output: Path, *, force: bool = False) -> Created:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine, and load them."""
     machine = assemble(described)
-    paths = model_paths(machine.name, output)
-    folders = [str(path) for path in paths if path.is_dir()]
-    if folders:
-        raise UsageError(
-            f"{described.source}: the model '{machine.name}' could not be written: found the "
-            f"folder {folders[0]}, needed a place for a file; give another --name or --output."
-        )
-    there = [str(path) for path in paths if os.path.lexists(path)]
-    if there and not force:
-        raise UsageError(
-            f"{described.source}: the model '{machine.name}' could not be written: found "
-            f"{' and '.join(there)} already there, needed new files; give another --name or "
-            "--output, or --force to replace them."
-        )
-    try:
-        return _write(machine, output)
-    except OSError as error:
-        raise OutOfResources(
-            f"{output}: the model could not be written: found '{error.strerror}', needed a folder "
-            "that takes it; free space, correct permissions, or choose another --output."
-        ) from error
-
-
-def model_paths(name: str, output: Path) -> tuple[Path, Path]:
-    """Return the paths of the YAML and the URDF of a model."""
-    return output / "models" / f"{name}.yaml", output / "urdf" / f"{name}.urdf"
-
-
-def _write(machine: Assembled, output: Path) -> Created:
-    """Write and load the files in a temporary folder, then move them to their places."""
-    made = [path for path in (output, *output.parents) if not path.exists()]
-    output.mkdir(parents=True, exist_ok=True)
-    try:
-        with temporary_folder(output, machine.name) as temporary:
-            written = model_paths(machine.name, temporary)
-            for path, text in zip(written, (yaml_text(machine), urdf_text(machine)), strict=True):
-                path.parent.mkdir()
-                path.write_bytes(text.encode())
-            _load(written[0], temporary, machine.source)
-            places = model_paths(machine.name, output)
-            for path in places:
-                if not path.parent.is_dir():
-                    path.parent.mkdir()
-                    made.insert(0, path.parent)
-            for path, place in zip(reversed(written), reversed(places), strict=True):
-                os.replace(path, place)  # the YAML last: a URDF alone is no model
-            write_schemas(places[0])
-    except BaseException:
-        for folder in made:
-            if folder.is_dir() and not os.listdir(folder):
-                folder.rmdir()
-        raise
-    return Created(load_mechanism(places[0]), *places, machine.notes)
+    names = f"models/{machine.name}.yaml", f"urdf/{machine.name}.urdf"
+    with new_files(output, "model", names, force=force) as temporary:
+        for name, text in zip(names, (yaml_text(machine), urdf_text(machine)), strict=True):
+            (temporary / name).parent.mkdir()
+            (temporary / name).write_bytes(text.encode())
+        _load(temporary / names[0], temporary, machine.source)
+    yaml_path, urdf_path = (output / name for name in names)
+    return Created(load_mechanism(yaml_path), yaml_path, urdf_path, machine.notes)
 
 
 def _load(path: Path, temporary: Path, source: str) -> None:

@@ -1,6 +1,7 @@
 """The table of a machine: YAML or CSV, read strictly, lengths in its stated unit.
 
-A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`). Common headings
+A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`), which alone can
+describe motors that carry rods. Common headings
 are understood, in three layouts: a row for each leg (``bx by bz px py pz``, ``base_x``,
 ``x_base``), a row with all joints (``B1x``), and a row for each joint (``B1, x, y, z``, or side
 and number in two columns; headings are optional there). If both A and B occur they are base and
@@ -19,6 +20,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -43,13 +45,13 @@ from legcal.descriptions.description import (
     Home,
     LegEntry,
     LegType,
+    check_links,
     home_at_height,
     joints_from_base,
     leg_type,
     legs_in_words,
-    look_like_base,
 )
-from legcal.errors import BadValue, Code, DatasetError, ModelError, Problem
+from legcal.errors import BadValue, Code, DatasetError, ModelError, Problem, Problems
 from legcal.files.motions import Quaternion, Vector
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
@@ -408,16 +410,14 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     ModelError
         With one sentence for each entry that is impossible or contradicts others.
     """
-    file = validate(TableFile, table, source, kind=ModelError)
-    problems = _conflicting_entries(file, str(source))
-    if problems:
-        raise ModelError(problems)
+    file, problems = validate(TableFile, table, source, kind=ModelError), Problems(source)
+    _check_entries(file, problems)
+    problems.raise_if_any()
     description = _description(file, str(source))
-    problems = _impossible_legs(description)
+    _check_legs(description, problems)
     if not problems and file.platform_in is None:
-        problems = look_like_base(description)
-    if problems:
-        raise ModelError(problems)
+        check_links(description, problems)
+    problems.raise_if_any()
     return description
 
 
@@ -447,98 +447,89 @@ def in_metres(value: float, unit: str) -> float:
     return float(Decimal(repr(float(value))) * Decimal(repr(LENGTH[unit])))
 
 
-def _conflicting_entries(file: TableFile, source: str) -> list[str]:
-    """Return the contradictions between counts, names and types of a table."""
+def _check_entries(file: TableFile, problems: Problems) -> None:
+    """Note the contradictions between counts, names and types of a table."""
     if (file.type is None) == (file.types is None):
         stated = "both" if file.type else "neither"
-        return [
-            f"{source}: the legs could not be read: found {stated} of type and types, needed "
-            "one: 'type: 6-UPS', or 'types' with one entry for each leg, or --type UPS."
-        ]
-    n, problems = file.n, []
+        needed = "one: 'type: 6-UPS', or 'types' with one entry for each leg, or --type UPS"
+        problems.add("the legs could not be read", f"{stated} of type and types", needed)
+        return
+    n, names = file.n, file.leg_names
     for key in (
         "platform_joints", "types", "legs", "offsets", "lengths", "min_length", "max_length",
         "travel", "radius", "kinds", "base_axes", "platform_axes", "hangs_on",
     ):  # fmt: skip
         if getattr(file, key) is not None and (count := len(file.per_leg(key))) != n:
-            problems.append(
-                f"{source}: {key} could not be used: found {count} entries and {n} "
-                "base_joints, needed one for each leg; correct their number."
-            )
+            there = f"{count} entries and {n} base_joints"
+            problems.add(_unused(key), there, "one for each leg", "correct their number")
     parts = (file.type or "").split("-")
     if len(parts) == 2 and int(parts[0]) != n:
-        problems.append(
-            f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
-            f"{int(parts[0])}; correct the type or the rows."
-        )
-    names = file.leg_names
-    problems += [
-        f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
-        for leg in sorted({leg for leg in names if names.count(leg) > 1})
-    ]
-    problems += _useless_entries(file, source)
-    problems += [
-        f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
-        f"{closest(leg, names)}"
-        for leg in file.base_frame or ()
-        if leg not in names
-    ]
-    problems += _wrong_home(file, source)
-    problems += _wrong_actuators(file, source)
-    problems += _wrong_home_readings(file, source)
-    problems += _wrong_lengths(file, source)
-    return problems
+        there = f"{n} base_joints"
+        problems.add(_unused(f"type {file.type}"), there, parts[0], "correct the type or the rows")
+    for leg in sorted({leg for leg in names if names.count(leg) > 1}):
+        problems.add(_unused("legs"), f"'{leg}' twice", "unique names", "rename it")
+    _check_use(file, problems)
+    for leg in file.base_frame or ():
+        if leg not in names:
+            there = f"'{leg}', which is not a leg"
+            problems.add(_unused("base_frame"), there, remedy=closest(leg, names))
+    _check_home(file, problems)
+    _check_actuators(file, problems)
+    _check_home_readings(file, problems)
+    _check_lengths(file, problems)
 
 
-def _wrong_actuators(file: TableFile, source: str) -> list[str]:
-    """Return the contradictions between motors and the rods that they carry."""
+def _unused(entry: str) -> str:
+    return f"{entry} could not be used"
+
+
+def _check_actuators(file: TableFile, problems: Problems) -> None:
+    """Note the contradictions between motors and the rods that they carry."""
     names, motors, actuators = file.leg_names, file.motors_of_legs, file.actuators or {}
-    problems = [
-        f"{source}: actuators.{name} could not be used: {problem}"
-        for name, entry in actuators.items()
-        if (problem := entry.problem(file.unit)) is not None
-    ]
+    n_before = len(problems)
+    for name, entry in actuators.items():
+        if (problem := entry.problem(file.unit)) is not None:
+            problems.add(f"{_unused(f'actuators.{name}')}: {problem}")
     for leg, type_, motor in zip(names, file.leg_types, motors, strict=False):
-        where = f"{source}: leg '{leg}' could not be used"
+        refused = _unused(f"leg '{leg}'")
         if motor is not None and motor not in actuators:
-            missing = f"'{motor}' in hangs_on, which is not among actuators; "
-            problems.append(
-                f"{where}: found {missing}{closest(motor, list(actuators) or ['none'])}"
-            )
+            missing = f"'{motor}' in hangs_on, which is not among actuators"
+            problems.add(refused, missing, remedy=closest(motor, list(actuators) or ["none"]))
         elif (motor is None) is not (type_.actuator is None):
             on = "no motor that it hangs on" if motor is None else f"it on '{motor}'"
-            problems.append(
-                f"{where}: found {on} and the type {type_}, needed actuators and hangs_on for "
-                "types that begin with the motor of a rod (PSS, RSS, PRS), and for no others; "
-                "correct them."
+            problems.add(
+                refused,
+                f"{on} and the type {type_}",
+                "actuators and hangs_on (of a table in YAML) for types that begin with the motor "
+                "of a rod (PSS, RSS, PRS), and for no others",
+                "correct them",
             )
         elif motor is not None and actuators[motor].turns is not (
             type_.actuator is ActuatorKind.REVOLUTE
         ):
-            moves = "turns" if actuators[motor].turns else "slides"
-            problems.append(
-                f"{where}: found the type {type_} on '{motor}', which {moves}, needed a type that "
-                f"begins with {'R' if actuators[motor].turns else 'P'}; correct the type or the "
-                "motor."
+            moves, letter = ("turns", "R") if actuators[motor].turns else ("slides", "P")
+            problems.add(
+                refused,
+                f"the type {type_} on '{motor}', which {moves}",
+                f"a type that begins with {letter}",
+                "correct the type or the motor",
             )
-    problems += [
-        f"{source}: actuators.{name} could not be used: found no leg that hangs on it, needed one "
-        "in hangs_on; leave it out, or name it there."
-        for name in actuators
-        if name not in motors
-    ]
-    lengths = file.per_leg("lengths")
+    for name in actuators:
+        if name not in motors:
+            problems.add(
+                _unused(f"actuators.{name}"),
+                "no leg that hangs on it",
+                "one in hangs_on",
+                "leave it out, or name it there",
+            )
     lacking = [
         leg
-        for leg, motor, length in zip(names, motors, lengths, strict=False)
+        for leg, motor, length in zip(names, motors, file.per_leg("lengths"), strict=False)
         if motor is not None and length is None
     ]
-    if lacking and not problems:
-        problems.append(
-            f"{source}: {legs_in_words(lacking)} could not be used: found no length, needed that "
-            "of rods that hang on a motor; add lengths."
-        )
-    return problems
+    if lacking and len(problems) == n_before:
+        needed = "that of rods that hang on a motor"
+        problems.add(_unused(legs_in_words(lacking)), "no length", needed, "add lengths")
 
 
 def _actuators(file: TableFile) -> dict[str, Actuator]:
@@ -572,51 +563,45 @@ def _home_readings(file: TableFile) -> dict[str, float]:
     }
 
 
-def _wrong_home_readings(file: TableFile, source: str) -> list[str]:
-    """Return the problems of home readings without a motor of their kind."""
-    problems = []
+def _check_home_readings(file: TableFile, problems: Problems) -> None:
+    """Note home readings without a motor of their kind."""
     for key, turns in (("home_readings", False), ("home_readings_deg", True)):
         right = [name for name, entry in (file.actuators or {}).items() if entry.turns is turns]
         motor = "arm, in degrees" if turns else f"carriage, in {file.unit}"
-        problems += [
-            f"{source}: {key}.{name} could not be used: found no such {motor}, needed "
-            f"{', '.join(right) or 'one among actuators'}; {closest(name, right or ['none'])}"
-            for name in getattr(file, key) or {}
-            if name not in right
-        ]
-    return problems
+        for name in getattr(file, key) or {}:
+            if name not in right:
+                problems.add(
+                    _unused(f"{key}.{name}"),
+                    f"no such {motor}",
+                    ", ".join(right) or "one among actuators",
+                    closest(name, right or ["none"]),
+                )
 
 
-def _wrong_home(file: TableFile, source: str) -> list[str]:
-    """Return the contradictions in the block ``home``."""
-    problems = []
+def _check_home(file: TableFile, problems: Problems) -> None:
+    """Note the contradictions in the block ``home``."""
     home = file.home
     if home is None:
-        return []
+        return
     if (home.xyz is None) == (home.height is None):
-        problems.append(
-            f"{source}: home.xyz could not be used: found "
-            f"{'neither' if home.xyz is None else 'both'} of xyz and height, needed one; write one "
-            "of them."
-        )
+        there = f"{'neither' if home.xyz is None else 'both'} of xyz and height"
+        problems.add(_unused("home.xyz"), there, "one", "write one of them")
     turns = [home.quat_xyzw is not None, home.rpy_deg is not None]
     if sum(turns) > 1 or (home.xyz is not None and sum(turns) < 1):
-        problems.append(
-            f"{source}: home could not be used: needed its turn once, as quat_xyzw or as rpy_deg; "
-            "write one of them."
-        )
+        needed = "its turn once, as quat_xyzw or as rpy_deg"
+        problems.add(_unused("home"), needed=needed, remedy="write one of them")
     if file.platform_in == "base":
-        problems.append(
-            f"{source}: home could not be used: found it beside platform joints in coordinates of "
-            "the base (platform_in: base), which are those at home, needed one of them; leave out "
-            "home."
+        problems.add(
+            _unused("home"),
+            "it beside platform joints in coordinates of the base (platform_in: base), which are "
+            "those at home",
+            "one of them",
+            "leave out home",
         )
-    return problems
 
 
-def _wrong_lengths(file: TableFile, source: str) -> list[str]:
-    """Return the problems of shortest and longest lengths: missing, redundant or impossible."""
-    problems = []
+def _check_lengths(file: TableFile, problems: Problems) -> None:
+    """Note shortest and longest lengths that are missing, redundant or impossible."""
     laws = map(file.per_leg, ("min_length", "max_length", "travel"))
     for name, low, high, travel in zip(file.leg_names, *laws, strict=False):
         if low is None and high is None:
@@ -629,18 +614,18 @@ def _wrong_lengths(file: TableFile, source: str) -> list[str]:
         elif travel is not None:
             conflict = "travel beside min_length and max_length"
         if conflict:
-            problems.append(
-                f"{source}: min_length and max_length could not be used: found {conflict} of leg "
-                f"'{name}', needed the shortest and the longest length, in place of travel; "
-                "correct them."
+            problems.add(
+                _unused("min_length and max_length"),
+                f"{conflict} of leg '{name}'",
+                "the shortest and the longest length, in place of travel",
+                "correct them",
             )
-            break
-    return problems
+            return
 
 
-def _useless_entries(file: TableFile, source: str) -> list[str]:
-    """Return the problems of entries for legs whose type does not have them."""
-    names, problems = file.leg_names, []
+def _check_use(file: TableFile, problems: Problems) -> None:
+    """Note entries for legs whose type does not have them."""
+    names = file.leg_names
     for key, of_sliders in (
         ("lengths", False), ("offsets", True), ("travel", True),
         ("min_length", True), ("max_length", True),
@@ -652,12 +637,12 @@ def _useless_entries(file: TableFile, source: str) -> list[str]:
         ]
         if useless and not (file.is_for_all(key) and len(useless) < len(names)):
             with_p, without_p = ("with", "without") if of_sliders else ("without", "with")
-            problems.append(
-                f"{source}: {key} could not be used: found an entry for leg '{useless[0]}', whose "
-                f"type is {without_p} P, needed it for legs {with_p} P only; leave it out, or "
-                "write null in a list."
+            problems.add(
+                _unused(key),
+                f"an entry for leg '{useless[0]}', whose type is {without_p} P",
+                f"it for legs {with_p} P only",
+                "leave it out, or write null in a list",
             )
-    return problems
 
 
 def _description(file: TableFile, source: str) -> Description:
@@ -739,65 +724,65 @@ def _turn(home: HomeEntry) -> Rotation:
     return Rotation.from_euler("xyz", home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
 
 
-def _impossible_legs(described: Description) -> list[str]:
-    """Return the contradictions between legs and their types, and coincident legs."""
-    lacking: dict[str, list[str]] = {}  # names of legs by problem
-    for leg in described.legs:
-        if leg.kind is LegKind.ACTUATED and leg.offset is None:
-            lacking.setdefault(
-                "actuated sliders without an offset, needed the length at reading zero; add "
-                "offsets, or min_length and max_length.",
-                [],
-            ).append(leg.name)
-        if leg.kind is LegKind.ACTUATED and leg.travel is None:
-            lacking.setdefault(
-                "actuated sliders without travel, needed the lowest and the highest reading of "
-                "their encoders; add travel, or min_length and max_length.",
-                [],
-            ).append(leg.name)
-        if leg.kind is LegKind.CONSTANT and leg.type.has_slider:
-            lacking.setdefault(
-                "the kind constant with a P in the type, needed a type without P for legs of "
-                "constant length; correct kinds or types.",
-                [],
-            ).append(leg.name)
-        for side, type_, axis in (
-            ("base", leg.type.base, leg.base_axis),
-            ("platform", leg.type.platform, leg.platform_axis),
-        ):
-            if axis is not None and not type_.has_axis:
-                joint = f"an {type_} joint" if type_ else "a leg that is fixed"
-                lacking.setdefault(
-                    f"an axis for {joint} at the {side}, needed axes of R and U joints only; write "
-                    f"null in {side}_axes.",
-                    [],
-                ).append(leg.name)
-    problems = [
-        f"{described.source}: {legs_in_words(names)} could not be used: found {mistake}"
-        for mistake, names in lacking.items()
-    ]
-    # Coincident legs, and joints that all coincide.
+def _check_legs(described: Description, problems: Problems) -> None:
+    """Note the contradictions between legs and their types, and coincident legs."""
     legs = described.legs
+    actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
+    lacking = [
+        (
+            [leg for leg in actuated if leg.offset is None],
+            "actuated sliders without an offset",
+            "the length at reading zero",
+            "add offsets, or min_length and max_length",
+        ),
+        (
+            [leg for leg in actuated if leg.travel is None],
+            "actuated sliders without travel",
+            "the lowest and the highest reading of their encoders",
+            "add travel, or min_length and max_length",
+        ),
+        (
+            [leg for leg in legs if leg.kind is LegKind.CONSTANT and leg.type.has_slider],
+            "the kind constant with a P in the type",
+            "a type without P for legs of constant length",
+            "correct kinds or types",
+        ),
+    ]
+    for side in ("base", "platform"):
+        odd = [
+            leg
+            for leg in legs
+            if getattr(leg, f"{side}_axis") is not None and not getattr(leg.type, side).has_axis
+        ]
+        for type_ in dict.fromkeys(getattr(leg.type, side) for leg in odd):
+            joint = f"an {type_} joint" if type_ else "a leg that is fixed"
+            lacking.append(
+                (
+                    [leg for leg in odd if getattr(leg.type, side) is type_],
+                    f"an axis for {joint} at the {side}",
+                    "axes of R and U joints only",
+                    f"write null in {side}_axes",
+                )
+            )
+    for some, found, needed, remedy in lacking:
+        if some:
+            problems.add(_unused(legs_in_words([leg.name for leg in some])), found, needed, remedy)
+    # Coincident legs, and joints that all coincide.
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]
-    for j, first in enumerate(legs):
-        for second in legs[j + 1 :]:
-            gap = max(
-                float(np.linalg.norm(first.A_base - second.A_base)),
-                float(np.linalg.norm(first.B_platform - second.B_platform)),
-            )
-            if gap <= _SAME * max(spans):
-                problems.append(
-                    f"{described.source}: legs '{first.name}' and '{second.name}' could not be "
-                    "used: found both between the same two points, needed different joints; "
-                    "correct their rows."
-                )
+    for i, j in combinations(range(len(legs)), 2):
+        gap = max(float(np.linalg.norm(ends[i] - ends[j])) for ends in (A, B))
+        if gap <= _SAME * max(spans):
+            pair = f"legs '{legs[i].name}' and '{legs[j].name}'"
+            there = "both between the same two points"
+            problems.add(_unused(pair), there, "different joints", "correct their rows")
     if min(spans) <= _SAME * max(spans):
-        problems.append(
-            f"{described.source}: the joints could not be used: found all of one side in one "
-            "point, needed them spread out; correct base_joints or platform_joints."
+        problems.add(
+            _unused("the joints"),
+            "all of one side in one point",
+            "them spread out",
+            "correct base_joints or platform_joints",
         )
-    return problems
 
 
 _OF_CONCEPTS = {  # columns by what their headings speak of, legs and joints aside
@@ -824,24 +809,20 @@ _OF_CONCEPTS = {  # columns by what their headings speak of, legs and joints asi
     for key in keys
 }
 _DIAMETERS = {"diameter": "radius", "tube diameter": "tube", "rod diameter": "rod"}
-_NOT_LENGTHS = ("deg", "us", "-")  # units of other columns
+_NOT_LENGTHS = ("deg", "-")  # units of other columns
 _LETTERS = ("a", "b", "p", "t")  # of sides, as in A1
 _XYZ = ("x", "y", "z")
 _RADII = ("radius", "tube", "rod")
-_AT_HOME = {"home_reading": "home_readings", "home_reading_deg": "home_readings_deg"}
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
     *("offset", "length", "min_length", "max_length", "travel_low", "travel_high"),
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
-    *(f"{vector}_{i}" for vector in ("direction", "point", "axis") for i in _XYZ),
-    *(f"{travel}_{end}" for travel in ("travel_deg", "travel_us") for end in ("low", "high")),
-    *("centre_us", "us_per_deg", "arm_radius", "home_reading", "home_reading_deg"),
 )
 COLUMNS = (
     *(
         Column(name, "text", required=False)
-        for name in ("leg", "type", "kind", "unit", "hangs_on", "platform_in")
+        for name in ("leg", "type", "kind", "unit", "platform_in")
     ),
     *(
         Column(
@@ -879,8 +860,6 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         table.refuse(row, conflict, "one of them", *_RADII, remedy=remedy, what="radius")
     table.check()
     cells = _Cells(table)
-    hangs_on = cells.texts("hangs_on")
-    motors = _motors(table, cells, hangs_on)
     document: dict[str, Any] = {
         "legcal_table": 1,
         "name": path.stem,
@@ -889,11 +868,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "types": cells.texts("type") if "type" in table else None,
         "base_joints": cells.points("base"),
         "platform_joints": cells.points("platform"),
-        # The travel of a leg carried by a motor is the travel of the motor.
-        "travel": [
-            travel if motor is None else None
-            for travel, motor in zip(cells.pairs("travel"), hangs_on, strict=True)
-        ],
+        "travel": cells.pairs("travel"),
         "radius": [
             {k: x for k, x in (("tube", tube), ("rod", rod)) if x is not None} or radius
             for radius, tube, rod in zip(*map(cells.numbers, _RADII), strict=True)
@@ -908,10 +883,8 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         "max_length": cells.numbers("max_length"),
         "base_axes": cells.vectors("base_axis"),
         "platform_axes": cells.vectors("platform_axis"),
-        "hangs_on": hangs_on,
     }
-    document |= {key: of_legs for key, of_legs in optional.items() if _is_given(of_legs)}
-    return document | motors
+    return document | {key: of_legs for key, of_legs in optional.items() if _is_given(of_legs)}
 
 
 class _Cells:
@@ -937,48 +910,6 @@ class _Cells:
     def pairs(self, name: str) -> list[Any]:
         pairs = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
         return [None if pair == (None, None) else list(pair) for pair in pairs]
-
-
-def _motors(table: Table, cells: _Cells, hangs_on: Sequence[str | None]) -> dict[str, Any]:
-    """Return the motors that carry legs, and their readings at home.
-
-    The numbers of a motor may be in any row of a leg that it carries, or in several.
-    """
-    columns = {
-        **{key: cells.vectors(key) for key in MOTIONS},
-        **{key: cells.pairs(key) for key in ("travel", "travel_deg", "travel_us")},
-        **{key: cells.numbers(key) for key in ("centre_us", "us_per_deg", "arm_radius", *_AT_HOME)},
-    }
-    motors = dict[str, dict[str, Any]]()
-    for row, motor in enumerate(hangs_on):
-        if motor is None:
-            continue
-        entry = motors.setdefault(motor, dict.fromkeys(columns))
-        for key, column in columns.items():
-            value = column[row]
-            if entry[key] is None:
-                entry[key] = value
-            elif value is not None and value != entry[key]:
-                table.refuse(
-                    row,
-                    f"another {key}",
-                    f"the same {key} in all rows of '{motor}'",
-                    "hangs_on",
-                    remedy="correct it, or leave it empty",
-                    what="hangs_on",
-                )
-    table.check()
-    if not motors:
-        return {}
-    actuators = {
-        name: {k: x for k, x in entry.items() if x is not None and k not in _AT_HOME}
-        for name, entry in motors.items()
-    }
-    readings = {
-        key: {name: entry[column] for name, entry in motors.items() if entry[column] is not None}
-        for column, key in _AT_HOME.items()
-    }
-    return {"actuators": actuators, **{key: stated for key, stated in readings.items() if stated}}
 
 
 def _shared(table: Table, name: str) -> str | None:

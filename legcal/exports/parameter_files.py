@@ -163,10 +163,8 @@ def _vector(
 
 def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
     """Return the joints of a result in their links, by side and leg."""
-    links = None if subject.result is None else subject.result.document.links
-    return {
-        (side, joint.leg): joint for side, block in (links or {}).items() for joint in block.joints
-    }
+    links = {} if subject.result is None else subject.result.document.links
+    return {(side, joint.leg): joint for side, block in links.items() for joint in block.joints}
 
 
 def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:

@@ -23,6 +23,7 @@ from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
 _HEAD = 1000  # bytes at the beginning of a file that contain its mark
+_SHOWN = 5  # names of files in a sentence
 _MOST_OF_NAME = 40  # maximum letters of a name, which leave room for an addition
 
 
@@ -263,6 +264,28 @@ def result_folder(
 
 
 @contextmanager
+def new_files(
+    folder: Path, noun: str, names: Iterable[str], *, force: bool | None = None
+) -> Iterator[Path]:
+    """Give a temporary folder for files of some names, as :func:`result_folder`.
+
+    Files that are there are replaced only with *force*, None where the command has no such option.
+    """
+    there = [name for name in names if os.path.lexists(folder / name)]
+    if there and not force:
+        replaced = "" if force is None else ", or --force to replace them"
+        found = ", ".join(there[:_SHOWN]) + f" and {len(there) - _SHOWN} more" * (
+            len(there) > _SHOWN
+        )
+        raise UsageError(
+            f"{folder}: the {noun} could not be written: found {found} already there, needed "
+            f"new files; give another folder or name{replaced}."
+        )
+    with result_folder(folder, OutputKind(noun, "", "")) as temporary:
+        yield temporary
+
+
+@contextmanager
 def _named(destination: Path, new: Path) -> Iterator[None]:
     """Make errors of the block name the destination instead of the temporary folder."""
     try:
@@ -313,7 +336,7 @@ def _workshop(destination: Path) -> Path:
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:
     """Move files into a folder; if that is interrupted, restore the previous files."""
-    names = _files_in(new)
+    names = sorted(_files_in(new), key=lambda name: name.suffix == ".yaml")  # they name the others
     gone = [name for name in stale if name not in names and (destination / name).is_file()]
     kept = [name for name in names if os.path.lexists(destination / name)] + gone
     for name in kept:

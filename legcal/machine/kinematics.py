@@ -79,7 +79,7 @@ def forward_kinematics(
     -------
     RigidTransform
         T_base_platform, with every loop closed to 1e-12 m. With redundant motors it minimises the
-        squares of :func:`reading_residuals`.
+        squares of the differences between readings and those of the pose.
 
     Raises
     ------

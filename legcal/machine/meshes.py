@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
+from legcal.geometry.lines import cross
 from legcal.geometry.motions import matrix_applied
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.urdf import origins_of
+
+GRAZING = 1e-5  # sine of the angle of a ray and a triangle below which the triangle hides nothing
 
 
 def read_mesh(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArray]:
@@ -72,6 +75,28 @@ def mesh_file(urdf_path: Path, name: str) -> Path | None:
             if (folder / tail).is_file():
                 return folder / tail
     return None
+
+
+def first_hits(
+    caster: Any, corners: Array, triangles: IntArray, origin: Array, points: Array
+) -> Array:
+    """Return the first hits of triangles by rays from an origin to points (n, 3), (n,) [m].
+
+    They are distances from the origin, (3,) or (n, 3), infinite without a hit. *caster* is the
+    :func:`ray_caster` of the triangles.
+    """
+    way = points - origin
+    start = np.broadcast_to(origin, way.shape)
+    ray = way / np.linalg.norm(way, axis=1)[:, None]
+    hits = np.full(len(points), np.inf)
+    triangle, index = caster.intersects_id(start, ray, multiple_hits=False)
+    corner = corners[triangles[triangle]]
+    normal = cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    towards = np.sum(normal * ray[index], axis=1)
+    is_hit = np.abs(towards) > GRAZING * np.linalg.norm(normal, axis=1)
+    index, reached = index[is_hit], np.sum(normal * (corner[:, 0] - start[index]), axis=1)[is_hit]
+    hits[index] = reached / towards[is_hit]
+    return hits
 
 
 def ray_caster(vertices: Array, triangles: IntArray | None) -> Any:

@@ -89,7 +89,7 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
             "add them",
             path,
         )
-    frames, kinds = close_loops(loops, reader.tree, reader.poses, path)
+    frames, kinds = close_loops(loops, reader.tree, path)
     name = root.get("model", "").strip() or path.stem
     urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
     urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)

@@ -5,7 +5,6 @@ Written files are loaded again and checked.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +14,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, ModelError, OutOfResources, UsageError
-from legcal.files.folder import write_atomically
+from legcal.errors import DidNotConverge, ModelError
+from legcal.files.folder import new_files
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.files.schema import read_yaml
 from legcal.geometry.rotations import roll_pitch_yaw
@@ -54,6 +53,8 @@ def mechanism_text(machine: Machine, urdf: str) -> str:
             "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
             "home": motion_to_xyz_quat(machine.home),
             **_actuators_in_words(machine),
+            **machine.tolerance.entries,
+            **({} if machine.spline_teeth is None else {"spline_teeth": machine.spline_teeth}),
             "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
         },
     )
@@ -80,28 +81,14 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     An unconverted URDF is copied byte for byte, but for lost paths of meshes.
     """
     name = model_name(machine)
-    places = folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
-    there = [str(path) for path in places if os.path.lexists(path)]
-    if there:
-        raise UsageError(
-            f"the model '{name}' could not be written",
-            f"{' and '.join(there)} already there",
-            "new files",
-            "give another folder",
-            machine.yaml_path,
-        )
-    try:
-        for path in places:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(places[1], _with_paths(machine, places[1]))
-        text = mechanism_text(machine, f"../urdf/{name}.urdf")
-        write_atomically(places[0], text.encode())  # last: a URDF alone is no model
-    except OSError as error:
-        raise OutOfResources(
-            f"{folder}: the model could not be written: found '{error.strerror}', needed a folder "
-            "that takes it; free space, correct permissions, or give another folder."
-        ) from error
-    return places
+    names = f"models/{name}.yaml", f"urdf/{name}.urdf"
+    urdf = _with_paths(machine, folder / names[1])
+    with new_files(folder, "model", names) as temporary:
+        for path in names:
+            (temporary / path).parent.mkdir()
+        (temporary / names[0]).write_text(mechanism_text(machine, f"../{names[1]}"), "utf-8")
+        (temporary / names[1]).write_bytes(urdf)
+    return folder / names[0], folder / names[1]
 
 
 def _with_paths(machine: Machine, destination: Path) -> bytes:

@@ -249,14 +249,6 @@ def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Arr
     )
 
 
-def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> KinematicParameters:
-    """Return the parameters of a vector in the order of :func:`to_vector`."""
-    free = free_coordinates(n_legs, frame_legs)
-    base, platform = np.zeros((n_legs, 3)), np.zeros((n_legs, 3))
-    base[free], platform[free], offsets = np.split(vector, [free.sum(), 2 * free.sum()])
-    return KinematicParameters(base, platform, offsets.copy())
-
-
 def vector_of(
     parametrization: Parametrization, legs: Sequence[Leg], nominal: Sequence[Leg]
 ) -> Array:

@@ -209,16 +209,6 @@ def _tested(
     return np.einsum("ks,ks->k", e, v), r, np.where(share > _SAYS, redundancy, 0.0)
 
 
-def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:
-    """Return the residuals of readings q (n_legs,) at a pose [m], zero for legs without motor.
-
-    Without redundant motors they vanish at the pose of forward kinematics, up to rounding.
-    """
-    motors, residuals = list(machine.motors), np.zeros(machine.n_legs)
-    residuals[motors] = np.asarray(q)[motors] - readings_at(machine, T_base_platform)[motors]
-    return residuals
-
-
 def consistent_readings(
     machine: Machine, readings: Array, at: RigidTransform | None = None
 ) -> Array:

@@ -37,7 +37,7 @@ from legcal.machine.actuator import Actuator, Arm, Line
 from legcal.machine.bodies import Bodies
 from legcal.machine.classification import joint_tolerance
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain, Step
-from legcal.machine.meshes import mesh_file, mesh_of_file, ray_caster, read_mesh
+from legcal.machine.meshes import first_hits, mesh_file, mesh_of_file, ray_caster, read_mesh
 from legcal.machine.spanning_tree import origin_xml, visual_xml
 from legcal.machine.urdf import Urdf, number_list, origins_of
 
@@ -456,7 +456,6 @@ def _radius_of_section(corners: Array, z: float) -> float:
 SIDES = 24  # sides of the prism around a round solid
 THICKER = 1.2  # least radius of an enclosing solid, relative to the enclosed cylinder
 SLICES, DIRECTIONS = 200, 12  # samples of an enclosing mesh along and around a leg
-GRAZING = 1e-5  # sine of the angle of a ray and a triangle below which the triangle hides nothing
 ALONG = 1e-6  # sine of the angle to a leg below which a revolute only spins the leg
 EMPTY = 1e-9  # size of a solid, or depth, that counts as none [m]
 
@@ -659,7 +658,7 @@ class PlacedOccluders:
         hidden = np.zeros(len(points), dtype=np.bool_)
         for side in sides if np.any(reach > 0.0) else sides[:1]:
             there = (points + reach[:, None] * side - t) @ R
-            hidden |= first_hits(self.occluders[i], -t @ R, there) < last
+            hidden |= hits_of_mesh(self.occluders[i], -t @ R, there) < last
         return hidden
 
     def _behind(self, i: int, points: Array, reach: Array, last: Array) -> BoolArray:
@@ -681,26 +680,15 @@ class PlacedOccluders:
         return np.asarray((first < leaves.min(axis=1)) & (first < last))
 
 
-def first_hits(mesh: Occluder, origin: Array, points: Array) -> Array:
+def hits_of_mesh(mesh: Occluder, origin: Array, points: Array) -> Array:
     """Return the first hits of a mesh by rays from an origin (3,) or (n, 3) to points (n, 3), (n,).
 
     They are fractions of the distance, infinite without a hit. All points are in the carrier frame.
     """
-    way = points - origin
-    start = np.broadcast_to(origin, way.shape)
-    length = np.linalg.norm(way, axis=1)
-    ray = way / length[:, None]
-    hits = np.full(len(points), np.inf)
     if mesh.triangles is None:
-        return hits
-    triangle, index = _caster(mesh).intersects_id(start, ray, multiple_hits=False)
-    corner = mesh.corners[mesh.triangles[triangle]]
-    normal = cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    towards = np.sum(normal * ray[index], axis=1)
-    is_hit = np.abs(towards) > GRAZING * np.linalg.norm(normal, axis=1)
-    index, reached = index[is_hit], np.sum(normal * (corner[:, 0] - start[index]), axis=1)[is_hit]
-    hits[index] = reached / towards[is_hit] / length[index]
-    return hits
+        return np.full(len(points), np.inf)
+    hits = first_hits(_caster(mesh), mesh.corners, mesh.triangles, origin, points)
+    return np.asarray(hits / np.linalg.norm(points - origin, axis=1))
 
 
 @lru_cache(maxsize=256)
@@ -937,7 +925,7 @@ def _enclosed(mesh: Occluder, radius: float) -> list[tuple[float, float]]:
     around = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(DIRECTIONS)])
     axis = np.column_stack([np.zeros((SLICES, 2)), height])
     start = (axis[:, None] + far * around).reshape(-1, 3)
-    hits = first_hits(mesh, start, np.repeat(axis, DIRECTIONS, axis=0))
+    hits = hits_of_mesh(mesh, start, np.repeat(axis, DIRECTIONS, axis=0))
     is_thick = np.all((1.0 - hits.reshape(SLICES, DIRECTIONS)) * far > radius, axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_thick, [False]]).astype(np.int8)))
     at = z.min() + size * edges

@@ -2,8 +2,7 @@
 
 All readers return a :class:`Source`; :class:`UrdfBuilder` writes the URDF of the tree. A joint that
 closes a loop (:class:`Loop`) is converted to a pair of frames: a point to a ``3d`` pair, a weld to
-a ``6d`` pair, a revolute or universal joint to one or two revolute joints with massless links,
-welded to the other side.
+a ``6d`` pair.
 """
 
 import re
@@ -20,7 +19,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
-from legcal.geometry.lines import cross
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.bodies import frame_link
@@ -259,8 +257,7 @@ def reference_poses(urdf: Urdf) -> dict[str, RigidTransform]:
     return poses
 
 
-LoopKind = Literal["point", "weld", "revolute", "universal"]
-_X, _Y, _Z = np.eye(3)
+LoopKind = Literal["point", "weld"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,11 +268,10 @@ class Loop:
     kind: LoopKind  # coincidence of both frames
     links: tuple[str, str]  # the two links
     T_link_frame: tuple[RigidTransform, RigidTransform]  # frame of the joint in either link
-    axes: tuple[Array, Array] = (_X, _X)  # unit axis in either frame
 
 
 def close_loops(
-    loops: Sequence[Loop], text: UrdfBuilder, poses: Mapping[str, RigidTransform], path: Path
+    loops: Sequence[Loop], text: UrdfBuilder, path: Path
 ) -> tuple[list[list[str]], list[ClosureKind]]:
     """Add the frames of all loops to a tree; return their pairs and kinds for the mechanism."""
     if len(loops) > MAX_LOOPS:
@@ -286,83 +282,27 @@ def close_loops(
             "give one mechanism",
             path,
         )
-    closures = [close_loop(loop, text, poses) for loop in loops]
+    closures = [close_loop(loop, text) for loop in loops]
     return [frames for frames, _ in closures], [kind for _, kind in closures]
 
 
-def close_loop(
-    loop: Loop, text: UrdfBuilder, poses: Mapping[str, RigidTransform]
-) -> tuple[list[str], ClosureKind]:
+def close_loop(loop: Loop, text: UrdfBuilder) -> tuple[list[str], ClosureKind]:
     """Add the frames of a loop to a tree and return the closure."""
-    T_first_frame, T_second_frame = loop.T_link_frame
-    if loop.kind in ("revolute", "universal"):
-        T_first_frame, T_second_frame = _with_axes(loop, poses)
     ends = []
     for number, (link, T_link_frame) in enumerate(
-        zip(loop.links, (T_first_frame, T_second_frame), strict=True), start=1
+        zip(loop.links, loop.T_link_frame, strict=True), start=1
     ):
         frame = text.unused(f"{loop.name}_{number}")
         text.link(frame)
         text.joint(text.unused(f"{frame}_frame"), "fixed", link, frame, T_link_frame)
         ends.append(frame)
-    turns = {"revolute": (_Z,), "universal": (_X, _Y)}.get(loop.kind, ())
-    for axis in turns:
-        turned = text.unused(f"{loop.name}_turned")
-        text.link(turned)
-        text.joint(text.unused(f"{turned}_joint"), "revolute", ends[0], turned, EYE, axis)
-        ends[0] = turned
     return ends, "3d" if loop.kind == "point" else "6d"
-
-
-def _with_axes(
-    loop: Loop, poses: Mapping[str, RigidTransform]
-) -> tuple[RigidTransform, RigidTransform]:
-    """Return the frames turned onto the axes of the joint, equal if the loop is closed."""
-    T_first_frame, T_second_frame = loop.T_link_frame
-    first, second = (
-        T.rotation.apply(axis) for T, axis in zip(loop.T_link_frame, loop.axes, strict=True)
-    )
-    R_second_first = poses[loop.links[1]].rotation.inv() * poses[loop.links[0]].rotation
-    if loop.kind == "revolute":
-        across = _across(first, np.roll(first, 1))
-        across_second = _across(second, R_second_first.apply(across))
-        rotations = (
-            _columns(across, cross(first, across), first),
-            _columns(across_second, cross(second, across_second), second),
-        )
-    else:
-        along_y = _across(first, R_second_first.inv().apply(second))
-        along_x = _across(second, R_second_first.apply(first))
-        rotations = (
-            _columns(first, along_y, cross(first, along_y)),
-            _columns(along_x, second, cross(along_x, second)),
-        )
-    return (
-        RigidTransform.from_components(T_first_frame.translation, rotations[0]),
-        RigidTransform.from_components(T_second_frame.translation, rotations[1]),
-    )
-
-
-def _across(axis: Array, direction: Array) -> Array:
-    """Return the unit component of a direction across an axis, or another unit vector across it."""
-    for candidate in (direction, np.eye(3)[int(np.argmin(np.abs(axis)))]):
-        part = candidate - (candidate @ axis) * axis
-        if np.linalg.norm(part) > 1e-3 * np.linalg.norm(candidate):
-            break
-    return np.asarray(part / np.linalg.norm(part))
-
-
-def _columns(x: Array, y: Array, z: Array) -> Rotation:
-    """Return the rotation whose columns are three perpendicular unit vectors."""
-    return Rotation.from_matrix(np.column_stack([x, y, z]))
 
 
 _CLOSING = re.compile(r"closing_(.+)_([12])")
 KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("spherical", "ball", "point"), "point"),
     **dict.fromkeys(("fixed", "weld"), "weld"),
-    **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
-    "universal": "universal",
 }
 
 
@@ -402,9 +342,8 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     problems.raise_if_any()
     for element in elements:
         robot.remove(element)
-    poses = reference_poses(bare)
     text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
-    pairs, kinds = close_loops(loops, text, poses, path)
+    pairs, kinds = close_loops(loops, text, path)
     for line in filter(None, text.body().split("\n")):
         robot.append(etree.fromstring(line))
         robot[-1].tail = "\n"
@@ -436,15 +375,14 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems
                 element,
                 f"closes a loop with the type '{element.get('type', '')}', needed one of "
                 f"{', '.join(KINDS)}",
-                "cut the loop at another joint",
+                "cut the loop at another joint, or close it in a mechanism YAML",
             )
             continue
         ends = _ends(element, urdf, problems)
-        axes = _axes(element, KINDS[kind], problems)
         if len(problems) > n_before or ends is None:
             continue
         (link_1, T_1), (link_2, T_2) = ends
-        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
+        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2)))
     return loops
 
 
@@ -456,14 +394,11 @@ def _ends(
     origins: list[etree._Element | None] = [
         part if part.find("origin") is None else part.find("origin") for part in sides
     ]
-    if not sides:
-        sides = [part for tag in ("parent", "child") for part in element.findall(tag)]
-        origins = [element.find(f"{part.tag}_origin") for part in sides]
     if len(sides) != 2:
         problems.at(
             element,
             f"names {len(sides)} links, needed two",
-            "write <link1 link=...> and <link2 link=...>, or <parent ...> and <child ...>",
+            "write <link1 link=...> and <link2 link=...>",
         )
         return None
     n_before = len(problems)
@@ -501,36 +436,6 @@ def _three(
             element, f"has {key}={str(text)[:60]!r}, needed 3 finite numbers", "correct the value"
         )
     return np.array(numbers or [0.0] * 3)
-
-
-def _axes(element: etree._Element, kind: LoopKind, problems: XmlProblems) -> tuple[Array, Array]:
-    """Return the unit axes of a loop in its two frames; the URDF default is x."""
-    x = np.array([1.0, 0.0, 0.0])
-    if kind not in ("revolute", "universal"):
-        return x, x
-    common = element.find("axis")
-    if common is not None and common.get("frame") is not None:
-        problems.at(
-            element,
-            f"gives its axis in the frame '{common.get('frame')}' alone, needed it in both",
-            "give both frames with rpy so that the axis is the same in them",
-        )
-    parts = [element.find(f"{side}_axis") for side in ("parent", "child")]
-    if kind == "universal" and None in parts:
-        problems.at(
-            element,
-            "is universal and has not two axes",
-            "write <parent_axis xyz=...> and <child_axis xyz=...>",
-        )
-    axes = []
-    for part in parts:
-        given = common if part is None else part
-        axis = x if given is None else _three(element, given, "xyz", problems)
-        norm = float(np.linalg.norm(axis))
-        if norm < 1e-9 and not problems:
-            problems.at(element, "has a zero axis, needed a direction", "correct its xyz")
-        axes.append(axis / max(norm, 1e-9))
-    return axes[0], axes[1]
 
 
 def _motors(

@@ -7,8 +7,9 @@ likely than the machine was built that badly. Where few images are to tell one g
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -25,8 +26,11 @@ MachineKind = Literal["printed", "machined", "bought"]
 # fit rely on a model about that good.
 _PART_OF_SIZE = 0.01
 _PART_OF_ZERO = 0.05
-_ANGLE = float(np.radians(3.0))
-_ANGLE_AT_ZERO = float(np.radians(5.0))
+_ANGLE = math.radians(3.0)
+_ANGLE_AT_ZERO = math.radians(5.0)
+# Screws of tolerance class 10 (ISO 3408) may be 0.07 % off, hobby screws and belts 0.1 to 0.5 %
+PART_OF_TRAVEL = 0.002
+_MOST_OF_TRAVEL = 0.01
 
 
 def _stated(*dimensions: str) -> BeforeValidator:
@@ -55,10 +59,27 @@ def _stated(*dimensions: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
+def _read_part(given: Any) -> float:
+    """Read a standard deviation as a part: a number, or text in per cent."""
+    text = given.strip() if isinstance(given, str) else describe(given)
+    try:
+        part = float(text[:-1]) / 100.0 if text.endswith("%") else float(text)
+    except ValueError:
+        part = math.nan
+    if not 0.0 < part <= _MOST_OF_TRAVEL:
+        raise BadValue(
+            describe(given),
+            f"a part of the travel up to {_MOST_OF_TRAVEL:.0%}",
+            "write per cent with their sign, such as 0.02%",
+        )
+    return part
+
+
 _SCHEMA = WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]})
 _Length = Annotated[Quantity, _stated("m"), _SCHEMA]
 _Angle = Annotated[Quantity, _stated("rad"), _SCHEMA]
 _Zero = Annotated[Quantity, _stated("m", "rad"), _SCHEMA]
+_Part = Annotated[float, BeforeValidator(_read_part), _SCHEMA]
 
 
 class ToleranceEntry(FileSchema):
@@ -68,6 +89,7 @@ class ToleranceEntry(FileSchema):
     axes: _Angle | None = None  # directions of axes
     lengths: _Length | None = None  # of rods and constant legs
     zeros: _Zero | None = None  # of motors, in their unit
+    travel: _Part | None = None  # of all motors that slide alike, as a part of it
 
 
 class BuiltEntry(FileSchema):
@@ -100,6 +122,7 @@ class BuiltEntry(FileSchema):
                 _value(stated.lengths),
                 _value(stated.zeros, "m"),
                 _value(stated.zeros, "rad"),
+                stated.travel,
             )
         )
 
@@ -120,12 +143,35 @@ class Tolerance:
     lengths: float | None = None
     zeros: float | None = None  # of motors that read a length
     angles_at_zero: float | None = None  # of motors that turn
+    # Of the travel of all motors that slide alike, as a part of it: pitches of screws and belts.
+    # Readings are exact in the fit; what this does to the platform is stated beside its sigma.
+    travel: float | None = None
+
+    @property
+    def says_parts(self) -> bool:
+        """Whether something is stated beside the travel."""
+        return replace(self, travel=None) != NOT_STATED
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The keys of a file that state it."""
+        if (
+            kind := next((k for k, typical in TYPICAL.items() if typical == self), None)
+        ) is not None:
+            return {"machine_kind": str(kind)}
+        zeros: float | str | None = self.zeros
+        if self.zeros != self.angles_at_zero:  # of one dimension
+            unit = "rad" if self.zeros is None else "m"
+            zeros = f"{self.zeros or self.angles_at_zero!r} {unit}"
+        numbers = {"joints": self.joints, "axes": self.axes, "lengths": self.lengths}
+        stated = {name: x for name, x in {**numbers, "zeros": zeros}.items() if x is not None}
+        return {"tolerance": stated} if stated else {}
 
     def completed(self, size: float) -> Tolerance:
         """Return all of them, rough ones where nothing is stated; *size* is the mean leg length."""
         rough = (_PART_OF_SIZE * size, _ANGLE, _PART_OF_SIZE * size, _PART_OF_ZERO * size)
         names = [one.name for one in fields(self)]
-        assumed = dict(zip(names, (*rough, _ANGLE_AT_ZERO), strict=True))
+        assumed = dict(zip(names, (*rough, _ANGLE_AT_ZERO, PART_OF_TRAVEL), strict=True))
         return Tolerance(**{n: getattr(self, n) or assumed[n] for n in names})
 
     def of_parameters(
@@ -136,7 +182,7 @@ class Tolerance:
         *size* is the mean leg length. Joints on an actuator at reading zero follow its zero too.
         """
         full, found = self.completed(size), dict[str, float]()
-        joints, axes, lengths, zeros, turn = (
+        joints, axes, lengths, zeros, turn, _ = (
             float(getattr(full, one.name) or 0.0) for one in fields(full)
         )
         for name in names:
@@ -159,9 +205,9 @@ class Tolerance:
 NOT_STATED = Tolerance()
 
 # Typical machines of each kind: 3D printed parts on a flat board, milled parts on machined plates,
-# a product with a data sheet.
+# a product with a data sheet. They move by belts or hobby screws, by ball screws, by either.
 TYPICAL: Mapping[MachineKind, Tolerance] = {
-    "printed": Tolerance(0.5e-3, float(np.radians(1.0)), 0.5e-3, 5e-3, float(np.radians(5.0))),
-    "machined": Tolerance(0.1e-3, float(np.radians(0.2)), 0.1e-3, 2e-3, float(np.radians(2.0))),
-    "bought": Tolerance(0.2e-3, float(np.radians(0.2)), 0.1e-3, 1e-3, float(np.radians(1.0))),
+    "printed": Tolerance(0.5e-3, math.radians(1.0), 0.5e-3, 5e-3, math.radians(5.0), 3e-3),
+    "machined": Tolerance(0.1e-3, math.radians(0.2), 0.1e-3, 2e-3, math.radians(2.0), 5e-4),
+    "bought": Tolerance(0.2e-3, math.radians(0.2), 0.1e-3, 1e-3, math.radians(1.0), 1e-3),
 }

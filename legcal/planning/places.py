@@ -28,8 +28,6 @@ _N_AZIMUTHS = 16  # directions around the machine
 _ELEVATIONS = (0.1, 0.4, 0.75, 1.15)  # [rad] above the plane across the machine
 _ELEVATIONS_PLANAR = (0.65, 1.0, 1.35)  # above the plane of motion
 _NEARER = (1.0, 0.8, 0.65)  # of the distance from where all is in the picture
-_FARTHER = 2.0  # of it, at most, in a box
-_ACROSS = 5  # places along each side of a box
 _DISTANCES = np.geomspace(0.4, 12.0, 60)  # sizes of the machine, that are tried
 _CLEARANCE = 0.3  # of the size, between camera and machine, at least
 _ROUNDING = 1e-9
@@ -123,16 +121,8 @@ def places_around(
     if bounds is None:
         return places
     inside = [place for place in places if place.is_inside(bounds)]
-    if len(inside) < _N_AZIMUTHS:  # a box between those places
-        inside += _places_in(bounds, points, camera, setting)
     if not inside:
         positions = np.array([place.T_base_camera.translation for place in places])
-        _, distance, least = _distances(bounds.mean(axis=1), points, camera, setting)
-        direction = " to reach one"
-        if distance > _FARTHER * least:
-            direction = " towards the machine"
-        elif distance < min(_NEARER) * least:
-            direction = " away from the machine"
         spans = [
             f"{name} {low:.2f} to {high:.2f}"
             for name, low, high in zip(
@@ -141,8 +131,8 @@ def places_around(
         ]
         raise NotVisible(
             f"{start} no position inside --bounds shows most of the machine large enough; "
-            f"positions around the machine are at {', '.join(spans)} m: widen --bounds{direction}, "
-            "or use a camera with another field of view."
+            f"positions around the machine are at {', '.join(spans)} m: widen --bounds to reach "
+            "one, or use a camera with another field of view."
         )
     return inside
 
@@ -156,30 +146,6 @@ def places_along(toward: Array, points: Array, camera: Camera, setting: Setting)
         for d in distance * np.array(_NEARER)
         if d < np.inf and d - reach >= _CLEARANCE * size
     ]
-
-
-def _places_in(bounds: Array, points: Array, camera: Camera, setting: Setting) -> list[Place]:
-    """Places all over a box with all, or most, points in the picture."""
-    grid = np.meshgrid(*(np.linspace(low, high, _ACROSS) for low, high in bounds))
-    places = []
-    for position in np.stack(grid, axis=-1).reshape(-1, 3):
-        toward, d, distance = _distances(position, points, camera, setting)
-        target, size, reach = _extent(toward, points)
-        if d - reach >= _CLEARANCE * size and min(_NEARER) <= d / distance <= _FARTHER:
-            places.append(Place(look_at(position, target)))
-    return places
-
-
-def _distances(
-    position: Array, points: Array, camera: Camera, setting: Setting
-) -> tuple[Array, float, float]:
-    """Direction of a position from points, its distance, and the distance that frames all points.
-
-    Distances are from the centre of the points [m].
-    """
-    offset = position - 0.5 * (points.min(axis=0) + points.max(axis=0))
-    d = max(float(np.linalg.norm(offset)), _ROUNDING)
-    return offset / d, d, _distance_to_frame_all(offset / d, points, camera, setting)
 
 
 def _extent(toward: Array, points: Array) -> tuple[Array, float, float]:

@@ -643,7 +643,6 @@ class _Search:
             names=parametrization.names,
             units=parametrization.units,
             growth=self._growth(contributions),
-            limits=_limits(self.with_all(contributions), self.criterion),
             seed=task.seed,
             board=task.laid,
             hand_held=task.hand_held,
@@ -698,28 +697,3 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
     session = Session([], parts)
     basis = parts[0].basis
     return np.asarray(basis @ session.fitted() @ basis.T)
-
-
-_LIMITS = {
-    "common-mode edge biases": ("bias", "tilt"),
-    "the gamma of the camera": ("camera gamma",),
-    "radii": ("radii",),
-    "intrinsics of the camera": ("camera ",),
-}
-
-
-def _limits(session: Session, criterion: Criterion) -> dict[str, float]:
-    """Criterion without each source of error."""
-    criteria = {}
-    for source, words in _LIMITS.items():
-        removed = [
-            i for name, i in session.names.items()
-            if any(word in name for word in words)
-            and not (source.startswith("intrinsics") and "gamma" in name)
-        ]  # fmt: skip
-        if removed:
-            remaining = np.setdiff1d(np.arange(len(session.names)), removed)
-            inverse = np.linalg.inv(session.information[np.ix_(remaining, remaining)])
-            S = np.asarray(inverse[: session.p, : session.p], dtype=np.float64)
-            criteria[source] = float(criterion(S[None])[0])
-    return criteria

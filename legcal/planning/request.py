@@ -202,7 +202,7 @@ def _plan_for_target(
     """Plan with the fewest images that reach a target [m].
 
     The growth of each plan predicts the number of images for the next one. An unreachable target is
-    refused with its limiting source of error.
+    refused.
     """
     n, least, best = max(_BEGIN, 2 * task.n_views), 0, None
     for _ in range(_ROUNDS):
@@ -248,21 +248,16 @@ def _images_for(planned: Plan, error: float, target: float) -> int:
 
 
 def _unreachable_target(task: Task, planned: Plan, target: float) -> str:
-    """Describe why no number of images reaches a target, and the limiting error."""
-    source = min(planned.limits, key=lambda what: planned.limits[what], default="")
+    """Describe why no number of images reaches a target."""
     error = 0.0 if planned.error is None else planned.error.mean_displacement
-    limit = "the noise of single outlines"
-    if source and planned.limits[source] < 0.8 * planned.value:
-        share = error * planned.limits[source] / planned.value
-        limit = f"{source} (without them {1e3 * share:.3f} mm)"
     more = ""
     n, value = planned.growth[planned.growth[:, 0] <= MOST_IMAGES][-1]
     if n > planned.n_images:
         more = f", about {1e3 * error * value / planned.value:.3f} mm with {n:.0f} similar ones"
     return (
         f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm cannot be reached: "
-        f"{1e3 * error:.3f} mm are expected with {planned.n_images} images{more}, limited by "
-        f"{limit}; use better light or a longer focal length, more --cameras, --board, or a larger "
+        f"{1e3 * error:.3f} mm are expected with {planned.n_images} images{more}; "
+        "use better light or a longer focal length, more --cameras, --board, or a larger "
         "--target."
     )
 

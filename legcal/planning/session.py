@@ -7,13 +7,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
@@ -24,6 +23,7 @@ from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.quantities import mm_deg
 from legcal.data.dataset import PLAN_NAME, POSES_NAME
+from legcal.data.dataset_file import dataset_texts
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError
@@ -35,14 +35,12 @@ from legcal.files.folder import (
     result_folder,
 )
 from legcal.files.motions import Pose, motion_to_xyz_quat
-from legcal.files.published import with_schema
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import Document, Number, SparseDocument, Version
 from legcal.files.table import format_table
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
-from legcal.machine.files import DATASET_YAML
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
 from legcal.planning.places import MAX_ANGLE, MAX_DRAWS, LaidBoard, Setting
@@ -53,7 +51,7 @@ from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 from legcal.vision.visibility import Seen
 
-CAMERA, MEASUREMENTS = "camera_info.yaml", "measurements.csv"
+CAMERA = "camera_info.yaml"
 HAND = "hand"  # the view of a hand-held camera
 PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 
@@ -144,30 +142,6 @@ def rough_view(
     return entry
 
 
-def dataset_texts(
-    machine: Machine,
-    model: str,  # path of its YAML in the dataset
-    views: Mapping[str, Any],
-    rows: Iterable[Sequence[Any]],  # of *columns* and readings
-    encoder_sigma: float | dict[str, float],
-    blocks: Mapping[str, Any],
-    columns: Sequence[str] = ("view", "image", "pose"),
-) -> dict[str, str]:
-    """Return ``dataset.yaml`` and ``measurements.csv``, by their names."""
-    document = {
-        "legcal_dataset": 1,
-        "mechanism": model,
-        "measurements": MEASUREMENTS,
-        "encoder_sigma": encoder_sigma,
-        "views": dict(views),
-        **blocks,
-    }
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    joints = [column.name for column in reading_columns(machine.legs)]
-    table = format_table([*columns, *joints], rows)
-    return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}
-
-
 def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     """Return the standard deviation of readings [m], by motor [m or rad] where they differ."""
     legs = [plan.machine.legs[j] for j in plan.machine.motors]
@@ -256,8 +230,6 @@ class Plan:
     growth : (n, 2) array
         Numbers of images, and the criterion with that many, most useful images first; beyond the
         planned number, with copies of the planned images.
-    limits : dict
-        Sources of error that limit a plan: the criterion [m] without each of them.
     """
 
     machine: Machine
@@ -272,7 +244,6 @@ class Plan:
     names: tuple[str, ...]
     units: tuple[str, ...]
     growth: Array
-    limits: dict[str, float]
     seed: int = 0
     board: LaidBoard | None = None  # on the base, in every image
     hand_held: bool = False
@@ -357,7 +328,6 @@ class Plan:
             },
             parameters=[ExpectedSigma(name=n, sigma=sigma, unit=u) for n, sigma, u in rows],
             growth=[Growth(images=int(n), value=float(x)) for n, x in self.growth],
-            limits=self.limits,
             notes=list(self.notes),
             parts=list(self.parts) or None,
         ).document()
@@ -438,7 +408,6 @@ class PlanDocument(SparseDocument):
     views: dict[str, ViewOfPlan]
     parameters: list[ExpectedSigma]
     growth: list[Growth]
-    limits: dict[str, Number]  # the criterion [m] if an error were not there, or images without end
     notes: list[str]
     parts: list[PartSigma] | None = None  # left out where not asked for (--only)
 

@@ -246,8 +246,8 @@ class GuidedSession:
 
     # The check of a photograph
 
-    def check(self, asked: Asked, photograph: Path, q: Array | None = None) -> Checked:
-        """Check a photograph of the pose that was asked, or of readings *q*; nothing is written."""
+    def check(self, asked: Asked, photograph: Path) -> Checked:
+        """Check a photograph of the pose that was asked; nothing is written."""
         m = self.dataset.measurements
         names = [view.name for view in m.views]
         held = f"{asked.view}-1"  # images of a camera in the hand are views: hand-1, hand-2
@@ -270,9 +270,7 @@ class GuidedSession:
         if not problems and m.views[v].name in self.cameras:
             one = measurements_at(m, np.zeros(1, dtype=np.intp))
             absolute = str(photograph.absolute())
-            one = replace(
-                one, image=(absolute,), view=np.array([v]), q=(asked.q if q is None else q)[None]
-            )
+            one = replace(one, image=(absolute,), view=np.array([v]), q=asked.q[None])
             legs, n_visible = self._legs_in(replace(self.dataset, measurements=one))
             if legs.sum() < FEW_LEGS * n_visible:
                 problems.append(
@@ -376,36 +374,6 @@ class GuidedSession:
             (self.folder / image).unlink(missing_ok=True)
             self._read_tables()
         return image or "The last row"
-
-    def parsed(self, asked: Asked, text: str) -> Array:
-        """Return readings (n_legs,) from numbers in mm or deg, in the order of the settings.
-
-        Raises UsageError or DidNotConverge if they are no readings of this machine.
-        """
-        legs, motors = self.machine.legs, self.machine.motors
-        names = list(dict.fromkeys(str(legs[j].prismatic) for j in motors))
-        try:
-            numbers = [float(word) for word in text.replace(",", " ").split()]
-        except ValueError:
-            numbers = []
-        if len(numbers) != len(names):
-            raise UsageError(
-                f"The readings could not be used: found '{text.strip()}', needed {len(names)} "
-                f"numbers in the order {', '.join(names)}; type them again."
-            )
-        q = asked.q.copy()
-        for j in motors:
-            value = numbers[names.index(str(legs[j].prismatic))]
-            value /= SHOWN_IN[legs[j].reading_unit][0]
-            if not legs[j].in_travel(np.array([value])).all():
-                raise UsageError(
-                    f"The readings could not be used: found {legs[j].prismatic} outside its "
-                    "travel, needed mm or deg as in the settings above; type them again."
-                )
-            q[j] = value
-        if self.machine.is_determined:
-            list(follow_each(self.machine, q[None, list(motors)]))
-        return q
 
     def _readings(self, q: Array) -> dict[str, str]:
         """Return the cells of readings, in the units of the table."""

@@ -12,15 +12,14 @@ import numpy as np
 from rich.text import Text
 
 from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccuracy
-from legcal.calibration.link_joints import joints_title, mark_in_words
 from legcal.calibration.pipeline import exact_cameras
-from legcal.calibration.quantities import DIGITS, FRAMES, joints_of, parameters_of
+from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
     brief_sentences,
-    residuals_in_words,
     sentences,
     tables,
 )
+from legcal.data.measurements import few
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.leg import ParameterId
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from legcal.calibration.result import Calibration
     from legcal.calibration.verification import Check
 
-_SAME_M, _SAME_RAD = 1e-9, 1e-9  # largest distance of equal frames [m, rad]
 _SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
 _LARGEST = 3  # largest changes of parameters shown
 _EXPLANATIONS = 3  # alternative explanations shown
@@ -241,6 +239,13 @@ def accuracy_table(evaluation: Evaluation) -> Report:
             f"Platform error over {len(dX)} poses: displacement {dX.mean():.4f} mm "
             f"(max {dX.max():.4f}), orientation {dE.mean():.4f} deg (max {dE.max():.4f})"
         )
+    left_out = None
+    if n := evaluation.n_left_out:
+        rows_left_out = few([str(row) for row in evaluation.unreached])
+        left_out = (
+            f"{n} of {n + len(dX)} poses are left out, which one of the models does not reach "
+            f"(rows {rows_left_out})."
+        )
     scale = np.array([SHOWN_IN[unit][0] for unit in evaluation.units])
     values, references = scale * evaluation.values, scale * evaluation.references
     rows = [
@@ -252,53 +257,9 @@ def accuracy_table(evaluation: Evaluation) -> Report:
     columns = ("parameter", ">model", ">reference", ">difference")
     return report(
         headline,
-        *(
-            f"Readings of redundant motors in the {who}: {residuals_in_words(residuals)}"
-            for who, residuals in (evaluation.redundant_readings or {}).items()
-        ),
-        *_left_out(evaluation),
-        *_joint_tables(evaluation),
+        left_out,
         table(*columns, rows=rows, title=f"Parameters, joints in R_b and R_e [mm{angles}]"),
     )
-
-
-def _joint_tables(evaluation: Evaluation) -> list[Text | Table]:
-    """Return the joints of two models in the links of the first, and the distance of the frames."""
-    blocks: list[Text | Table] = []
-    for side, block in evaluation.links.items():
-        rows = [
-            (
-                joint.leg if k == 0 else "",
-                axis,
-                *(f"{1e3 * x:z.4f}" for x in (joint.xyz[k], joint.reference[k])),
-                f"{1e3 * joint.difference[k]:+z.4f}",
-                mark_in_words(side, "frame" if joint.defined[k] else "estimated", joint.defines),
-            )
-            for joint in block.joints
-            for k, axis in enumerate("xyz")
-        ]
-        title = joints_title(side, block.link, evaluation.joints_move)
-        columns = ("leg", "axis", ">model", ">reference", ">difference", "")
-        blocks.append(table(*columns, rows=rows, title=title))
-        distance, frame = block.frames_apart, FRAMES[side]
-        if distance.dX_m > _SAME_M or distance.dE_rad > _SAME_RAD:
-            blocks.append(
-                Text(
-                    f"In their links {frame} of both models are {1e3 * distance.dX_m:.4f} mm and "
-                    f"{np.degrees(distance.dE_rad):.4f} deg apart; they are aligned for this table."
-                )
-            )
-    return blocks
-
-
-def _left_out(evaluation: Evaluation) -> list[Text | Table]:
-    """Return a table of the rows left out, if any."""
-    n, rows = evaluation.n_left_out, evaluation.unreached
-    if not n:
-        return []
-    title = f"{n} of {n + len(evaluation.displacement)} poses are left out"
-    cells = [(str(row.row), row.view, row.image, " and ".join(row.by)) for row in rows]
-    return [table(">row", "view", "image", "not reached by", rows=cells, title=title)]
 
 
 def check_verdict(check: Check) -> Verdict:

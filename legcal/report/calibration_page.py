@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration.evaluation import Evaluation, evaluate
-from legcal.calibration.identify.identifiability import ranks_of_dataset
 from legcal.calibration.quantities import joints_of, parameters_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
@@ -24,7 +23,7 @@ from legcal.calibration.summary import (
 )
 from legcal.calibration.workspace_errors import PlatformMap, platform_map
 from legcal.data.measurements import row_names
-from legcal.errors import LegcalError, printable
+from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
@@ -52,7 +51,6 @@ from legcal.pages.document import (
 )
 from legcal.pages.svg import Bars, log_bars, number_grid
 from legcal.report.calibration import next_steps, platform_table
-from legcal.report.identify import conditions_table
 from legcal.report.residuals import outline_crops, residual_charts
 from legcal.scene.motions import MachineScene, PlacedModel, pyramid, scene_content
 from legcal.version import __version__
@@ -396,7 +394,7 @@ def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence
 
 
 def identifiability_blocks(calibration: Calibration) -> list[Any]:
-    """Return counts, ranks, and the least certain directions."""
+    """Return counts, and the least certain directions."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
     n_held = len(calibration.solution.kinematic.held_basis)
@@ -417,14 +415,6 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
         "Degrees of freedom": f"{result.residuals.dof}, chi2 {result.residuals.chi2:.1f}",
     }
     blocks: list[Any] = [Facts(counts)]
-    try:
-        conditions, full = ranks_of_dataset(calibration.dataset, problem.choices)
-    except LegcalError:
-        pass
-    else:
-        counts["Predicted rank"] = f"{full.rank} of {full.of}"
-        legs = calibration.dataset.machine.leg_names
-        blocks += [conditions_table(conditions, legs)] * bool(conditions)
     weak: list[list[Cell]] = [
         [
             row.in_words,
@@ -432,7 +422,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
             _parts(components.parameters, components.components),
         ]
         for row in result.weakest
-        for components in (row.links or row,)
+        for components in (row.links,)
     ]
     if weak:
         columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")

@@ -9,19 +9,15 @@ from math import degrees
 from rich.text import Text
 
 from legcal.calibration.identify.report import (
-    BoardReport,
-    CameraIntrinsics,
     ConditionBlock,
     Identifiability,
     Ranks,
     WeakDirection,
-    views_in_words,
 )
 from legcal.machine.parameters import leg_labels, legs_in_words, list_in_words
 from legcal.pages.document import Table, Verdict
 from legcal.report.render import Part, Report, table
 from legcal.report.render import report as blocks
-from legcal.vision.board import Link
 
 CONDITIONS = {
     "eq12": "base joints and axes (12)",
@@ -32,9 +28,11 @@ CONDITIONS = {
     "three_legs_at_once": "three legs at once (18, 19)",
 }
 _LEGEND = "length known: leg with an encoder (length = reading + offset), or of constant length"
-_NEEDS = {"full": "the joint fit"}
+_SCALE = (
+    "readings are angles, and radii alone say how large the machine is, so that calibrate refuses "
+    "it until a length or radii are stated (--length, --set), or a board is seen"
+)
 _MAX_WEAK = 6  # directions shown
-_MAX_MENDED = 3
 _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
@@ -42,12 +40,9 @@ def identify_table(report: Identifiability) -> Report:
     """Return an identifiability report as text, 80 columns wide."""
     return blocks(
         _heading(report),
-        None if report.recommendation is None else _recommendation(report),
         [conditions_table(report.conditions, report.legs), Text(_LEGEND, style="dim")],
         _weak(report.full) if report.full.weak else None,
         _remedies(report) if report.remedies else None,
-        _scale(report) if report.scale else None,
-        [*_boards(report), *(_intrinsics(intrinsics) for intrinsics in report.intrinsics)],
         _verdict(report),
     )
 
@@ -69,33 +64,11 @@ def _heading(report: Identifiability) -> list[str]:
         legs = f"legs {', '.join(labels[name] for name in view)}" if view else "no leg"
         lines.append(f"{views_in_heading}: {legs} in {images} image{'s' * (images != 1)}{per_view}")
         first = last
-    if report.board.present:
+    if report.board:
         lines.append("a calibration board on the base in every view")
-    if report.platform_board.present:
+    if report.platform_board:
         lines.append("a calibration board on the platform in every view")
     return lines
-
-
-def _recommendation(report: Identifiability) -> list[Part]:
-    """Return the sufficient sets of views."""
-    if not report.recommendation:
-        return ["No sufficient set of views was found; the report is for all legs in one view."]
-    labels, rows = leg_labels(report.legs), []
-    for view_set in report.recommendation:
-        number = len(view_set.views)
-        views = views_in_words([",".join(labels[name] for name in view) for view in view_set.views])
-        sigma = (
-            "" if view_set.platform_sigma is None else f"{1e3 * view_set.platform_sigma.dX_m:.2g}"
-        )
-        judged = "  *" if view_set.views == report.views else ""
-        words = f"{number} view{'s' * (number != 1)}: {views}"
-        rows.append((words, str(view_set.legs_a_view), sigma + judged))
-    columns = ("smallest sufficient sets of views", ">legs each", "sigma [mm]")
-    legend = "sigma: predicted error of the platform, all sets at the same poses; *: the set of "
-    legend += "this report"
-    if report.platform_sigma is not None:
-        legend += ", whose own camera places and poses give the error below"
-    return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
 def conditions_table(conditions: Sequence[ConditionBlock], leg_names: Sequence[str]) -> Table:
@@ -137,62 +110,6 @@ def _two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):.12g}"
 
 
-def _scale(report: Identifiability) -> list[Part]:
-    """Return the possible sources of scale with their precision."""
-    rows = []
-    for source in report.scale or ():
-        scale = "not fixed" if source.sigma is None else f"{100 * source.sigma:.2g} %"
-        motion = source.platform_sigma
-        rows.append((source.assumed, scale, "" if motion is None else f"{1e3 * motion.dX_m:.2g}"))
-    return [
-        "Readings are angles: without another source of scale it is determined by the leg radii "
-        "only.",
-        table("source of scale", ">sigma of scale", ">platform [mm]", rows=rows),
-    ]
-
-
-def _boards(report: Identifiability) -> list[str]:
-    """Return the effect of boards; one on the platform only if present or helpful."""
-    n_parameters, moving = report.full.of, report.platform_board
-    helps = moving.needed_for or moving.without != moving.with_board
-    on_platform = [_board(moving, n_parameters, "platform")] if moving.present or helps else []
-    return [_board(report.board, n_parameters, "base"), *on_platform]
-
-
-def _board(board: BoardReport, n_parameters: int, link: Link) -> str:
-    """Return the effect of a calibration board on a link, in a few sentences."""
-    subject = f"The calibration board on the {link}" if board.present else "A calibration board"
-    before, after = board.without, board.with_board
-    if not board.needed_for and before == after:
-        return f"{subject} is not needed: the rank is the same without it."
-    verb = "raises" if board.present else f"on the {link} would raise"
-    text = f"{subject} {verb}"
-    if board.needed_for:
-        needed = list_in_words(
-            [_NEEDS.get(name, CONDITIONS.get(name, name)) for name in board.needed_for]
-        )
-        on_link = "" if board.present else f" on the {link}"
-        text = f"{subject}{on_link} is needed for {needed}; it raises"
-    text += f" the rank from {before.full_rank} to {after.full_rank} of {n_parameters}"
-    if not board.mends:
-        return f"{text}."
-    phrases = list(board.mends[:_MAX_MENDED])
-    if len(board.mends) > _MAX_MENDED:
-        phrases.append(f"{len(board.mends) - _MAX_MENDED} more (see --json)")
-    return f"{text}, and determines: {'; '.join(phrases)}."
-
-
-def _intrinsics(intrinsics: CameraIntrinsics) -> str:
-    """Return the intrinsics that the legs determine."""
-    camera = f"Camera of {intrinsics.camera}: the legs"
-    sigma_of = {name: sigma for name, sigma in intrinsics.sigma.items() if sigma is not None}
-    if not intrinsics.determined:
-        open_ = list_in_words([name for name in intrinsics.sigma if name not in sigma_of])
-        return f"{camera} do not determine {open_}; calibrate it with legcal camera."
-    sigmas = ", ".join(f"{name} {_two_digits(sigma)}" for name, sigma in sigma_of.items())
-    return f"{camera} determine its intrinsics too (predicted sigma: {sigmas} px)."
-
-
 def _remedies(report: Identifiability) -> Table:
     """Return the remedies."""
     n_parameters = report.full.of
@@ -217,11 +134,8 @@ def _verdict(report: Identifiability) -> list[Part]:
             f"; {harmless} undetermined directions do not move the platform" if harmless else ""
         )
         lines.append(f"Identifiable: {determined}{undetermined}.")
-        if report.scale:
-            lines.append(
-                "But for the scale: calibrate refuses this machine until a length or radii are "
-                "stated (--length, --set), or a board is seen."
-            )
+        if report.scale_is_open:
+            lines.append(f"But for the scale: {_SCALE}.")
     else:
         lines.append(Text(f"NOT identifiable: {determined}.", style="bold"))
     if report.platform_sigma is not None:
@@ -231,14 +145,6 @@ def _verdict(report: Identifiability) -> list[Part]:
             f"{_two_digits(degrees(sigma.dE_rad))} deg."
         )
         lines.append(Text(expected, style="dim"))
-        scale = report.scale or ()
-        ways = [s.assumed for s in scale if s.sigma is not None and s.source != "radii"]
-        for radii in (s.platform_sigma for s in scale if s.source == "radii"):
-            if radii is not None:
-                lines.append(
-                    f"With radii alone it is {_two_digits(1e3 * radii.dX_m)} mm: the scale is the "
-                    f"largest part of it; better is {', or '.join(ways)}."
-                )
     if any(weak.dX_m is not None and not weak.harmless for weak in report.full.weak):
         hidden = "hides: unobserved platform error if the largest component is 1 mm."
         lines.append(Text(hidden, style="dim"))
@@ -256,10 +162,9 @@ def identify_verdict(report: Identifiability) -> Verdict:
         word = "These images cannot determine the machine"
         reasons = [f"Open: {one.direction}." for one in full.weak if not one.harmless]
         return Verdict("bad", word, sentence, reasons)
-    if report.scale:
+    if report.scale_is_open:
         word = "These images can determine all of the machine but its scale"
-        ways = ", or ".join(one.assumed for one in report.scale if one.sigma is not None)
-        return Verdict("doubtful", word, sentence, [f"To fix the scale: {ways}."] if ways else [])
+        return Verdict("doubtful", word, sentence, [f"{_SCALE[0].upper()}{_SCALE[1:]}."])
     if not report.conditions_hold:
         word = "The joint fit can determine it, but conditions of the paper fail"
         return Verdict("doubtful", word, sentence, [])

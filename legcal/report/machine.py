@@ -249,12 +249,7 @@ def _noise_line(location: Location) -> str:
     if noise.angle is not None:
         angle = f"{np.degrees(noise.angle):.3g} deg"
         words += f", orientation {angle} ({stated[noise.angle_stated]})"
-    possible_sources = [
-        "errors of the readings" * (noise.reading > 0.0),
-        "the covariance of the model" * noise.model,
-    ]
-    sources = [other for other in possible_sources if other]
-    counted = f"; {' and '.join(sources)} counted in" if sources else ""
+    counted = "; the covariance of the model counted in" * noise.model
     p_value = "" if location.p_value is None else f", p {location.p_value:.2g}"
     return (
         f"Noise of a component: {words}{counted}. chi2 {location.chi2:.1f} at {location.dof} "

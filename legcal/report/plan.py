@@ -16,17 +16,16 @@ from legcal.geometry.types import Array
 from legcal.machine.configurations import poses_at
 from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Drawing, Items, Picture, Row, page_html
-from legcal.pages.svg import Canvas, Points, scatter
+from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
 from legcal.planning.session import Plan, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
 from legcal.scene.motions import pyramid
 
-PLACES, GROWTH, CHECKLIST, PAGE_NAME = "places.svg", "growth.svg", "checklist.txt", "plan.html"
+PLACES, CHECKLIST, PAGE_NAME = "places.svg", "checklist.txt", "plan.html"
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"
 _WORST = 12  # least certain parameters shown, equally many of each unit
-_LEAST = 6  # smallest number of images drawn; fewer determine next to nothing
 _SIDE = 560.0  # width of a picture of camera places [px]
 _DEPTH = 0.1  # depth of the pyramid of a camera, relative to its distance from the machine
 
@@ -112,18 +111,12 @@ def _selected_growth(plan: Plan) -> list[tuple[float, float]]:
     return [(k, value) for k, value in plan.growth.tolist() if k in chosen]
 
 
-def _scaled(plan: Plan, value: float) -> tuple[float, str]:
-    """Return the expected error at another value of the criterion, and its unit."""
-    ratio = value / plan.value
-    if plan.error is None:
-        return ratio, "relative to the plan"
-    return 1e3 * ratio * plan.error.mean_displacement, "mm"
-
-
 def _scaled_in_words(plan: Plan, value: float) -> str:
     """Return the expected error at another value of the criterion, in words."""
-    expected, unit = _scaled(plan, value)
-    return f"{expected:.{3 if unit == 'mm' else 2}f} {unit}"
+    ratio = value / plan.value
+    if plan.error is None:
+        return f"{ratio:.2f} relative to the plan"
+    return f"{1e3 * ratio * plan.error.mean_displacement:.3f} mm"
 
 
 def _measured(plan: Plan) -> tuple[int, ...]:
@@ -226,7 +219,6 @@ def _board_in_words(plan: Plan, board: LaidBoard) -> str:
 
 def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[str, str | bytes]:
     """Return the pictures, the checklist and the page of a session, by their names."""
-    growth = _draw_growth(plan).markup()
     places, in_page = (_draw_places(plan, in_page=x).markup() for x in (False, True))
     images = [
         Picture(
@@ -237,7 +229,6 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     ]
     blocks: list[Any] = [
         Drawing(in_page, "Camera places from above and from the side."),
-        Drawing(growth, "Expected error vs. number of images."),
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),
     ]
@@ -248,7 +239,6 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     listed = "".join(f"[ ] {item}\n" for item in checklist(plan))
     return {
         PLACES: places,
-        GROWTH: growth,
         CHECKLIST: listed,
         PAGE_NAME: page_html(page),
         **{f"previews/{name}.jpg": data for name, data in previews.items()},
@@ -274,24 +264,3 @@ def _draw_places(plan: Plan, *, in_page: bool) -> Canvas:
                 marks.append(Mark(line, _CAMERA_COLOUR, distance, 1, 0.5, only_plan=True))
     title = "at home, with the cameras; distances in mm"
     return draw_machine(machine, in_page=in_page, marks=marks, title=title, side=_SIDE)
-
-
-def _draw_growth(plan: Plan) -> Canvas:
-    """Draw the expected error over the number of images."""
-    planned = plan.growth[:, 0] <= plan.n_images
-    min_images = 1 if plan.given else min(_LEAST, plan.n_images)
-    is_known = np.isfinite(plan.growth[:, 1]) & (plan.growth[:, 0] >= min_images)
-    scale, unit = _scaled(plan, 1.0)
-    quantity = "expected error of the platform" if unit == "mm" else "determinant's root"
-    extrapolated = is_known & (~planned | (plan.growth[:, 0] == plan.n_images))
-    images, error = plan.growth[:, 0], scale * plan.growth[:, 1]
-    lines = [
-        Points(images[chosen], error[chosen], group=k, label=label, line=line)
-        for k, (chosen, label, line) in enumerate(
-            (
-                (extrapolated, "more of their kind", "5 4"),
-                (is_known & planned, "planned", ""),
-            )
-        )
-    ]
-    return scatter(quantity, lines, "images", f"{quantity} [{unit}]", log="xy")

@@ -155,7 +155,7 @@ def ellipsoids(result: Result) -> dict[str, Array]:
     frame.
     """
     half_axes = {}
-    for side, block in (result.links or {}).items():
+    for side, block in result.links.items():
         value, vector = np.linalg.eigh(np.array([joint.covariance for joint in block.joints]))
         half_axes[str(side)] = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
     return half_axes

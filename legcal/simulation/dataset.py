@@ -16,6 +16,7 @@ import numpy as np
 from legcal.brief import brief
 from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, PLAN_NAME
+from legcal.data.dataset_file import dataset_texts
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import join_outlines, write_observations
 from legcal.data.reading_units import sigma_too_large
@@ -34,7 +35,7 @@ from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
-from legcal.planning.session import dataset_texts, rough_view
+from legcal.planning.session import rough_view
 from legcal.progress import Progress, Report, shown_progress
 from legcal.simulation.board import documents
 from legcal.simulation.observe import (
@@ -178,8 +179,7 @@ def simulate(
         if settings.plan is not None:
             plan = read_bytes(Path(settings.plan) / PLAN_NAME, MAX_DOCUMENT)
             (folder / PLAN_NAME).write_bytes(plan)
-        files = [*files_in(folder), TRUTH_NAME]
-        write_truth(folder / TRUTH_NAME, session, settings, files)
+        write_truth(folder / TRUTH_NAME, session, settings)
     seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
     readings = session.poses.readings[np.unique(session.scene.images.pose)]
     rod = truth.rod_for_scale(has_length=bool(measured or session.boards))
@@ -342,7 +342,6 @@ def write_truth(
     path: Path,
     session: SimulatedSession,
     settings: SimulationSettings,
-    files: Sequence[str],  # the other files of the dataset
 ) -> None:
     """Write ``truth.json``: settings, radii, cameras, poses and board as they really were."""
     truth, poses = session.truth, session.poses
@@ -365,7 +364,6 @@ def write_truth(
             for label, T, readings in zip(session.labels, poses.poses, poses.readings, strict=True)
         },
         **({"board": documents(session.boards, poses=True)} if session.boards else {}),
-        "files": list(files),
     }
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -393,9 +391,3 @@ def check_dataset_destination(destination: Path) -> None:
             f"{destination}: the dataset could not be written: found {content}, needed a new or "
             "empty folder; give another folder, or remove this one first."
         )
-
-
-def files_in(folder: Path) -> list[str]:
-    """Return the files of a folder, relative to it, in order; without hidden folders."""
-    paths = [path.relative_to(folder) for path in folder.rglob("[!.]*") if path.is_file()]
-    return [path.as_posix() for path in sorted(paths) if not path.parent.name.startswith(".")]

@@ -13,13 +13,13 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.geometry.lines import cross, distance_to_line
+from legcal.geometry.lines import distance_to_line
 from legcal.geometry.motions import matrix_product, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import Configurations
 from legcal.machine.leg import Leg
-from legcal.machine.meshes import mesh_file, ray_caster, read_mesh
+from legcal.machine.meshes import first_hits, mesh_file, ray_caster, read_mesh
 from legcal.machine.model import Machine, joint_values, vectors_A_to_B
 from legcal.machine.rods import arms_at, first_rods
 from legcal.machine.shapes import coaxial_tolerance
@@ -31,7 +31,6 @@ _BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
 _POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
 _DEFAULT_RADIUS = 0.02  # radius of a leg without a cylinder, in distances between its joints
 _GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
-_GRAZING = 1e-5  # sine of the angle of a ray to a face up to which the face hides nothing
 _FLAT = 0.2  # maximum cosine between legs and the normal of plates that are parallel to the legs
 
 _SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
@@ -416,20 +415,9 @@ class PosedMachine:
         """Return a mask of the points that are hidden from a centre by a solid."""
         if not len(self.faces):
             return np.zeros(len(points), dtype=np.bool_)
-        ray = points - centre
-        distance = np.linalg.norm(ray, axis=-1)
-        ray = ray / distance[:, None]
-        face, index = _caster(self).intersects_id(
-            np.broadcast_to(centre, ray.shape), ray, multiple_hits=False
-        )
-        corner = self.vertices[self.faces[face]]
-        normal = cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        towards = np.sum(normal * ray[index], axis=-1)
-        is_hit = np.abs(towards) > _GRAZING * np.linalg.norm(normal, axis=-1)
-        index, reached = index[is_hit], np.sum(normal * (corner[:, 0] - centre), axis=-1)[is_hit]
-        hidden = np.zeros(len(points), dtype=np.bool_)
-        hidden[index] = reached / towards[is_hit] < distance[index] - margin[index]
-        return hidden
+        distance = np.linalg.norm(points - centre, axis=-1)
+        hits = first_hits(_caster(self), self.vertices, self.faces, centre, points)
+        return np.asarray(hits < distance - margin)
 
     def encloses(self, centre: Array) -> bool:
         """Return whether a point (3,) is in a solid, or between the joints of the machine."""

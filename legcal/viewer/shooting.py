@@ -9,7 +9,6 @@ from typing import Any
 
 from legcal.calibration.quantities import mm_deg
 from legcal.errors import LegcalError, printable
-from legcal.geometry.types import Array
 from legcal.pages.document import Dialogue as DialogueBlock
 from legcal.pages.document import Page, Section, page_html
 from legcal.planning.shooting import Asked, Checked, GuidedSession
@@ -24,8 +23,7 @@ _UNKNOWN = 0.02  # errors above are not known yet, of the mean leg length
 class Dialogue:
     """Takes photographs and words until a session is complete or its owner quits.
 
-    Words are those of :data:`WORDS`, readings in mm or deg that replace the commanded ones of the
-    pose that is asked, and nothing, which asks a camera for a photograph.
+    Words are those of :data:`WORDS`, and nothing, which asks a camera for a photograph.
     """
 
     def __init__(
@@ -38,7 +36,6 @@ class Dialogue:
         self.words = queue.SimpleQueue[str]()
         self.lines: list[str] = []  # what was said
         self._say = say
-        self._q: Array | None = None  # typed readings of the pose that is asked
         self._refused: tuple[Path, Checked] | None = None
         self._before: set[str] = set()  # incomplete files of the last look
         self._told: set[str] = set()  # of these, those that were named
@@ -79,7 +76,7 @@ class Dialogue:
         return complete
 
     def _ask(self) -> None:
-        self.asked, self._q, self._refused = self.session.next(), None, None
+        self.asked, self._refused = self.session.next(), None
         prompt = [] if self.asked is None else self._prompt(self.asked)
         self._shown = {
             "prompt": prompt,
@@ -110,14 +107,11 @@ class Dialogue:
             image = self.session.undo()
             self.say(f"{image} was taken out." if image else "There is no photograph to take out.")
             self._ask()
-        elif word[0] in "+-.0123456789":
-            self._q = self.session.parsed(asked, word)
-            self.say(f"Pose {asked.pose} gets these readings.")
         else:
-            self.say(f"'{word}' is not understood. Readings in mm or deg, or {WORDS}.")
+            self.say(f"'{word}' is not understood. Words are: {WORDS}.")
 
     def _look(self, asked: Asked, photograph: Path) -> None:
-        checked = self.session.check(asked, photograph, self._q)
+        checked = self.session.check(asked, photograph)
         if checked.problems:
             if checked.exposure is not None:
                 self._refused = (photograph, checked)
@@ -127,7 +121,7 @@ class Dialogue:
         self._take(asked, photograph, checked)
 
     def _take(self, asked: Asked, photograph: Path, checked: Checked) -> None:
-        self.session.accept(asked, photograph, self._q, checked)
+        self.session.accept(asked, photograph, checked=checked)
         legs = "" if checked.legs is None else f", {checked.legs.sum()} of {checked.n_visible} legs"
         blur = "" if checked.exposure is None else f", blur {checked.exposure.blur:.1f} px"
         self.say(f"  {photograph.name} is {asked.view} {asked.pose}{blur}{legs}. {self.known}")

@@ -10,25 +10,20 @@ import numpy as np
 
 from legcal.calibration.identify.ranks import (
     Analysis,
-    expected_intrinsics,
     is_scale_open,
     n_open_with_radii,
     refusal_of_scale,
-    scale_sources,
     undetermined,
     weak_directions,
 )
 from legcal.calibration.identify.remedies import (
     find_remedies,
-    judge_board,
-    recommend,
 )
 from legcal.calibration.identify.report import (
     ConditionBlock,
     Identifiability,
     PaperBlock,
     Ranks,
-    Recommendation,
 )
 from legcal.calibration.identify.session import (
     THIN,
@@ -70,7 +65,7 @@ from legcal.perception.body_edges import bodies_of
 
 MOST_VIEWS = 50
 MOST_IMAGES = 2000  # of a session; more add nothing and take minutes
-_IMAGES = 15
+_VIEWS, _IMAGES = 3, 15  # where none are given
 _ROUGH = 0.1  # mean leg lengths: above, a calibration rejects a direction
 
 
@@ -150,8 +145,8 @@ def identifiability(
     mechanism : Machine
         The nominal model.
     views : sequence of sequences of str
-        Names of the legs visible from each camera position; without any, the smallest
-        sufficient sets of views are recommended and the first one is judged.
+        Names of the legs visible from each camera position; without any, three positions that show
+        all legs are judged. Where cameras should stand is for :func:`legcal.plan` to say.
     images : int
         Images a view, each of another pose.
     board : bool
@@ -186,7 +181,6 @@ def identifiability(
     multiple.
     """
     legs = read_views(views, mechanism.leg_names, images)
-    recommendation = None
     boards = {"board": board, "platform_board": platform_board}
     if hand_held:
         if not board or not legs:
@@ -198,16 +192,14 @@ def identifiability(
             )
         legs, images = tuple(view for view in legs for _ in range(images)), 1
     elif not legs:
-        recommendation = recommend(mechanism, images, noise, **boards)
-        names = recommendation[0].views if recommendation else (mechanism.leg_names,)
-        legs = read_views(names, mechanism.leg_names, images)
+        legs = read_views([mechanism.leg_names] * _VIEWS, mechanism.leg_names, images)
 
     def planned(images: int) -> Session:
         return planned_session(mechanism, legs, images, **boards, hand_held=hand_held)
 
     choices = Choices.by_tolerances(mechanism, only)
     analysis = Analysis(planned(images), choices, noise=noise)
-    return _report_on(mechanism, analysis, recommendation, None if hand_held else planned)
+    return _report_on(mechanism, analysis, None if hand_held else planned)
 
 
 def identifiability_of_dataset(
@@ -222,23 +214,11 @@ def identifiability_of_dataset(
     Raises DidNotConverge if the forward kinematics at the readings fail.
     """
     analysis = replace(_analysis_of(dataset, choices), noise=noise)
-    report = _report_on(dataset.machine, analysis, None, None)
-    report = report.model_copy(update={"intrinsics": expected_intrinsics(analysis)})
+    report = _report_on(dataset.machine, analysis, None)
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
     return report.model_copy(update={"notes": (*report.notes, note)})
-
-
-def ranks_of_dataset(
-    dataset: Dataset, choices: Choices = NO_CHOICES
-) -> tuple[tuple[ConditionBlock, ...], Ranks]:
-    """Return the paper's conditions and the rank of the joint fit for a dataset.
-
-    As :func:`identifiability_of_dataset`, without remedies.
-    """
-    analysis = _analysis_of(dataset, choices)
-    return _named_conditions(dataset.machine, analysis.session), analysis.full
 
 
 def _named_conditions(machine: Machine, session: Session) -> tuple[ConditionBlock, ...]:
@@ -284,16 +264,11 @@ def check_identifiable(
 def _report_on(
     machine: Machine,
     analysis: Analysis,
-    recommendation: tuple[Recommendation, ...] | None,
     replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
     session = analysis.session
     conditions = _named_conditions(machine, session)
-    board = judge_board(
-        analysis,
-        *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
-    )
-    platform_board = judge_board(analysis, (), (), link="platform")
+    on_platform = np.unique(session.view[np.flatnonzero(session.platform_board)])
     full = analysis.full
     notes = []
     if analysis.motion.why_not:
@@ -317,13 +292,12 @@ def _report_on(
         identifiable=full.complete,
         views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
         images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
-        board=board,
-        platform_board=platform_board,
+        board=bool(session.board.all()),
+        platform_board=len(on_platform) == session.n_views,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
         remedies=() if full.complete else find_remedies(analysis, replanned),
-        recommendation=recommendation,
         notes=tuple(notes),
-        scale=scale_sources(analysis) or None,
+        scale_is_open=bool(session.actuators) and is_scale_open(analysis),
         parts=analysis.parts or None,
         paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )

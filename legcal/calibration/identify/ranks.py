@@ -1,4 +1,4 @@
-"""What the joint fit of a session determines: its rank, weak directions, intrinsics, the scale.
+"""What the joint fit of a session determines: its rank, weak directions, the scale.
 
 Encoders of arms measure angles: such a machine at twice the size, with rods twice as thick and
 cameras twice as far, gives the same images and readings. A measured length, a board, or radii fix
@@ -14,10 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from legcal.calibration.identify.report import (
-    CameraIntrinsics,
     Ranks,
     RmsMotion,
-    ScaleSource,
     WeakDirection,
 )
 from legcal.calibration.identify.session import Session
@@ -35,21 +33,16 @@ from legcal.errors import NotIdentifiable
 from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.geometry.types import Array
 from legcal.machine.equations import pose_sensitivity
-from legcal.machine.leg import ARMS, SIGMA_LENGTH, LegColumns, ParameterId
+from legcal.machine.leg import ARMS, LegColumns, ParameterId
 from legcal.machine.parameters import SHOWN, describe_direction, sparse_basis, split_by_motion
 from legcal.vision.board import Link
-from legcal.vision.camera import shared_cameras
 
 _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
 _HARMLESS = 1e-3  # motion of the platform over it, below which it is harmless
-INTRINSICS = ("fx", "fy", "cx", "cy")
-_MAX_SIGMA_OF_INTRINSICS = 0.1  # focal lengths: above, intrinsics are not determined
-_OPEN_INTRINSIC = 0.05  # least component of an intrinsic in an open direction
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
 _KNOWN = 2.5e-9  # mean leg lengths: of a radius that is known
 _VAGUE = RefinementSettings.radius_sigma / 2.0  # of the scale
-_LINKS: tuple[Link, ...] = ("base", "platform")
 
 
 def is_of_arm(name: str) -> bool:
@@ -71,9 +64,9 @@ class Analysis:
         """Analyse other images of the same machine."""
         return Analysis(session, self.choices, self.noise, self.motion)
 
-    def with_board(self, *, board: bool = True, link: Link = "base") -> Analysis:
-        """Analyse the same images with a board on a link in all of them, or in none."""
-        return self.elsewhere(self.session.with_board(board=board, link=link))
+    def with_board(self, link: Link = "base") -> Analysis:
+        """Analyse the same images with a board on a link in all of them."""
+        return self.elsewhere(self.session.with_board(link))
 
     @cached_property
     def contributions(self) -> Contributions:
@@ -242,69 +235,7 @@ def _limit(session: Session, sigma: float = _MAX_SIGMA) -> float:
     return 1.0 / (sigma * session.mean_length)
 
 
-def expected_intrinsics(analysis: Analysis) -> tuple[CameraIntrinsics, ...]:
-    """Return the uncertainty of all intrinsics, estimated jointly with all other unknowns."""
-    session, choices = analysis.session, analysis.choices
-    cameras = {view.name: view.camera for view in session.cameras}
-    owners = tuple(dict.fromkeys(shared_cameras(list(cameras), list(cameras.values()))))
-    names = [f"{owner}.{key}" for owner in owners for key in INTRINSICS]
-    estimated = replace(
-        choices,
-        fixed=choices.fixed.difference(names),
-        free=choices.free.union(names),
-        priors={name: prior for name, prior in choices.priors.items() if name not in names},
-    )
-    found = session.contributions(estimated, analysis.noise).of_shared()
-    of_names = {name.removeprefix("camera "): i for i, name in enumerate(found.names)}
-    columns = [of_names[name if name in of_names else name.rpartition(".")[2]] for name in names]
-    focal = np.repeat([np.sqrt(cameras[o].K[0, 0] * cameras[o].K[1, 1]) for o in owners], 4)
-    rows = np.concatenate([found.all_gains(), found.known])
-    _, singular, basis = np.linalg.svd(marginal_rows(rows, np.array(columns)) * focal)
-    is_determined = singular > 1.0 / _MAX_SIGMA_OF_INTRINSICS
-    spread = np.sqrt(np.sum((basis[is_determined].T / singular[is_determined]) ** 2, axis=1))
-    is_open = np.sqrt(np.sum(basis[~is_determined] ** 2, axis=0)) > _OPEN_INTRINSIC
-    sigmas, opens = (x.reshape(len(owners), -1).tolist() for x in (spread * focal, is_open))
-    return tuple(
-        CameraIntrinsics(
-            owner,
-            not any(open_),
-            {k: None if o else s for k, s, o in zip(INTRINSICS, sigma, open_, strict=True)},
-        )
-        for owner, sigma, open_ in zip(owners, sigmas, opens, strict=True)
-    )
-
-
 # The scale
-
-
-def scale_sources(analysis: Analysis) -> tuple[ScaleSource, ...]:
-    """Return possible sources of scale with their accuracy; empty if the scale is known."""
-    if not analysis.session.actuators or not is_scale_open(analysis):
-        return ()
-    names = analysis.session.parametrization.names
-    measured = analysis.session.columns(LegColumns.LENGTH)[:1]
-    length = SIGMA_LENGTH * analysis.session.mean_length
-    radius = RefinementSettings.radius_sigma
-    row = np.zeros((1, len(names)))
-    row[0, measured] = 1.0 / length
-    with_length = np.concatenate([_information(analysis), row])
-    tried = (
-        ("length", f"{names[measured[0]]} measured to {1e3 * length:.2g} mm", with_length),
-        *(
-            (
-                f"{link}_board",
-                f"a calibration board on the {link} in every view",
-                _information(analysis.with_board(link=link)),
-            )
-            for link in _LINKS
-        ),
-        (
-            "radii",
-            f"radii known to {100 * radius:g} %, all wrong alike",
-            _information(analysis, common=radius),
-        ),
-    )
-    return tuple(_source(analysis, *each) for each in tried)
 
 
 def is_scale_open(analysis: Analysis) -> bool:
@@ -344,13 +275,6 @@ def _all_known(analysis: Analysis) -> dict[str, float]:
     return dict.fromkeys(analysis.session.radii, _KNOWN * analysis.session.mean_length)
 
 
-def _source(analysis: Analysis, name: str, words: str, information: Array) -> ScaleSource:
-    """Accuracy of the scale and the platform with a source; None where lengths stay open."""
-    sigma = _sigma(analysis, information)
-    motion = None if sigma is None else analysis.motion.sigma(information)
-    return ScaleSource(name, words, sigma, motion)
-
-
 def _sigma(analysis: Analysis, information: Array) -> float | None:
     """Relative standard deviation of the scale; None if it is open."""
     session = analysis.session
@@ -369,24 +293,15 @@ def _sigma(analysis: Analysis, information: Array) -> float | None:
 
 def _information(
     analysis: Analysis,
-    sigma_radii: Mapping[str, float] | None = None,
-    *,
-    common: float | None = None,
+    sigma_radii: Mapping[str, float],
 ) -> Array:
-    """Information rows by parameters, for standard deviations [m] of radii, or a *common* error.
+    """Information rows by parameters, for standard deviations [m] of radii.
 
-    That is relative, and the same for all. Lines of arms have stated priors only.
+    Lines of arms have stated priors only.
     """
-    found, radii = analysis.without_radii, analysis.session.radii
+    found = analysis.without_radii
     rows = np.concatenate([found.all_gains(), found.known])
     column = {name.removeprefix("radii "): i for i, name in enumerate(found.names)}
-    if common is not None:
-        seen = [name for name in radii if name in column]
-        by_common = rows[:, [column[name] for name in seen]] @ [radii[name] for name in seen]
-        rows = np.column_stack([np.delete(rows, [column[name] for name in seen], 1), by_common])
-        prior = np.eye(1, rows.shape[1], rows.shape[1] - 1) / common
-        return analysis.of_parameters(np.concatenate([rows, prior]), found.basis)
-    sigma_radii = sigma_radii or {}
     known = [name for name in sigma_radii if name in column]
     prior = np.zeros((len(known), rows.shape[1]))
     for row, name in zip(prior, known, strict=True):
@@ -404,9 +319,6 @@ def _stated_radii(analysis: Analysis) -> dict[str, float]:
 def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
     """Describe why the scale of a session is open, and the remedies."""
     machine = dataset.machine
-    sources = scale_sources(analysis)
-    fixing = [source.assumed for source in sources if source.sigma is not None]
-    options = ", or ".join(fixing or [source.assumed for source in sources])
     reason, fix_gain = "readings of arms are angles", ""
     if machine.readings_carry_length:  # but for gains
         reason, fix_gain = (
@@ -423,5 +335,6 @@ def refusal_of_scale(dataset: Dataset, analysis: Analysis) -> str:
     )
     return (
         f"{dataset.folder}: the parameters cannot be identified: {reason}, so the overall scale is "
-        f"undetermined; any of these would determine it: {options}; {fix_gain}{stated}."
+        f"undetermined; {fix_gain}{stated}, or put a calibration board on base or platform, seen "
+        "in every view."
     )

@@ -1,22 +1,17 @@
-"""Remedies: the smallest sufficient sets of views, calibration boards, and other changes.
+"""Remedies for what a session leaves open: more images, cameras, boards, known parameters.
 
-Views are recommended by the paper's counts and the ranks. A calibration board is judged for every
-session; other remedies are candidates, tested by computing the ranks again.
+Each is a candidate that is tested by computing the ranks again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
-from legcal.calibration.identify.ranks import Analysis, missing, undetermined, weak_directions
+from legcal.calibration.identify.ranks import Analysis, missing, undetermined
 from legcal.calibration.identify.report import (
-    BoardRanks,
-    BoardReport,
-    Recommendation,
     Remedy,
     WeakDirection,
 )
@@ -25,199 +20,14 @@ from legcal.calibration.identify.session import (
     cameras_for,
     legs_around,
     neighbours,
-    planned_session,
 )
-from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, PredictedNoise
-from legcal.geometry.types import Array
-from legcal.machine.leg import JointType
-from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_words, list_in_words
-from legcal.paper.conditions import Condition, count_conditions, three_legs_at_once
-from legcal.vision.board import Link
 
-_MOST_VIEWS = 4
-_MOST_WINDOWS = 12  # tested views of one size, evenly around the base
-_COMPLEMENT = 1e-6  # least component outside the open space
 _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
 _ENOUGH_IMAGES = 15  # a view
 _KNOWN = 4e11  # 1 / mean leg length
-
-
-def recommend(
-    machine: Machine,
-    images: int,
-    noise: PredictedNoise = DEFAULT_NOISE,
-    *,
-    board: bool = False,  # a calibration board on the base relates the cameras
-    platform_board: bool = False,  # a calibration board on the platform shows its poses
-) -> tuple[Recommendation, ...]:
-    """Return the smallest sufficient sets of views, fewest camera positions first.
-
-    For each number of camera positions, the fewest legs per view; of sets of that size, the one
-    with the smallest standard deviation of the platform. More positions are listed only if fewer
-    legs per view suffice; the user knows how many legs one camera can see.
-
-    Empty if no set suffices.
-    """
-    recommendations = list[Recommendation]()
-    candidates = _Candidates(machine, images, noise, board=board, platform_board=platform_board)
-    size_limit = machine.n_legs + 1
-    for n_views in range(1, _MOST_VIEWS + 1):
-        for size in range(1, size_limit):
-            best = candidates.best(n_views, size)
-            if best is not None:
-                recommendations.append(best)
-                size_limit = size
-                break
-    return tuple(recommendations)
-
-
-class _Candidates:
-    """Candidate views of neighbouring legs, with their information."""
-
-    def __init__(
-        self,
-        machine: Machine,
-        images: int,
-        noise: PredictedNoise,
-        *,
-        board: bool,
-        platform_board: bool,
-    ) -> None:
-        self.machine, self.images = machine, images
-        every = [range(machine.n_legs)]
-        self.session = planned_session(
-            machine, every, images, board=board, platform_board=platform_board
-        )
-        self.every = Analysis(self.session, noise=noise)
-        self.motion = self.every.motion
-        self.ring = legs_around(self.session)
-        self.of_size: dict[int, list[Analysis]] = {}
-
-    def best(self, n_views: int, size: int) -> Recommendation | None:
-        """Return the best set of *n_views* views of *size* legs; None if none suffices."""
-        windows = self.windows(size)
-        best: tuple[float, Recommendation] | None = None
-        for which in combinations(range(len(windows)), n_views):
-            views = [windows[k] for k in which]
-            if not self.counts_hold(views):
-                continue
-            chosen = [self.analyses(size)[k] for k in which]
-            information = self.together(chosen)
-            if missing(self.session, information, self.motion):
-                continue
-            sigma = self.motion.sigma(information)
-            worst = float(np.linalg.svd(information, compute_uv=False)[-1])
-            rank = 1.0 / worst if sigma is None else sigma.dX_m
-            if best is None or rank < best[0]:
-                names = tuple(tuple(self.session.leg_names[j] for j in legs) for legs in views)
-                best = (rank, Recommendation(names, size, sigma))
-        return None if best is None else best[1]
-
-    def windows(self, size: int) -> list[tuple[int, ...]]:
-        """Return groups of neighbours around the base, or several views of all legs."""
-        if size >= self.machine.n_legs:
-            return [tuple(range(self.machine.n_legs))] * _MOST_VIEWS
-        views = neighbours(self.ring, size)
-        return views[:: -(-len(views) // _MOST_WINDOWS)]
-
-    def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
-        """Whether the paper's counts hold."""
-        s = self.session
-        counts = count_conditions(
-            views,
-            s.n_legs,
-            spatial=s.spatial,
-            revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint is JointType.REVOLUTE],
-            passive=np.flatnonzero(~s.with_length).tolist(),
-            board=bool(s.board.all()),
-            actuators=s.on_actuators,
-        )
-        at_once = three_legs_at_once(views, s.legs, spatial=s.spatial)
-        return not any(c.fails for c in (*counts, at_once))
-
-    def together(self, chosen: Sequence[Analysis]) -> Array:
-        """Combine the information of views on the parameters.
-
-        Views of a board on the base share its pose; a board on the platform has one pose.
-        """
-        first, *others = (a.contributions for a in chosen)
-        joined = first.with_more(others)
-        rows = np.concatenate([joined.all_gains(), joined.known])
-        return self.every.of_parameters(rows, joined.basis)
-
-    def analyses(self, size: int) -> list[Analysis]:
-        """Analyse every candidate view of *size* legs by itself."""
-        if size not in self.of_size:
-            views = self.windows(size)
-            seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)
-            for row, legs in zip(seen, views, strict=True):
-                row[list(legs)] = True
-            cameras = cameras_for(self.session, views)
-            self.of_size[size] = [
-                self.every.elsewhere(
-                    replace(self.session, seen=seen[[k]], cameras=cameras[k : k + 1])
-                )
-                for k in range(len(views))
-            ]
-        return self.of_size[size]
-
-
-def judge_board(
-    analysis: Analysis,  # of the session
-    # without, with_board: the paper's conditions without a board and with one in every view
-    without: Sequence[Condition],
-    with_board: Sequence[Condition],
-    *,
-    link: Link = "base",
-) -> BoardReport:
-    """Report the effect of a board on a link, whether the session has one or not."""
-    session = analysis.session
-    is_visible = session.board if link == "base" else session.platform_board
-    without_board = analysis.with_board(board=False, link=link) if is_visible.any() else analysis
-    with_boards = (
-        analysis if len(is_visible) and is_visible.all() else analysis.with_board(link=link)
-    )
-    views = (
-        np.flatnonzero(is_visible) if link == "base" else session.view[np.flatnonzero(is_visible)]
-    )
-    is_present = len(np.unique(views)) == session.n_views
-    needed = [
-        before.name
-        for before, after in zip(without, with_board, strict=True)
-        if before.fails and not after.fails
-    ]
-    if with_boards.full.complete and not without_board.full.complete:
-        needed.append("full")
-    return BoardReport(
-        present=is_present,
-        needed_for=tuple(needed),
-        without=_ranks(without_board),
-        with_board=_ranks(with_boards),
-        mends=_determined_by_board(without_board, with_boards),
-    )
-
-
-def _ranks(analysis: Analysis) -> BoardRanks:
-    return BoardRanks(analysis.full.rank, analysis.full.complete)
-
-
-def _determined_by_board(without_board: Analysis, with_boards: Analysis) -> tuple[str, ...]:
-    """Describe directions that move the platform and that only a board determines."""
-    open_before, open_after = (
-        undetermined(a.session, a.information) for a in (without_board, with_boards)
-    )
-    newly_determined = _complement(open_before, open_after)
-    directions = weak_directions(without_board.session, without_board.motion, newly_determined)
-    return tuple(d.direction for d in directions if not d.harmless)
-
-
-def _complement(space: Array, part: Array) -> Array:
-    """Orthonormal basis of the complement of a subspace (k, p) in a space (w, p)."""
-    _, singular, basis = np.linalg.svd(space - space @ part.T @ part, full_matrices=False)
-    return np.asarray(basis[singular > _COMPLEMENT])
 
 
 def find_remedies(
@@ -315,7 +125,7 @@ def _board(analysis: Analysis) -> Iterator[_Candidate]:
         yield text, analysis.with_board(), ()
     if not analysis.session.platform_board.any():
         text = "put a calibration board on the platform, visible to every camera"
-        yield text, analysis.with_board(link="platform"), ()
+        yield text, analysis.with_board("platform"), ()
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
-
-from pydantic import Field
+from typing import Any
 
 from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.files.schema import Document, SparseDocument
 from legcal.paper.conditions import Condition
-
-_TIMES = {2: "two", 3: "three", 4: "four"}
-
-
-def views_in_words(views: Sequence[str]) -> str:
-    """Return views one after the other, equal ones once: ``1,2,3 from two places``."""
-    said = []
-    for view in dict.fromkeys(views):
-        times = list(views).count(view)
-        said.append(view if times == 1 else f"{view} from {_TIMES.get(times, times)} places")
-    return "; ".join(said)
 
 
 @dataclass(frozen=True)
@@ -63,68 +50,12 @@ class RmsMotion:
 
 
 @dataclass(frozen=True)
-class Recommendation:
-    """A set of views that satisfies the paper's conditions and the ranks."""
-
-    # the legs that each camera position shows: neighbours around the base
-    views: tuple[tuple[str, ...], ...]
-    legs_a_view: int
-    # predicted standard deviation of the platform; None where the motors do not determine its pose
-    platform_sigma: RmsMotion | None
-
-
-@dataclass(frozen=True)
-class BoardRanks:
-    """The ranks of all parameters, with a board in every image or with none."""
-
-    full_rank: int
-    # whether the joint fit determines all directions that move the platform
-    identifiable: bool
-
-
-@dataclass(frozen=True)
-class BoardReport:
-    """Effect of a calibration board on a session."""
-
-    present: bool  # whether the session has one, in every view
-    # what fails without a board and holds with it: ``eq12``, ``two_directions``, ``full`` (the
-    # joint fit determines all that moves the platform)
-    needed_for: tuple[str, ...]
-    without: BoardRanks  # without, with_board: the ranks without and with a board in every image
-    with_board: Annotated[BoardRanks, Field(alias="with")]
-    # the directions that only a board determines, in words
-    mends: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class ScaleSource:
-    """A possible source of scale for a machine without readings of lengths."""
-
-    source: str  # ``length``, ``base_board``, ``platform_board`` or ``radii``
-    assumed: str  # what was taken to be known, in words
-    # standard deviation of the scale, as a part of it; None where this does not fix it
-    sigma: float | None
-    platform_sigma: RmsMotion | None  # that of the platform then; None where it is not determined
-
-
-@dataclass(frozen=True)
 class Remedy:
     """Something that would help, with the rank that it gives."""
 
     remedy: str  # what to do
     full_rank: int  # of all parameters; fixed ones count as known
     enough: bool  # whether everything that moves the platform is determined with it
-
-
-@dataclass(frozen=True)
-class CameraIntrinsics:
-    """Expected uncertainty of a camera's intrinsics, estimated jointly from the legs."""
-
-    camera: str  # the view after whose name the intrinsics are called
-    determined: bool  # whether the legs determine all four
-    # standard deviations of ``fx``, ``fy``, ``cx``, ``cy`` to expect [px]; None for those that stay
-    # open
-    sigma: dict[str, float | None]
 
 
 class ConditionBlock(SparseDocument):
@@ -180,8 +111,9 @@ class Identifiability(SparseDocument):
     identifiable: bool
     views: tuple[tuple[str, ...], ...]  # the legs that each view shows
     images: tuple[int, ...]  # number of images of each view
-    board: BoardReport  # effect of a calibration board on the base
-    platform_board: BoardReport  # the same of one on the platform
+    # whether every view shows a calibration board on the base, on the platform
+    board: bool
+    platform_board: bool
     # standard deviation of the platform that is to be expected, rms over the poses. None where
     # something that moves the platform is not determined, or the motors
     # do not determine its pose
@@ -189,13 +121,9 @@ class Identifiability(SparseDocument):
     remedies: tuple[
         Remedy, ...
     ]  # changes that would determine the undetermined directions; each was tried
-    # the smallest sets of views, fewest first; None where views were given
-    recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]
-    # intrinsics that the legs determine, of a dataset with images; empty without them
-    intrinsics: tuple[CameraIntrinsics, ...] = ()
-    # sources of the scale where only radii determine it: readings are angles or missing; else None
-    scale: tuple[ScaleSource, ...] | None = None
+    # whether only radii determine the scale: readings are angles, and no length is stated
+    scale_is_open: bool = False
     paper: PaperBlock
     # what is expected of the parts asked for (--only); left out without
     parts: tuple[PartSigma, ...] | None = None

@@ -319,11 +319,11 @@ class Session:
         """Which legs have a length that is measured or constant, (n_legs,)."""
         return np.array([leg.kind is not LegKind.PASSIVE for leg in self.legs], dtype=np.bool_)
 
-    def with_board(self, *, board: bool = True, link: Link = "base") -> Session:
-        """Return the same with a calibration board on a link in all images, or in none."""
+    def with_board(self, link: Link = "base") -> Session:
+        """Return the same with a calibration board on a link in all images."""
         if link == "platform":
-            return replace(self, platform_board=np.full(len(self.view), board, dtype=np.bool_))
-        return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
+            return replace(self, platform_board=np.ones(len(self.view), dtype=np.bool_))
+        return replace(self, board=np.ones(self.n_views, dtype=np.bool_))
 
     def columns(self, kind: int) -> IntArray:
         """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""

@@ -17,7 +17,7 @@ nominal or refused, rounds of outlier rejection and noise estimation, checks, th
 ``outlier_readings``  wrong readings of redundant motors: detected and rejected
 ``diagnostics``       stated priors and fixed values against the measurements
 ``scale``             the source of the absolute scale: a measured length, or radii alone
-``sensitivity``       effect of errors of fixed quantities; score tests of cameras
+``sensitivity``       score tests of cameras; what wrong ones do to the parameters
 ``held_out``          prediction errors in held-out images, and in images left out in turn
 ``platform``          accuracy at the platform
 ``predicted``         the information and noise of images before they are measured

@@ -1,8 +1,7 @@
 """Prediction errors of a fit: in held-out images, and in images left out block by block.
 
 **Held out**, in pixels: outlines predicted from the calibrated model, the readings and the cameras,
-against the measured ones. At the platform: its pose from the readings, against its pose from
-outlines alone.
+against the measured ones.
 
 **Left out**: images that did not take part, predicted by a fit without them and by the nominal
 model. No fit is repeated: from the normal equations at the minimum the information of a block of
@@ -18,19 +17,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.documents import HoldoutPlatform
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import Postures, State
+from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, information, minimise, normal_equations
 from legcal.estimation.uncertainty import left_out_blocks, leverage, marginal
-from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.kinematics import pose_differences
+from legcal.geometry.types import Array, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,142 +99,6 @@ class Posterior:
 
 
 _READINGS = ("readings",)  # factors
-_ROBUST_STEPS, _MAX_STEPS = 10, 30
-_WIDTH = 3.0  # width of the robust loss, whitened
-_MAX_SIGMA = 0.03  # [rad, mean leg lengths]: largest uncertainty of a usable pose
-_MAX_STEP = 0.1  # [rad, mean leg lengths] in one step
-_MAX_DISTANCE = 0.3  # [rad, mean leg lengths] from the start
-_STEP_TOLERANCE = 1e-4  # squared length of the last step, in standard deviations
-_MIN_INFORMATION = 1.0  # [1/rad^2, 1 / squared leg lengths]
-
-
-@dataclass(frozen=True, eq=False)
-class PosesByOutlines:
-    """Platform poses estimated from outlines alone."""
-
-    T_Rb_Re: tuple[RigidTransform, ...]  # all poses; valid only for ``known``
-    known: IntArray  # (n_known,) indices of poses determined by outlines
-    # (n_known, 6, 6) of the motion between the poses by readings and by outlines: rotation
-    # vector in R_b and displacement of R_e [rad, m]
-    covariance: Array
-
-
-def poses_by_outlines(predicted: Predicted, rejection: float) -> PosesByOutlines:
-    """Fit poses to outlines alone, starting from the poses by readings.
-
-    First with a robust loss, then with equal weights of the inliers, whose whitened distance is
-    below *rejection*. Poses that do not converge are not known.
-    """
-    problem, start = predicted.problem, predicted.state
-    linear = linearize(problem, start)
-    length = start.mean_length
-    state, is_known = start, _are_determined(_outline_information(problem, start, linear), start)
-    converged = np.zeros(len(is_known), dtype=np.bool_)
-    weight = np.ones(len(problem.outlines))
-    for step in range(_ROBUST_STEPS + _MAX_STEPS):
-        s = linear["outlines"].squared_norms
-        if step < _ROBUST_STEPS:
-            weight = 1.0 / (1.0 + s / _WIDTH**2)
-        elif step == _ROBUST_STEPS:
-            weight = np.where(s < rejection**2, 1.0, 0.0)
-        normal = _outline_information(problem, state, linear, weight)
-        change, squared = _step(normal)
-        converged = (squared < _STEP_TOLERANCE) & (step >= _ROBUST_STEPS)
-        moving = is_known & ~converged
-        if not moving.any():
-            break
-        state, is_near = _take_step(
-            predicted, state, np.where(moving[:, None], change, 0.0), length
-        )
-        is_known &= is_near
-        linear = linearize(problem, state)
-    outlines = _outline_information(problem, state, linear, weight)
-    readings = information(problem, state, linear, only=_READINGS)
-    determined = np.flatnonzero(is_known & converged & _are_determined(outlines, state))
-    covariance = _covariance(outlines, readings, predicted.covariance)[determined]
-    return PosesByOutlines(state.platform_pose.motions, determined, covariance)
-
-
-def _outline_information(
-    problem: FitProblem, state: State, linear: Linearization, weight: Array | None = None
-) -> NormalEquations:
-    """Return the normal equations of outlines alone, with weights (n,) of their squares."""
-    if weight is not None:
-        rows = linear["outlines"].whitened(np.sqrt(weight)[:, None, None])
-        linear = replace(linear, rows={**linear.rows, "outlines": rows})
-    return information(problem, state, linear, only=("outlines",))
-
-
-def _step(normal: NormalEquations) -> tuple[Array, Array]:
-    """Gauss-Newton steps (n_poses, d) and their squared lengths in sigmas (n_poses,)."""
-    y = -(normal.V_inverse @ normal.g_elements[..., None])[..., 0]
-    squared = np.einsum("kf,kfh,kh->k", y, normal.V, y)
-    return (_motions(normal) @ y[..., None])[..., 0], np.asarray(squared)
-
-
-def _take_step(
-    predicted: Predicted, state: State, change: Array, length: float
-) -> tuple[State, BoolArray]:
-    """Take bounded steps (n_poses, d); also return which poses are still near the start.
-
-    Poses far from the start, or with a camera inside a leg, are reset to the start.
-    """
-    problem, start = predicted.problem, predicted.state
-    first = start.platform_pose
-    step_size = np.linalg.norm(change / start.posture_scale, axis=1, keepdims=True)
-    change = change * np.minimum(1.0, _MAX_STEP / np.maximum(step_size, 1e-300))
-    moved = state.platform_pose.moved(change)
-    cosine = 0.5 * (np.einsum("kij,kij->k", moved.R, first.R) - 1.0)
-    shift = np.linalg.norm(moved.t - first.t, axis=1)
-    is_near = (cosine > np.cos(_MAX_DISTANCE)) & (shift < _MAX_DISTANCE * length)
-    trial = problem.projected(_with_poses(state, first, is_near, moved))
-    is_visible = np.isfinite(problem.offsets(trial)).all(axis=1)
-    is_near[problem.outlines.pose[~is_visible]] = False
-    return _with_poses(trial, first, is_near, trial.platform_pose), is_near
-
-
-def _with_poses(state: State, first: Postures, chosen: BoolArray, poses: Postures) -> State:
-    """Set the chosen poses, and the others to the first ones."""
-    return replace(state, platform_pose=first.where(chosen, poses))
-
-
-def _are_determined(normal: NormalEquations, state: State) -> BoolArray:
-    """Mask of poses determined well enough to compare, (n_poses,)."""
-    Z, length = _motions(normal), state.mean_length
-    covariance = Z @ normal.V_inverse @ np.swapaxes(Z, 1, 2)
-    scale = state.posture_scale if normal.tangent is None else np.ones(normal.V.shape[1])
-    has_rank = np.linalg.eigvalsh(scale[:, None] * normal.V * scale)[:, 0] > _MIN_INFORMATION
-    turn, shift = (
-        np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2))
-        for part in (slice(0, 3), slice(3, 6))
-    )
-    return np.asarray(has_rank & (shift < _MAX_SIGMA * length) & (turn < _MAX_SIGMA))
-
-
-def _covariance(
-    outlines: NormalEquations, readings: NormalEquations, fit_covariance: Array
-) -> Array:
-    """Covariance (n_poses, 6, 6) of motions between poses by readings and by outlines.
-
-    Both have independent noise and share the errors of the fit.
-    """
-    difference = outlines.elements_by_kept - readings.elements_by_kept
-    tangent_covariance = (
-        outlines.V_inverse
-        + readings.V_inverse
-        + difference @ fit_covariance @ np.swapaxes(difference, 1, 2)
-    )
-    Z = _motions(outlines)[:, :6]
-    return np.asarray(Z @ tangent_covariance @ np.swapaxes(Z, 1, 2))
-
-
-def _motions(normal: NormalEquations) -> Array:
-    """Tangent basis of postures, (n_poses, d, f)."""
-    if normal.tangent is None:
-        return np.broadcast_to(np.eye(6), (len(normal.V), 6, 6))
-    return normal.tangent.Z
-
-
 _MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))  # median norm of two unit Gaussians
 _RANK_TOLERANCE = 1e-18  # relative to the largest eigenvalue of a pose's information
 
@@ -257,28 +118,6 @@ class HeldOut:
     rms_px: float | None  # of the offsets [px]; None without outlines
     expected_px: float | None
     views: dict[str, float]  # rms by name of the view [px]
-    displacement: Array  # (n_known,) between poses by readings and by outlines [m]
-    rotation: Array  # (n_known,) [rad]
-    expected_displacement: Array
-    expected_rotation: Array
-
-    @property
-    def platform(self) -> HoldoutPlatform | None:
-        """Measured and expected errors at the platform; None without poses.
-
-        Poses are weighted by their expected errors.
-        """
-        if len(self.displacement) == 0:
-            return None
-        dX, expected_dX = _weighted_rms(self.displacement, self.expected_displacement)
-        dE, expected_dE = _weighted_rms(self.rotation, self.expected_rotation)
-        return HoldoutPlatform(
-            poses=len(self.displacement),
-            dX_m=dX,
-            expected_dX_m=expected_dX,
-            dE_rad=dE,
-            expected_dE_rad=expected_dE,
-        )
 
 
 def compare_held_out(
@@ -316,12 +155,6 @@ def compare_held_out(
     limit = problem.settings.rejection * _median_distance(norm)
     inliers = norm < limit
     pixels = np.einsum("nij,njk,nik->ni", L, expected, L)
-    by_outlines = poses_by_outlines(predicted, limit)
-    poses = by_outlines.known.tolist()
-    displacement, rotation = pose_differences(
-        [by_outlines.T_Rb_Re[k] for k in poses], [T_Rb_Re[k] for k in poses]
-    )
-    variance = np.einsum("kii->ki", by_outlines.covariance)
     return HeldOut(
         images=measurements.n_rows,
         poses=measurements.n_poses,
@@ -330,10 +163,6 @@ def compare_held_out(
         rms_px=_rms(offsets[inliers]),
         expected_px=_rms(np.sqrt(pixels[inliers])),
         views=_rms_by_view(measurements, problem.outlines.view[inliers], offsets[inliers]),
-        displacement=displacement,
-        rotation=rotation,
-        expected_displacement=np.sqrt(variance[:, 3:].sum(axis=1)),
-        expected_rotation=np.sqrt(variance[:, :3].sum(axis=1)),
     )
 
 
@@ -380,15 +209,6 @@ def _rms_by_view(measurements: Measurements, view: IntArray, offsets: Array) -> 
 def _rms(offsets: Array) -> float | None:
     """Root mean square of offsets; None without any."""
     return float(np.sqrt(np.mean(offsets**2))) if len(offsets) else None
-
-
-def _weighted_rms(measured: Array, expected: Array) -> tuple[float, float]:
-    """Root mean squares of both, weighted by the expected variances."""
-    weight = expected**-2
-    total = float(np.sum(weight))
-    return float(np.sqrt(np.sum(weight * measured**2) / total)), float(
-        np.sqrt(len(measured) / total)
-    )
 
 
 _N_BLOCKS = 5

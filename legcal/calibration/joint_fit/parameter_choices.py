@@ -23,7 +23,7 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.machine.tolerance import NOT_STATED, Tolerance
+from legcal.machine.tolerance import Tolerance
 from legcal.vision.board import LINKS, FixedBoard, Link, board_name
 from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
 
@@ -78,7 +78,7 @@ class Choices:
         """
         if only is None:
             return NO_CHOICES
-        if machine.tolerance == NOT_STATED:
+        if not machine.tolerance.says_parts:
             raise UsageError(
                 "--only could not be used: found no tolerance, needed how well the machine is "
                 "built; state machine_kind: printed, machined or bought, or tolerance, in "

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -145,8 +145,18 @@ def part_errors(
 
     *turned* [m or rad] are motors whose zero is known to be elsewhere, by their labels.
     """
+    names, kinds, stated, J, centre = _part_derivatives(legs, tuple((turned or {}).items()))
+    sigmas = [getattr(tolerance, of) or 0.0 if isinstance(of, str) else of for of in stated]
+    return PartErrors(names, kinds, np.array(sigmas, dtype=np.float64), J, centre)
+
+
+@lru_cache(maxsize=4)  # the same for all tolerances and all fits of a machine
+def _part_derivatives(
+    legs: FittedLegs, turned: tuple[tuple[str, float], ...]
+) -> tuple[tuple[str, ...], tuple[Kind, ...], tuple[str | float, ...], Array, Array]:
+    """Return names, kinds, sigmas or the tolerances that state them, J (p, m) and x_0 (p,)."""
     columns, nominal, first = LegColumns, legs.nominal, reading_legs(legs.nominal)
-    base = with_zeros(nominal, turned or {})
+    base = with_zeros(nominal, dict(turned))
     place = np.arange(legs.n_legs * columns.COUNT, dtype=np.intp).reshape(legs.n_legs, -1)
     place[:, columns.ACTUATOR] = place[list(first)][:, columns.ACTUATOR]  # rods share their motor
     rods = [leg.q0 for leg in nominal if leg.actuator is not None]
@@ -156,19 +166,20 @@ def part_errors(
         framed = in_joint_frames(moved, legs.frame_legs)
         return vector_of(legs.parametrization, framed, nominal)
 
-    errors = list[tuple[str, Kind, float, list[tuple[Leg, ...]], float]]()
+    errors = list[tuple[str, Kind, str | float, list[tuple[Leg, ...]], float]]()
     for j, leg in enumerate(nominal):
         own = first[j] == j and leg.actuator is not None
         arm = own and leg.actuator is not None and leg.actuator.arm is not None
         kind: Kind
-        for part, kind, sigma, exists in (
-            (columns.A, "joints", tolerance.joints, True),
-            (columns.B, "joints", tolerance.joints, True),
-            (columns.LENGTH, "lengths", tolerance.lengths, leg.kind is LegKind.CONSTANT),
-            (columns.BASE_AXIS, "axes", tolerance.axes, leg.base_axis is not None),
-            (columns.PLATFORM_AXIS, "axes", tolerance.axes, leg.platform_axis is not None),
-            (ActuatorColumns.AXIS, "axes", tolerance.axes, own),
-            (ActuatorColumns.POINT, "joints", tolerance.joints, own and leg.reads_angle),
+        stated: str | float
+        for part, kind, stated, exists in (
+            (columns.A, "joints", "joints", True),
+            (columns.B, "joints", "joints", True),
+            (columns.LENGTH, "lengths", "lengths", leg.kind is LegKind.CONSTANT),
+            (columns.BASE_AXIS, "axes", "axes", leg.base_axis is not None),
+            (columns.PLATFORM_AXIS, "axes", "axes", leg.platform_axis is not None),
+            (ActuatorColumns.AXIS, "axes", "axes", own),
+            (ActuatorColumns.POINT, "joints", "joints", own and leg.reads_angle),
             (ActuatorColumns.ARM_AXIS, "arms", ARM_AXIS_SIGMA, arm),
             (ActuatorColumns.ARM_POINT, "arms", ARM_POINT_SIGMA * float(np.mean(rods or 0)), arm),
         ):
@@ -176,15 +187,15 @@ def part_errors(
                 step = np.zeros(place.size)
                 step[at] = h = _STEP * (size if kind in ("joints", "lengths") else 1.0)
                 moved = [moved_legs(base, place, side * step) for side in (1.0, -1.0)]
-                errors.append((leg.name, kind, float(sigma or 0.0), moved, h))
+                errors.append((leg.name, kind, stated, moved, h))
         if leg.is_motor and first[j] == j:
-            sigma = tolerance.angles_at_zero if leg.reads_angle else tolerance.zeros
+            stated = "angles_at_zero" if leg.reads_angle else "zeros"
             h = leg.reading_of(_STEP * size)
             moved = [with_zeros(base, {leg.motor_label: side * h}) for side in (1.0, -1.0)]
-            errors.append((leg.motor_label, "zeros", float(sigma or 0.0), moved, h))
+            errors.append((leg.motor_label, "zeros", stated, moved, h))
     J = [(vector(plus) - vector(minus)) / (2.0 * h) for *_, (plus, minus), h in errors]
     names, kinds, sigmas = zip(*(one[:3] for one in errors), strict=True)
-    return PartErrors(names, kinds, np.array(sigmas), np.array(J).T, vector(base))
+    return names, kinds, sigmas, np.array(J).T, vector(base)
 
 
 def with_zeros(legs: Sequence[Leg], zeros: Mapping[str, float]) -> tuple[Leg, ...]:

@@ -106,7 +106,7 @@ _REACHED_BY_ALL = 0.03  # with redundant motors, whose readings may disagree
 class Effect:
     """Effect of an error of a fixed quantity on the platform."""
 
-    what: str  # the error: ``a focal length 1 % longer``
+    what: str  # the error, in words
     # Motion of the platform over the workspace; at the readings of the dataset if that is unknown
     error: PlatformError
 

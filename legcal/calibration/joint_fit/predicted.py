@@ -149,24 +149,6 @@ class Contributions:
             tuple(self.names[i] for i in shared), rows, self.known[~with_own][:, shared]
         )
 
-    def with_more(self, others: Sequence[Contributions]) -> Contributions:
-        """Add images of other cameras at the same machine; all without unknowns of single views."""
-        names = {name: i for i, name in enumerate(self.names)}
-        rows, known = [self.all_gains()], [self.known]
-        for other in others:
-            n_before = len(names)
-            columns = np.array([names.setdefault(name, len(names)) for name in other.names])
-            is_new = other.known[:, columns >= n_before].any(axis=1)
-            for table, more in ((rows, other.all_gains()), (known, other.known[is_new])):
-                wide = np.zeros((len(more), len(names)))
-                wide[:, columns] = more
-                table.append(wide)
-        stacked = (
-            np.concatenate([np.pad(x, ((0, 0), (0, len(names) - x.shape[1]))) for x in table])
-            for table in (rows, known)
-        )
-        return self._stacked(tuple(names), *stacked)
-
     def _stacked(self, names: tuple[str, ...], rows: Array, known: Array) -> Contributions:
         """Return rows (m, n) as those of one image."""
         nothing = np.zeros((1, len(rows)))

@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_o
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
 from legcal.calibration.joint_fit.variables import State
-from legcal.calibration.tuning import SCALE_BY_CHANCE, TRAVEL_SIGMA
+from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
@@ -94,7 +94,7 @@ def sensitivity_to_scale(
         columns = {"readings": _whitened_travel(problem, travel)[..., None]}
         normal = normal_equations(problem, state, linear)
         (score,), ((information,),) = score_test(problem, linear, normal, columns)
-        variance = 1.0 / (TRAVEL_SIGMA**-2 + information)
+        variance = 1.0 / (problem.legs.sigma_travel**-2 + information)
         off = float(np.hypot(score * variance, np.sqrt(variance)))
         moved = kinematic_steps(problem, response(problem, linear, normal, columns))
         return (Sensitivity(ALL_READINGS, off * moved),)

@@ -1,4 +1,4 @@
-"""Sensitivity to errors of fixed quantities, and score tests of cameras.
+"""Score tests of cameras, and what an error in what counts as known does to the parameters.
 
 Encoders carry the absolute scale, and no other parameter of the fit imitates the perspective of a
 wrong focal length completely. The cost then has a gradient by the focal length at the minimum:
@@ -16,26 +16,16 @@ import numpy as np
 
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import LegConstraints, State, intrinsic_of
+from legcal.calibration.joint_fit.variables import State, intrinsic_of
 from legcal.estimation.problem import Linearization
 from legcal.estimation.solver import NormalEquations, normal_equations
-from legcal.estimation.uncertainty import Scores, residual_changes, response
+from legcal.estimation.uncertainty import Scores, response
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import LegColumns
-from legcal.machine.parameters import is_held_by_default
 from legcal.vision.camera import shared_cameras
 
 FITTED_CAMERA = (
     "the camera corrections that the measurements suggest"  # where they contradict their files
 )
-_FOCAL_PART = 0.01  # relative error of the focal length
-_RADIUS_PART = 0.01
-_TWIST_ERROR = np.radians(0.1)
-_CAMERA_ERRORS: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]] = {  # relative, px
-    "a focal length 1 % longer": ({"fx": _FOCAL_PART, "fy": _FOCAL_PART}, {}),
-    "a principal point 0.1 px further to the right": ({}, {"cx": 0.1}),
-    "a principal point 0.1 px further down": ({}, {"cy": 0.1}),
-}
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
@@ -49,73 +39,28 @@ class Sensitivity:
     steps: Array  # (p, c) steps of all parameters [m, rad], for c independent errors
 
 
-def sensitivities(
-    cameras: CameraResiduals, normal: NormalEquations, contradicted: Sequence[WrongIntrinsic] = ()
+def sensitivity_to_cameras(
+    cameras: CameraResiduals, normal: NormalEquations, contradicted: Sequence[WrongIntrinsic]
 ) -> tuple[Sensitivity, ...]:
-    """Return the sensitivity of the parameters to errors of cameras, radii and fixed twists.
+    """Return how the corrections of contradicted intrinsics change the parameters, if any are.
 
-    For parameters with a prior, the error is of the prior mean; free ones are left out. So are
-    errors that change no outline, as in a fit to measured axes.
-
-    Parameters
-    ----------
-    cameras : CameraResiduals
-        At the minimum of the fit.
-    normal : NormalEquations
-        The information there.
-    contradicted : sequence of WrongIntrinsic
-        Contradicted intrinsics of camera files: their corrections are one more error.
+    *cameras* are at the minimum of the fit, *normal* is the information there. Of intrinsics with
+    a prior, the correction is that of its mean.
     """
-    problem, state, linear = cameras.problem, cameras.state, cameras.linear
-    radii = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
-    camera_columns = _camera_columns(problem)
-    errors = {
-        what: (camera_columns, _camera_error(state, relative, added))
-        for what, (relative, added) in _CAMERA_ERRORS.items()
+    if not contradicted:
+        return ()
+    problem, linear, place = cameras.problem, cameras.linear, _camera_columns(cameras.problem)
+    error = np.sum([one.error for one in contradicted], axis=0)
+    of_priors = np.zeros(problem.n_kept + 1)
+    of_priors[place] = error
+    pull = problem.priors.whitened(of_priors[problem.priors.unknown])
+    changes = {
+        name: _efficiency(problem, name) * change[..., None]
+        for name, change in cameras.changes(np.where(place == problem.n_kept, error, 0.0)).items()
     }
-    if contradicted:
-        errors[FITTED_CAMERA] = camera_columns, np.sum([one.error for one in contradicted], axis=0)
-    errors["radii 1 % larger"] = problem.columns["radii"], _RADIUS_PART * radii[:, None]
-    names, changes, pulls = list[str](), list[dict[str, Array]](), list[Array]()
-    for what, (place, error) in errors.items():
-        prior_error = np.zeros(problem.n_kept + 1)
-        prior_error[place] = error
-        pull = prior_error[problem.priors.unknown]
-        fixed = np.where(place == problem.n_kept, error, 0.0)
-        if place is camera_columns:
-            change = cameras.changes(fixed)
-        else:
-            change = residual_changes(problem, linear, "radii", fixed)
-        if change["outlines"].any() or pull.any():
-            names.append(what)
-            changes.append(change)
-            pulls.append(problem.priors.whitened(pull))
-    result: list[Sensitivity] = []
-    if names:
-        residual_changes_of = {
-            factor.name: _efficiency(problem, factor.name)
-            * np.stack([change[factor.name] for change in changes], axis=-1)
-            for factor in problem.factors
-            if factor.name in changes[0]
-        }
-        steps = response(problem, linear, normal, residual_changes_of)
-        steps += normal.kept_covariance() @ linear.prior_J.T @ np.column_stack(pulls)
-        result = [
-            Sensitivity(what, kinematic_steps(problem, steps[:, [i]]))
-            for i, what in enumerate(names)
-        ]
-    parametrization, choices = problem.legs.parametrization, problem.choices
-    twists: dict[str, list[Array]] = {}
-    for j, x in enumerate(parametrization.place[:, LegColumns.TWIST].tolist()):
-        if x >= 0 and not problem.free[x]:
-            name = parametrization.names[x]
-            is_fixed = choices.holds(name, by_default=is_held_by_default(name))
-            step = _twist_steps(problem, state, linear, normal, j)
-            twists.setdefault("fixed" if is_fixed else "tied", []).append(step)
-    for how, steps_of_twists in twists.items():
-        what = f"an error of 0.1 deg in each {how} twist"
-        result.append(Sensitivity(what, np.column_stack(steps_of_twists)))
-    return tuple(result)
+    steps = response(problem, linear, normal, changes)
+    steps += normal.kept_covariance() @ linear.prior_J.T @ pull[:, None]
+    return (Sensitivity(FITTED_CAMERA, kinematic_steps(problem, steps)),)
 
 
 def _camera_columns(problem: FitProblem) -> IntArray:
@@ -149,29 +94,6 @@ def kinematic_steps(problem: FitProblem, steps: Array) -> Array:
     kinematic = np.zeros((len(problem.free), steps.shape[1]))
     kinematic[problem.free] = steps[: problem.n_kinematic]
     return kinematic
-
-
-def _twist_steps(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    normal: NormalEquations,
-    leg: int,
-) -> Array:
-    """Return the steps (p,) of kinematic parameters by an error of a fixed twist."""
-    motion = _TWIST_ERROR * LegConstraints(problem.parameters).following(
-        state, leg, LegColumns.TWIST
-    )
-    changes = {
-        factor.name: _efficiency(problem, factor.name)
-        * linear[factor.name].J_element
-        @ motion[factor.element][..., None]
-        for factor in problem.factors
-        if factor.element is not None  # corners on the base do not depend on poses
-    }
-    steps = kinematic_steps(problem, response(problem, linear, normal, changes))[:, 0]
-    steps[problem.legs.parametrization.place[leg, LegColumns.TWIST]] = _TWIST_ERROR
-    return steps
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
     Sensitivity,
     WrongIntrinsic,
-    sensitivities,
+    sensitivity_to_cameras,
 )
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
@@ -185,7 +185,6 @@ class GoodnessOfFit:
     chi2: float  # of used outlines, axes, readings and priors
     dof: int
     rms_px: float | None  # of the offsets of used outlines [px]
-    rms_axes: float | None  # of measured axes, over their claimed standard deviations
     rms_corners_px: Mapping[Link, float]  # of corners of the calibration board on each link [px]
     noise: NoiseModel  # errors of single outlines
     shared_px: Mapping[str, float]  # sigmas of common-mode biases by kind [px]; empty without any
@@ -274,7 +273,7 @@ def assemble_solution(
         },
         gammas=gammas,
         sensitivities=(
-            *sensitivities(cameras, normal, contradicted),
+            *sensitivity_to_cameras(cameras, normal, contradicted),
             *sensitivity_to_scale(problem, state, linear, kept),
         ),
         outlines=_with_rejections(outlines, fit),
@@ -292,7 +291,6 @@ def assemble_solution(
             *map(str, gammas),
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
             *contradicted_radii(problem, state, normal),
-            *(_misfit_of_axes(quality) if len(problem.axes) else ()),
             *map(str, contradicted),
         ),
     )
@@ -312,7 +310,6 @@ def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> Goodness
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
         dof=n_residuals - problem.n_unknowns + n_held,
         rms_px=_rms(used),
-        rms_axes=_rms(linear["axes"].r),
         rms_corners_px={
             corners.link: rms
             for corners in problem.boards
@@ -421,19 +418,6 @@ def _kinematic(
 def _rms(values: Array) -> float | None:
     """Root mean square of values; None without any."""
     return float(np.sqrt(np.mean(values**2))) if values.size else None
-
-
-def _misfit_of_axes(quality: GoodnessOfFit) -> tuple[str, ...]:
-    """Note on axes with errors above their claimed standard deviations."""
-    chi2, dof = quality.chi2, quality.dof
-    if chi2 <= dof + _SIGNIFICANT * np.sqrt(2.0 * dof):
-        return ()
-    return (
-        f"The errors of axes are larger than their standard deviations: chi2 is {chi2:.0f} for "
-        f"{dof} degrees of freedom, so that the uncertainty of the result is about "
-        f"{np.sqrt(chi2 / max(dof, 1)):.1f} times the stated one; correct the standard "
-        "deviations.",
-    )
 
 
 def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +45,7 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import actuator_index, actuators_of, first_rods
 from legcal.machine.ties import Ties, independent, ties_of
+from legcal.machine.tolerance import PART_OF_TRAVEL
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
 _RANK = 1e-7  # of the largest singular value
@@ -223,6 +224,8 @@ class FittedLegs:
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
     is_redundant: bool = False  # whether readings can contradict each other
+    # of the travel of all motors that slide alike, as a part of it
+    sigma_travel: float = PART_OF_TRAVEL
 
     @property
     def n_legs(self) -> int:
@@ -266,6 +269,7 @@ class FittedLegs:
         return vector_of(self.parametrization, legs, self.nominal)
 
 
+@lru_cache(maxsize=1)  # one machine is fitted several times, and what follows from its legs kept
 def fitted_legs(machine: Machine) -> FittedLegs:
     """Return the legs of a mechanism as inputs of the joint fit."""
     return FittedLegs(
@@ -279,6 +283,7 @@ def fitted_legs(machine: Machine) -> FittedLegs:
         },
         machine.home_of_frames,
         machine.is_redundant,
+        machine.tolerance.travel or PART_OF_TRAVEL,
     )
 
 

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from legcal.calibration.location.document import (
     LocatedFrame,
     OpenPart,
     PoseComponent,
     direction_of,
-    direction_words,
     open_parts_in_words,
 )
 from legcal.calibration.location.fit import (
@@ -32,7 +30,6 @@ _MAX_SIGMA = 0.1  # largest sigma of a determined direction [rad, machine length
 # smallest singular value, relative to the largest, of a direction that the workspace determines
 _MACHINE_TOLERANCE = 2e-3
 _PART_TOLERANCE = 0.03  # smallest component of a unit direction that messages name
-_AXIS_TOLERANCE = 0.02  # smallest spread, relative to the largest, of an independent direction
 _RESOLVED = 1e-3  # smallest motion of the tool along a unit direction that holding it fixes
 _N_POSES, _SEED = 30, 1  # random poses of the workspace
 _BLOCKS: tuple[tuple[slice, LocatedFrame, PoseComponent], ...] = (
@@ -72,12 +69,11 @@ def determine(
     parts: list[OpenPart] = []
     words = ""
     if basis.shape[1]:
-        workspace = _workspace(measurements)
-        _check_machine(measurements, fit, basis, workspace, name)
+        _check_machine(measurements, fit, basis, name)
         fit = hold_open_part(measurements, fit, tool_position)
         basis = _open_at(measurements, fit, basis.shape[1], fit.frames)
         parts = _open_parts(basis, fit.frames)
-        words = _held_words(parts, workspace, tool_position)
+        words = _held_words(parts, tool_position)
     scale = pairs.scale
     unit = _covariance_with(fit.information, basis, oriented=oriented)
     covariance = unit * np.outer(scale, scale)
@@ -145,58 +141,6 @@ def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
     return parts
 
 
-@dataclass(frozen=True, eq=False)
-class _PoseSpread:
-    """Independent rotations and displacements of a set of platform poses."""
-
-    axes: Array  # (r, 3): independent rotation axes in the base link, by decreasing rotation
-    n_shifts: int  # number of independent directions of displacement
-
-    @property
-    def words(self) -> str:
-        """Description of the differences, to follow "poses that"."""
-        turns = (
-            "do not turn",
-            f"all turn about one axis, {direction_words(self.axes[0])} of the base"
-            if len(self.axes)
-            else "",
-            "turn about two axes",
-            "turn about all axes",
-        )[len(self.axes)]
-        shifts = ("stay in place", "move along a line", "move in a plane", "move in space")
-        return f"{turns} and {shifts[self.n_shifts]}"
-
-
-def _pose_spread(R: Array, t: Array, length: float) -> _PoseSpread:
-    """Return the spread of poses R (n, 3, 3), t (n, 3) [m] of a machine of a given length [m]."""
-    turns = (Rotation.from_matrix(R) * Rotation.from_matrix(R).mean().inv()).as_rotvec()
-    _, s, Vt = np.linalg.svd(turns, full_matrices=False)
-    size = np.sqrt(len(t))
-    axes = Vt[(s > _AXIS_TOLERANCE * s[0]) & (s / size > 1e-6)]
-    moves = np.linalg.svd(t - t.mean(axis=0), compute_uv=False)
-    n_shifts = int(np.sum((moves > _AXIS_TOLERANCE * moves[0]) & (moves / size > 1e-6 * length)))
-    return _PoseSpread(axes, n_shifts)
-
-
-def _needed_words(measured: _PoseSpread, workspace: _PoseSpread, scatter: str) -> str:
-    """Return the end of a message: the missing rotations or displacements, and the remedy."""
-    if len(measured.axes) < min(2, len(workspace.axes)):
-        several = "two axes" if len(workspace.axes) > 1 else "an axis"
-        more = (
-            "tilted about another axis too" if len(measured.axes) else "turned against each other"
-        )
-        return f", needed rotations about {several}; add poses that are {more}"
-    if measured.n_shifts < workspace.n_shifts:
-        return (
-            f", needed displacements in {workspace.n_shifts} directions; add poses that are "
-            "displaced in another direction too"
-        )
-    return (
-        f", with a scatter of {scatter}, needed more or better ones, further apart; add some from "
-        "all over the workspace"
-    )
-
-
 def _open_at(measurements: ToolMeasurements, fit: FrameFit, k: int, frames: Array) -> Array:
     """Return the k least determined directions (12, k) at given frames."""
     n = 12 if measurements.is_oriented else 9
@@ -221,51 +165,33 @@ def _workspace(measurements: ToolMeasurements) -> PosePairs:
     )
 
 
-def _check_machine(
-    measurements: ToolMeasurements, fit: FrameFit, basis: Array, workspace: PosePairs, name: str
-) -> None:
+def _check_machine(measurements: ToolMeasurements, fit: FrameFit, basis: Array, name: str) -> None:
     """Refuse directions that other poses would determine or that holding the tool does not fix."""
     pairs = measurements.pairs
-    design = jacobian(fit.frames, workspace) * pairs.unit[:, None] * pairs.scale
+    design = jacobian(fit.frames, _workspace(measurements)) * pairs.unit[:, None] * pairs.scale
     resolvable = _shown_elsewhere(
         basis, design.reshape(-1, N_STEP), oriented=measurements.is_oriented
     )
-    measured_spread = _pose_spread(pairs.R, pairs.t, pairs.length)
-    workspace_spread = _pose_spread(workspace.R, workspace.t, pairs.length)
     start = f"{name}: base and tool could not be located, because"
     if resolvable.shape[1]:
         raise NotIdentifiable(
             f"{start} {open_parts_in_words(_open_parts(resolvable, fit.frames))} cannot be told "
-            f"from the poses: found {len(pairs)} poses that {measured_spread.words}"
-            f"{_needed_words(measured_spread, workspace_spread, _scatter(measurements, fit))}."
+            f"from these {len(pairs)} poses; add some that turn about another axis, that are "
+            "displaced in another direction or further apart, from all over the workspace, or "
+            "measure them better."
         )
     if not _is_resolved_by_the_tool(basis):
         raise NotIdentifiable(
             f"{start} no pose of this machine tells "
-            f"{open_parts_in_words(_open_parts(basis, fit.frames))}: "
-            f"found a platform whose poses {workspace_spread.words}, needed a part that holding "
-            "the tool in the platform closes; measure orientations too, or the base itself."
+            f"{open_parts_in_words(_open_parts(basis, fit.frames))}, even with the tool held in "
+            "the platform; measure orientations too, or the base itself."
         )
 
 
-def _scatter(measurements: ToolMeasurements, fit: FrameFit) -> str:
-    sigma = fit.noise.rms
-    turn = f" and {np.degrees(sigma[1]):.2g} deg" if measurements.is_oriented else ""
-    return f"{1e3 * sigma[0]:.2g} mm{turn}"
-
-
-def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Array) -> str:
-    """Return a sentence that names the held parts and the reason."""
+def _held_words(parts: list[OpenPart], tool_position: Array) -> str:
+    """Return a sentence that names the held parts."""
     tool = [part for part in parts if part.frame == "tool"]
     base = [part for part in parts if part.frame == "base"]
-    machine = _pose_spread(workspace.R, workspace.t, workspace.length)
-    if len(machine.axes) == 0:
-        reason = "the platform of this machine does not turn"
-    elif len(machine.axes) == 1:
-        axis = direction_words(machine.axes[0])
-        reason = f"the platform of this machine turns about one axis only, {axis} of the base"
-    else:
-        reason = f"the platform of this machine takes poses that {machine.words}"
     position = ", ".join(f"{x:g}" for x in tool_position)
     with_it = f" from {open_parts_in_words(base)}" if base else ""
     assumptions = [
@@ -275,7 +201,7 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
         for part in tool
     ]
     return (
-        f"No pose tells {open_parts_in_words(tool)} apart{with_it}, because {reason}: "
+        f"No pose of this machine tells {open_parts_in_words(tool)} apart{with_it}: "
         f"{' and '.join(assumptions)} there, "
         "and the base follows; where the tool is in the world does not depend on it."
     )

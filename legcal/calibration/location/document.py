@@ -17,11 +17,11 @@ from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.errors import DatasetError, ModelError, UsageError
+from legcal.errors import ModelError, UsageError
 from legcal.files.folder import OutputFile
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.published import with_schema
-from legcal.files.schema import FileSchema, Number, Version, read_yaml, validate
+from legcal.files.schema import FileSchema, Number, Version
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
@@ -74,7 +74,6 @@ class MeasurementNoise(FileSchema):
     # estimated from the residuals
     position_stated: bool
     angle_stated: bool
-    reading: _Size  # stated standard deviation of a reading [m or rad]; zero if none was stated
     model: bool  # whether the covariance of a calibrated model is included
 
 
@@ -309,67 +308,6 @@ def write_location(location: Location, file: str | Path) -> None:
         width=120,
     )
     LOCATION_FILE.write(Path(file), with_schema("location", text))
-
-
-def load_location(file: str | Path) -> Location:
-    """Return the location in a file that ``legcal locate`` wrote.
-
-    Parameters
-    ----------
-    file : str or Path
-        The YAML.
-
-    Raises
-    ------
-    DatasetError
-        If it is missing or damaged.
-    """
-    path = Path(file)
-    content = read_yaml(path, _WHAT)
-    if _KEY not in content:
-        raise DatasetError(
-            f"{path}: the {_WHAT} could not be read: found no key '{_KEY}', needed a file that "
-            "legcal locate wrote; give that file."
-        )
-    document = validate(LocationFile, content, path)
-    determined, residuals = document.determined, document.residuals
-    return Location(
-        model=document.model,
-        poses=document.poses,
-        T_world_base=document.T_world_base.motion(),
-        T_platform_tool=document.T_platform_tool.motion(),
-        has_tool_orientation=determined.tool_orientation,
-        covariance=_matrix(path, document.covariance),
-        held=tuple(determined.held),
-        held_at=determined.tool_position,
-        held_words=determined.words,
-        noise=document.noise,
-        rows=tuple(residuals.rows),
-        chi2=residuals.chi2,
-        dof=residuals.dof,
-        p_value=residuals.p_value,
-        tool_position_sigma=document.tool_in_world_sigma.position,
-        tool_angle_sigma=document.tool_in_world_sigma.angle,
-        status=document.status,
-        sentence=document.verdict,
-        notes=tuple(document.notes),
-    )
-
-
-def _matrix(path: Path, entry: _Covariance) -> Array:
-    """Return the covariance; refuse a matrix that is not symmetric and positive semidefinite."""
-    n = len(NAMES)
-    is_square = len(entry.matrix) == n and all(len(row) == n for row in entry.matrix)
-    if tuple(entry.names) == NAMES and is_square:
-        matrix = np.array(entry.matrix)
-        largest = float(np.abs(matrix).max())
-        symmetric = np.abs(matrix - matrix.T).max() <= _SYMMETRY_TOLERANCE * largest
-        if symmetric and float(np.linalg.eigvalsh(matrix)[0]) >= -_NEGATIVE_TOLERANCE * largest:
-            return matrix
-    raise DatasetError(
-        f"{path}: covariance could not be read: found another matrix, needed a covariance of the "
-        f"{n} components {NAMES[0]} to {NAMES[-1]}; give the file that legcal locate wrote."
-    )
 
 
 # World and tool in the URDF

@@ -43,7 +43,6 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 
 RANK_TOLERANCE = 1e-9  # smallest singular value of a determined direction, relative to the largest
 _MAX_ROUNDS = 30  # alternations of frames and variances
-_READING_ROUNDS = 3  # alternations of frames and the effect of reading errors on the tool
 _MAX_REML_ITERATIONS = 300
 _FACTOR_TOLERANCE = 1e-7
 _MAX_STEP = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # turn [rad], displacement [m]
@@ -80,18 +79,6 @@ class FrameFit:
         """Inverse covariance of a step in units of ``pairs.scale``, (12, 12)."""
         F = self.frame_design
         return np.asarray(F.T @ F)
-
-
-def fit_measurements(measurements: ToolMeasurements, start: Array) -> FrameFit:
-    """Return the most likely frames of measurements, from a start.
-
-    The covariance by errors of the readings depends on the frames and is updated with them.
-    """
-    pairs, by_model = measurements.pairs, measurements.by_model
-    result = fit(pairs, start, measurements.noise_at(start), by_model)
-    for _ in range(_READING_ROUNDS if measurements.by_readings is not None else 0):
-        result = fit(pairs, result.frames, measurements.noise_at(result.frames), by_model)
-    return result
 
 
 def fit(
@@ -351,7 +338,7 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
 
 def _fit_to(pairs: PosePairs, start: Array, noise: PoseNoise) -> FrameFit:
     """Return the fit of rows with their estimated scatter, or the stated one if it is larger."""
-    result = fit(pairs, start, replace(noise, stated=(False, False), readings=None))
+    result = fit(pairs, start, replace(noise, stated=(False, False)))
     min_factor = np.where(noise.stated, noise.factor, 0.0)
     return replace(result, noise=result.noise.scaled(np.maximum(result.noise.factor, min_factor)))
 

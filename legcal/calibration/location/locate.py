@@ -17,11 +17,10 @@ from legcal.calibration.location.document import (
     MeasurementNoise,
     RowResidual,
 )
-from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit, fit_measurements
+from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit
 from legcal.calibration.location.frames import (
     FrameCandidates,
     jacobian,
-    likely_mistake,
     residuals,
     search,
     transforms,
@@ -34,9 +33,7 @@ from legcal.calibration.location.tool_poses import (
     read_tool_poses,
     tool_measurements,
 )
-from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.files.quantity import split_quantity
 from legcal.files.schema import describe
 from legcal.geometry.motions import pose_distance
 from legcal.geometry.types import Array
@@ -44,8 +41,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 
 _MAX_OUTLIERS = 4  # rows per outlier at least; one outlier is always allowed
-# residuals that suggest a mistake, and that are refused [spreads of positions, rad]
-_LARGE_RESIDUAL, _MAX_RESIDUAL = 0.05, 0.2
+_MAX_RESIDUAL = 0.2  # spreads of positions, [rad]; larger ones are refused
 _MIN_DOF = 1.0  # smallest degrees of freedom for an estimated scatter
 _MAX_SIGMA, _MAX_TOOL = 2.5, 250.0  # mean leg lengths
 _SAME_CHI2 = 30.0  # largest difference in chi2 of two answers that explain the poses equally well
@@ -63,7 +59,6 @@ def locate(
     *,
     position_sigma: float | None = None,
     angle_sigma: float | None = None,
-    encoder_sigma: float | str = 0.0,
     tool_position: Sequence[float] | None = None,
 ) -> Location:
     """Estimate the base in the world and the tool in the platform from measured tool poses.
@@ -80,10 +75,7 @@ def locate(
         The table of measured tool poses.
     position_sigma, angle_sigma : float, optional
         Standard deviations of the measurement, a component [m], [rad]; estimated from the residuals
-        if neither the option nor the column of the table is given.
-    encoder_sigma : float or str
-        Standard deviation of a reading: a number [m, for revolute motors rad], or a text with a
-        unit ('0.01deg'), which applies to motors of that unit; the others are exact.
+        if not given.
     tool_position : (3,) sequence of float, optional
         Position of the tool in the platform [m], used where the machine does not determine it; the
         origin by default.
@@ -101,7 +93,6 @@ def locate(
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     _check_numbers(position_sigma, angle_sigma, tool_position, machine.size)
-    sigma_q = _sigmas_of_readings(encoder_sigma, machine)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
     measurements = tool_measurements(
@@ -110,26 +101,18 @@ def locate(
         name,
         position_sigma=position_sigma,
         angle_sigma=angle_sigma,
-        encoder_sigma=sigma_q,
     )
     candidates = search(measurements.pairs, measurements.fewest)
     _check_plausible(measurements, candidates, name)
     inliers = find_inliers(measurements, candidates.frames[0])
-    _check_outliers(measurements, candidates, inliers, name)
+    _check_outliers(measurements, inliers, name)
     used = measurements.of(inliers.is_inlier)
-    frame_fit = fit_measurements(used, inliers.frames)
+    frame_fit = fit(used.pairs, inliers.frames, used.noise, used.by_model)
     _check_scatter(used, frame_fit, name)
     tool = np.zeros(3) if tool_position is None else np.asarray(tool_position, dtype=np.float64)
     determined = determine(used, frame_fit, tool, name)
     _check_unique(used, determined, candidates, tool, name)
     return _judge(measurements, name, inliers, determined, tool)
-
-
-def _sigmas_of_readings(stated: float | str, machine: Machine) -> dict[str, float]:
-    """Return the stated standard deviations of readings by motor [m or rad]; {} if exact."""
-    if (split_quantity(stated)[0] if isinstance(stated, str) else stated) == 0.0:
-        return {}
-    return sigmas_of(stated, machine.legs)
 
 
 def _check_numbers(
@@ -160,7 +143,7 @@ def _check_numbers(
 def _check_plausible(
     measurements: ToolMeasurements, candidates: FrameCandidates, name: str
 ) -> None:
-    """Refuse poses that no frames explain, naming the likeliest mistake.
+    """Refuse poses that no frames explain.
 
     Only the rows that agree best are considered: most rows are right, or all share one mistake.
     """
@@ -168,40 +151,22 @@ def _check_plausible(
     spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
     rms = float(np.sqrt(candidates.cost[0]))  # [machine lengths, rad]
     relative = rms / min(1.0, spread / pairs.length + 1e-12)
-    if relative <= _LARGE_RESIDUAL:
-        return
-    _refuse_mistakes(measurements, candidates, name)
     if relative > _MAX_RESIDUAL:
         size = f"{1e3 * rms * pairs.length:.3g} mm"
         turn = f" or {np.degrees(rms):.3g} deg" * measurements.is_oriented
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses about {size}{turn} from "
-            "where the readings put them, whatever the frames, needed poses measured at these "
-            "readings; check that rows belong together, the columns of the readings, and the model."
+            "where the readings put them, whatever the frames, needed positions in metres and "
+            "quaternions x, y, z, w of the tool in right-handed axes of the world, measured at "
+            "these readings; check units, order and axes, that rows belong together, and the model."
         )
 
 
-def _refuse_mistakes(
-    measurements: ToolMeasurements, candidates: FrameCandidates, name: str
-) -> None:
-    """Refuse poses that a common mistake in the table explains."""
-    mistake = likely_mistake(measurements.pairs, float(candidates.cost[0]), measurements.fewest)
-    if mistake is not None:
-        raise DatasetError(
-            f"{name}: base and tool could not be located: found poses that look like {mistake[0]}, "
-            "needed positions in metres and quaternions x, y, z, w of the tool in right-handed "
-            f"axes of the world; {mistake[1]}."
-        )
-
-
-def _check_outliers(
-    measurements: ToolMeasurements, candidates: FrameCandidates, inliers: Inliers, name: str
-) -> None:
+def _check_outliers(measurements: ToolMeasurements, inliers: Inliers, name: str) -> None:
     n, n_out = len(measurements.pairs), int(np.sum(~inliers.is_inlier))
     max_outliers = max(1, n // _MAX_OUTLIERS)
     if n_out <= max_outliers:
         return
-    _refuse_mistakes(measurements, candidates, name)
     rows = ", ".join(str(i) for i in measurements.poses.numbers[~inliers.is_inlier])
     raise DatasetError(
         f"{name}: base and tool could not be located: found {n_out} of {n} rows that disagree with "
@@ -337,7 +302,6 @@ def _noise(measurements: ToolMeasurements, frame_fit: FrameFit) -> MeasurementNo
         angle=float(rms[1]) if oriented else None,
         position_stated=measurements.noise.stated[0],
         angle_stated=measurements.noise.stated[1] and oriented,
-        reading=measurements.encoder_sigma,
         model=measurements.by_model is not None,
     )
 

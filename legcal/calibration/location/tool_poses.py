@@ -1,13 +1,12 @@
 """Measured tool poses: the table, and the noise of its rows.
 
 The table is a CSV file. Its header has the actuated joints, ``x,y,z`` and, if orientations are
-measured, ``qx,qy,qz,qw``, in any order; ``name``, ``position_sigma`` and ``angle_sigma`` are
-optional. Without names of joints it is read as a table of readings is: legs by name or number,
-units in headings, readings or whole lengths.
+measured, ``qx,qy,qz,qw``, in any order; ``name`` is optional. Without names of joints it is read as
+a table of readings is: legs by name or number, units in headings, readings or whole lengths.
 
-A row has three sources of error: the measurement, which is isotropic, with one standard deviation
-for positions and one for orientations, times a factor that may be unknown; the readings, which move
-position and orientation together; and a calibrated model, whose errors all rows share.
+A row has two sources of error: the measurement, which is isotropic, with one standard deviation for
+positions and one for orientations that may be unknown; and a calibrated model, whose errors all
+rows share.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -24,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
-from legcal.calibration.location.frames import PosePairs, tool_motions
+from legcal.calibration.location.frames import PosePairs
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
 from legcal.data.readings_sheet import ReadingsSheet
@@ -42,15 +41,13 @@ from legcal.files.table import (
     read_table,
     split_heading,
 )
-from legcal.geometry.covariances import whitener
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.equations import freedoms, pose_equations, pose_sensitivity
+from legcal.machine.equations import pose_sensitivity
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.kinematics import forward_kinematics_many, platforms_in_base
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of
-from legcal.machine.rods import first_rods, readings_of_rods
 
 MIN_SIGMA = 1e-9  # [m, rad]; no measurement is better, and files round
 MAX_ANGLE_SIGMA = 0.2  # [rad]; with a larger one the orientation was not measured
@@ -81,24 +78,6 @@ _COLUMNS = (
         Column(name, what="quaternion", required=False, blank=True, group="quaternion")
         for name in _QUATERNION
     ),
-    Column(
-        "position_sigma",
-        least=MIN_SIGMA,
-        what="standard deviation",
-        unit="metres",
-        needed=f"one from {MIN_SIGMA:g} metres",
-        required=False,
-    ),
-    Column(
-        "angle_sigma",
-        least=MIN_SIGMA,
-        most=MAX_ANGLE_SIGMA,
-        what="standard deviation",
-        unit="radians",
-        needed=f"one from {MIN_SIGMA:g} to {MAX_ANGLE_SIGMA:g} radians, not degrees",
-        required=False,
-        blank=True,
-    ),
 )
 _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNORECASE)
 
@@ -112,10 +91,6 @@ class ToolPoses:
     position: Array  # (n, 3): position of the tool in the world [m]
     rotation: Array  # (n, 3, 3): T_world_tool; the identity if only the position was measured
     oriented: BoolArray  # (n,): whether the orientation was measured too
-    # position_sigma, angle_sigma: (n,): standard deviation of each component [m], [rad]; None if
-    # not stated
-    position_sigma: Array | None
-    angle_sigma: Array | None
     numbers: IntArray  # (n,): numbers of the rows in the file, from 1
     notes: tuple[str, ...] = ()  # warnings about the table
 
@@ -144,13 +119,6 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     readings, notes = readings_in(table, machine.legs)
     position = table.numbers(_POSITION)
     rotation, oriented, worst = _orientations(table)
-    if "angle_sigma" in table:
-        if "qx" not in table:
-            actual, needed = "angle_sigma and no quaternions", "qx, qy, qz, qw beside it"
-            table.refuse_file(
-                header_problem(path, actual, needed, "add the columns", Code.MISSING_COLUMN)
-            )
-        table.need(["angle_sigma"], oriented)
     numbers = table.numbers(
         [*joints, *(name for name in (*_POSITION, *_QUATERNION) if name in table)]
     )
@@ -170,14 +138,11 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
             f"{path}: quaternions were made unit; their norms are up to {worst:.2g} off, as if "
             "they had been rounded.",
         )
-    angle_sigma = np.where(oriented, table.number("angle_sigma"), 1.0)
     return ToolPoses(
         q=q,
         position=position,
         rotation=rotation,
         oriented=oriented,
-        position_sigma=table.number("position_sigma") if "position_sigma" in table else None,
-        angle_sigma=angle_sigma if "angle_sigma" in table else None,
         numbers=np.arange(1, len(table) + 1),
         notes=notes,
     )
@@ -245,13 +210,10 @@ class PoseNoise:
     # whether the standard deviations of positions and of orientations were stated; otherwise their
     # factor is estimated
     stated: tuple[bool, bool]
-    # (n, 6, 6): covariance of the tool pose by errors of the readings [m, rad]; None without any
-    readings: Array | None = None
 
     def of(self, rows: BoolArray | IntArray) -> PoseNoise:
         """Return the noise of selected rows."""
-        readings = None if self.readings is None else self.readings[rows]
-        return replace(self, sigma=self.sigma[rows], readings=readings)
+        return replace(self, sigma=self.sigma[rows])
 
     def scaled(self, factor: Array) -> PoseNoise:
         """Return a copy with other factors."""
@@ -268,22 +230,16 @@ class PoseNoise:
         return np.asarray(self.factor * np.sqrt((self.sigma**2).mean(axis=0)))
 
     def standard_deviations(self) -> Array:
-        """Return the standard deviations without errors of the readings, (n, 6) [m, rad]."""
+        """Return the standard deviations, (n, 6) [m, rad]."""
         return np.repeat(self.sigma * self.factor, 3, axis=1)
 
     def whitening(self, oriented: BoolArray) -> Array:
         """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero if not measured."""
         sigma = self.standard_deviations()
-        if self.readings is None:
-            W = np.zeros((*sigma.shape, 6))
-            W[:, range(6), range(6)] = 1.0 / sigma
-        else:
-            S = self.readings.copy()
-            S[~oriented, 3:, :3] = S[~oriented, :3, 3:] = 0.0
-            S[:, range(6), range(6)] += sigma**2
-            W = whitener(S)
+        W = np.zeros((*sigma.shape, 6))
+        W[:, range(6), range(6)] = 1.0 / sigma
         W[~oriented, 3:] = 0.0
-        return np.asarray(W)
+        return W
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,10 +250,8 @@ class ToolMeasurements:
     poses: ToolPoses  # as measured
     pairs: PosePairs
     noise: PoseNoise  # standard deviations of the measurement
-    encoder_sigma: float  # largest standard deviation of a reading [m or rad]; zero if none stated
-    # by_readings, by_model: (n, 6, k): platform motions (see tool_motions) by independent errors of
-    # one standard deviation; None without such errors
-    by_readings: Array | None
+    # (n, 6, k): platform motions (see tool_motions) by independent errors of the model of one
+    # standard deviation; None without such errors
     by_model: Array | None
     fewest: int  # smallest number of poses that determines the frames
 
@@ -307,16 +261,8 @@ class ToolMeasurements:
             self,
             pairs=self.pairs.of(rows),
             noise=self.noise.of(rows),
-            by_readings=None if self.by_readings is None else self.by_readings[rows],
             by_model=None if self.by_model is None else self.by_model[rows],
         )
-
-    def noise_at(self, frames: Array) -> PoseNoise:
-        """Return the noise including the effect of reading errors on the tool at given frames."""
-        if self.by_readings is None:
-            return self.noise
-        moved = tool_motions(self.by_readings, frames, self.pairs)
-        return replace(self.noise, readings=moved @ np.swapaxes(moved, 1, 2))
 
     @property
     def is_oriented(self) -> bool:
@@ -329,17 +275,14 @@ def tool_measurements(
     poses: ToolPoses,
     name: str,  # name of the poses in messages
     *,
-    # position_sigma, angle_sigma: standard deviations of all rows [m], [rad]; None if the table
-    # states them or they are to be estimated from the residuals
+    # standard deviations of all rows [m], [rad]; None if to be estimated from the residuals
     position_sigma: float | None,
     angle_sigma: float | None,
-    encoder_sigma: Mapping[str, float],  # by motor [m or rad], without exact ones
 ) -> ToolMeasurements:
     """Return measured poses with the platform poses at their readings and their noise.
 
     Raises NotIdentifiable if there are too few poses, or the motors do not determine the pose;
-    DidNotConverge if the machine cannot reach some readings; UsageError if a standard deviation is
-    stated twice.
+    DidNotConverge if the machine cannot reach some readings.
     """
     fewest = FEWEST if poses.oriented.any() else FEWEST_POSITIONS
     _check_count(poses, name, fewest)
@@ -356,15 +299,12 @@ def tool_measurements(
         oriented=poses.oriented,
         length=_RADIAN * machine.size,
     )
-    by_model = _motions_by_model(machine, T)
     return ToolMeasurements(
         machine=machine,
         poses=poses,
         pairs=pairs,
-        noise=_noise(poses, position_sigma, angle_sigma, pairs.length, name),
-        encoder_sigma=max(encoder_sigma.values(), default=0.0),
-        by_readings=motions_by_readings(machine, T, encoder_sigma) if encoder_sigma else None,
-        by_model=by_model,
+        noise=_noise(poses, position_sigma, angle_sigma, pairs.length),
+        by_model=_motions_by_model(machine, T),
         fewest=fewest,
     )
 
@@ -387,58 +327,14 @@ def _check_count(poses: ToolPoses, name: str, fewest: int) -> None:
 
 
 def _noise(
-    poses: ToolPoses,
-    position_sigma: float | None,
-    angle_sigma: float | None,
-    length: float,
-    name: str,
+    poses: ToolPoses, position_sigma: float | None, angle_sigma: float | None, length: float
 ) -> PoseNoise:
     """Return the stated standard deviations, and a start for the others."""
-    sigma = np.ones((len(poses), 2))
-    factor, stated = np.array([_FIRST_FACTOR * length, _FIRST_FACTOR]), [False, False]
-    sources = (
-        ("position", poses.position_sigma, position_sigma),
-        ("angle", poses.angle_sigma, angle_sigma),
-    )
-    for kind, (name_of_kind, column, number) in enumerate(sources):
-        if column is not None and number is not None:
-            raise UsageError(
-                f"{name}: the {name_of_kind} sigma could not be used: found it in the column "
-                f"{name_of_kind}_sigma and as an option, needed it once; leave one of them out."
-            )
-        if column is None and number is None:
-            continue
-        sigma[:, kind] = number if column is None else column
-        factor[kind], stated[kind] = 1.0, True
+    stated = position_sigma is not None, angle_sigma is not None or not poses.oriented.any()
+    factor = np.array([position_sigma or _FIRST_FACTOR * length, angle_sigma or _FIRST_FACTOR])
     if not poses.oriented.any():
-        sigma[:, 1] = factor[1] = 1.0
-        stated[1] = True
-    return PoseNoise(sigma, factor, (stated[0], stated[1]))
-
-
-def motions_by_readings(
-    machine: Machine,
-    poses: Sequence[RigidTransform],
-    sigma: Mapping[str, float],  # standard deviations of readings by motor [m or rad]
-) -> Array:
-    """Return the platform motions (n, 6, k) by an error of each reading at given poses."""
-    R, t = _joint_frames(machine, poses)
-    legs = geometries(machine)
-    equations = pose_equations(legs, R, t, by_local=False, q=readings_of_rods(legs, R, t))
-    columns = list(freedoms(machine.frame_legs))
-    inverse = np.linalg.pinv(equations.by_pose[:, :, columns])
-    of_leg = np.array([sigma.get(str(leg.prismatic), 0.0) for leg in machine.legs])
-    hangs = np.array([leg.actuator is not None for leg in legs], dtype=np.bool_)
-    is_rod = equations.measured & ~hangs[equations.leg]
-    moved = np.zeros((len(poses), 6, is_rod.sum() + equations.by_q.shape[2]))
-    moved[:, columns] = np.concatenate(  # the sign of a reading does not matter
-        [
-            inverse[:, :, is_rod] * of_leg[equations.leg[is_rod]],
-            inverse @ equations.by_q * of_leg[first_rods(legs)],
-        ],
-        axis=2,
-    )
-    return _of_link(machine, poses, moved)
+        factor[1] = 1.0
+    return PoseNoise(np.ones((len(poses), 2)), factor, stated)
 
 
 def _of_table(problem: Problem, name: str) -> Problem:
