@@ -128,6 +128,8 @@ class CameraCalibration:
             covariance=self.covariance.tolist(),
             rms_px=self.rms_px,
             noise_px=self.noise_px,
+            noise_length_px=self.noise_length_px,
+            effective_corners=self.effective_corners,
             coverage=self.coverage,
             images=list(self.images),
             warnings=list(self.warnings),
@@ -158,6 +160,8 @@ class CameraDocument(Document):
     covariance: list[list[float]]
     rms_px: float
     noise_px: float
+    noise_length_px: float
+    effective_corners: float
     coverage: float
     images: list[BoardImage]
     warnings: list[str]
