@@ -411,6 +411,13 @@ class MotorZero(Document):
     teeth: StrictInt  # of its spline by which its horn is off; 0 where it is no whole number
 
 
+class NextStep(Document):
+    """A thing to do, with a command to copy, "" where there is none."""
+
+    what: str
+    command: str
+
+
 class Result(Legs, Heading, SparseDocument):
     """``result.json``: the heading, the calibrated legs, and how well they are known."""
 
@@ -439,6 +446,7 @@ class Result(Legs, Heading, SparseDocument):
     only: Literal["zeros", "lengths", "all"] | None = None  # the group, where one was asked for
     zeros: list[MotorZero] | None = None  # of the motors, likewise
     overlays: list[Overlay] | None = None  # left out where none were asked for
+    next: list[NextStep] | None = None  # what to do next, in ``calibrate --json`` alone
 
     def nominal_actuator(self, calibrated: Actuator | None) -> Actuator | None:
         """Return the actuator that the parameters count from."""

@@ -215,7 +215,7 @@ def calibrate(
     page_of.say()
     show(
         as_json,
-        lambda: found.result.document(),
+        lambda: calibration.document(found, output, command_line()),
         lambda: calibration.summary(found, output, command_line(), verbose=verbose),
     )
     if not found.verdict.trustworthy:

@@ -6,12 +6,12 @@ import shlex
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.text import Text
 
-from legcal.calibration.documents import PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
@@ -86,6 +86,13 @@ def _first(lines: Sequence[str], room: int) -> list[str]:
 def _height(line: str) -> int:
     """Return the height of a text on a screen."""
     return max(1, len(textwrap.wrap(line, _WIDTH)))
+
+
+def document(calibration: Calibration, output: Path, command: str) -> dict[str, Any]:
+    """Return the document of ``calibrate --json``: the result, and what to do next."""
+    steps = next_steps(calibration, str(output), command)
+    blocks = [NextStep(what=one.what, command=one.command) for one in steps]
+    return calibration.result.model_copy(update={"next": blocks}).document()
 
 
 def _written_beside(command: str) -> str:
