@@ -356,6 +356,7 @@ def test_exit_code_document_summary_and_page_agree(
     monkeypatch.setattr("legcal.calibration.pipeline.calibrate", again)
     code = run(monkeypatch, "calibrate", folder, "-o", out, "--json")
     printed = json.loads(capsys.readouterr().out)
+    following = printed.pop("next")  # in what is printed alone
     written = load_result(out).result
     page: Any = html.document_fromstring((out / "report.html").read_text())
     light, first = (
@@ -363,6 +364,7 @@ def test_exit_code_document_summary_and_page_agree(
         page.xpath("string((//section[@id='next']//li)[1])"),
     )
     assert written.document() == printed
+    assert following[0]["what"] in first
     assert printed["verdict"] in page.xpath("string(//section[@id='verdict'])")
     assert printed["verdict"] in load_result(out).summary()
     if spoil is _nothing:

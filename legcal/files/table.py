@@ -431,12 +431,13 @@ def concepts(text: str) -> tuple[str, ...]:
 
 @cache
 def _divided(token: str) -> tuple[str, ...] | None:
-    """Return the concepts of a word, or of the known words that it is made of."""
+    """Return the concepts of a word, or of the known words that it is made of, each once."""
     if token in _CONCEPTS:
         return (_CONCEPTS[token],)
     for end in range(len(token) - 1, 0, -1):
-        if token[:end] in _CONCEPTS and (rest := _divided(token[end:])) is not None:
-            return (_CONCEPTS[token[:end]], *rest)
+        first, rest = _CONCEPTS.get(token[:end]), _divided(token[end:])
+        if first is not None and rest is not None and first not in rest:
+            return (first, *rest)
     return None
 
 

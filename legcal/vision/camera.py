@@ -11,16 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from math import factorial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from scipy.interpolate import BSpline, make_interp_spline
 
 from legcal.geometry.types import Array
 from legcal.vision.distortion import DistortionModel
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 MAX_RADIUS = 10.0  # maximum radius of the search on the sensor plane
@@ -91,20 +93,23 @@ def _fisheye_derivatives(xy: Array, K: Array, coefficients: Array) -> tuple[Arra
 # from the principal point. Its coefficients are h at multiples of 15 deg; h is the even spline of
 # degree 5 through them with h(0) = 0, so that the radius has the slope 1 there.
 _KNOTS = np.radians(15.0 * np.arange(1, 7))
-SPLINE = make_interp_spline(
-    np.concatenate([-_KNOTS[::-1], [0.0], _KNOTS]),
-    np.vstack([np.eye(6)[::-1], np.zeros(6), np.eye(6)]),
-    k=5,
-)
 _ANGLES = np.linspace(0.0, 0.5 * np.pi, 721)[:-1]  # of the table from which undistortion starts
+
+
+@cache
+def _spline_of_each() -> BSpline:
+    """Return the splines h of unit coefficients, by an angle: with values (..., 6)."""
+    from scipy.interpolate import make_interp_spline  # only where a lens is splined
+
+    angles = np.concatenate([-_KNOTS[::-1], [0.0], _KNOTS])
+    return make_interp_spline(angles, np.vstack([np.eye(6)[::-1], np.zeros(6), np.eye(6)]), k=5)
 
 
 def _splined_radius(theta: Array, h: Array) -> tuple[Array, Array]:
     """Return the radius at angles (n,) to the axis, and its derivative, (n,) each."""
-    t, c, degree = SPLINE.tck
-    spline = BSpline.construct_fast(t, c @ h, degree)
-    times = 1.0 + spline(theta)
-    return theta * times, times + theta * spline(theta, 1)
+    spline = _spline_of_each()
+    times = 1.0 + spline(theta) @ h
+    return theta * times, times + theta * (spline(theta, 1) @ h)
 
 
 def _splined_distort(xy: Array, K: Array, h: Array) -> Array:
@@ -135,7 +140,7 @@ def _splined_derivatives(xy: Array, K: Array, h: Array) -> tuple[Array, Array]:
     across = np.where(r[:, None, None] > 1e-9, np.eye(2) - along, np.eye(2))
     times = np.where(r > 1e-9, radius / r, 1.0)[:, None, None]
     by_xy = (slope / (1.0 + r**2))[:, None, None] * (np.eye(2) - across) + times * across
-    by_h = outwards[:, :, None] * (theta[:, None] * SPLINE(theta))[:, None, :]
+    by_h = outwards[:, :, None] * (theta[:, None] * _spline_of_each()(theta))[:, None, :]
     f = np.diag(K)[:2]
     by_f = np.eye(2) * (outwards * radius[:, None])[:, :, None]
     by_c = np.broadcast_to(np.eye(2), by_f.shape)
@@ -382,7 +387,8 @@ def splined(camera: Camera) -> Camera:
 def spline_pieces(camera: Camera) -> list[list[float]]:
     """Return h of a splined camera as polynomials from 0, 15, 30, 45, 60 and 75 deg on [rad]."""
     start = np.concatenate([[0.0], _KNOTS[:-1]])
-    terms = [SPLINE(start, n) @ camera.distortion / factorial(n) for n in range(SPLINE.k + 1)]
+    spline = _spline_of_each()
+    terms = [spline(start, n) @ camera.distortion / factorial(n) for n in range(spline.k + 1)]
     return [[float(term[k]) for term in terms] for k in range(len(start))]
 
 

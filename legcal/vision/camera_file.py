@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
-from scipy.optimize import least_squares
 
 from legcal.errors import BadValue, DatasetError, UsageError
 from legcal.files.folder import OutputFile
@@ -884,6 +883,8 @@ def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
 
     def residual(values: Array) -> Array:
         return np.ravel(of(values).distort(xy) - pixels)
+
+    from scipy.optimize import least_squares  # only where a camera is converted
 
     values = intrinsic_values(start)
     best = of(least_squares(residual, values, jac=jacobian, x_scale="jac", method="lm").x)
