@@ -1,36 +1,48 @@
-"""Tests of stated priors, radii and arms against the measurements.
+"""Tests of stated priors, fixed values, cameras, radii and arms against the measurements.
 
-A stated prior is tested against the estimate from measurements and other priors. Fixed values are
-tested by scores, as cameras are (:mod:`.sensitivity`).
+A stated prior is tested against the estimate from measurements and other priors; a fixed value by
+a second fit with the parameter free.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
 
+from legcal.calibration.joint_fit.determinacy import (
+    HeldDirections,
+    held_at_nominal,
+    undetermined_directions,
+)
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
-from legcal.calibration.joint_fit.parameter_choices import board_scale
+from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.calibration.tuning import SCATTER_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
-from legcal.errors import DidNotConverge, LegcalError
-from legcal.estimation.solver import NormalEquations
+from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
+from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg, ParameterId, radius_name
 from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import actuators_of
 from legcal.vision.board import LINKS
+from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
 _MIN_INFORMATION = 1e-9  # least information of measurements for a test, over the prior's
+_MIN_INFORMATION_WIDE = 1e-3  # the same for the wide prior in place of a fixed value
 _MAX_SCALE_SIGMA = 0.05  # largest standard deviation of the size of a board for a test
+_WIDE_SIGMA = 0.05  # mean leg lengths or rad: the wide prior in place of a fixed value
+_WIDE_RADIUS = 0.2  # relative, of a radius
+_MAX_VARIANCE_SHARE = 0.5  # posterior over prior variance, for a test
+_NOMINAL_SIGMA = 0.01  # mean leg lengths: error of a nominal model along held directions
 _MANY_REJECTED = 0.1  # of all outlines
 _MOST_REJECTED = 0.5  # of the outlines of a leg or a view
 # An arm that is no cylinder: its median outline error over that of rods (at most 1.8 for 204
@@ -126,12 +138,200 @@ def _contradicted(
             yield problem.named[i], mean, sigma, estimate
 
 
-def fixed_by_choice(problem: FitProblem) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class _Comparison:
+    """A stated value and its estimate from the measurements."""
+
+    name: str
+    unit: str
+    mean: float
+    sigma: float  # zero where it is fixed
+    estimate: float
+    sigmas_joint: float  # difference in standard deviations, other stated values free
+    sigmas_alone: float  # the same, other stated values right
+
+    def __str__(self) -> str:
+        apart = self.sigmas_joint if self.sigmas_joint > _SIGNIFICANT else self.sigmas_alone
+        stated = f"{self.mean:.6g} {self.unit}"
+        if self.sigma:
+            stated = f"{self.mean:.6g} +- {self.sigma:.2g} {self.unit}"
+        return (
+            f"The {'prior' if self.sigma else 'fixed value'} of {self.name} contradicts the "
+            f"measurements: stated {stated}, measured about {self.estimate:.4g} {self.unit}, "
+            f"{apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct it, "
+            f"{'' if self.sigma else 'give it a prior, '}or free it (--set {self.name}=free)."
+        )
+
+
+def refuse_contradicted_values(
+    problem: FitProblem,
+    start: Start,
+    state: State,
+    *,
+    with_priors: bool = False,
+) -> None:
+    """Refuse fixed values that contradict the measurements.
+
+    The fit is repeated with the values free. It estimates the noise of outlines, so that too small
+    claimed covariances do not refuse a right value. It starts from *start*, and from *state* if
+    that fails; if both fail, nothing is refused.
+
+    Parameters
+    ----------
+    problem : FitProblem
+        Without held directions and edge biases.
+    start, state
+        Start of the fit, and its minimum or last state with the values fixed.
+    with_priors : bool
+        Also test stated priors.
+
+    Raises
+    ------
+    DidNotConverge
+        One sentence for each value.
+    """
+    if not problem.settings.judges_stated_values:
+        return
+    choices, values = problem.choices, _values(problem, state)
+    stated = {name: (values[name], 0.0) for name in _fixed_by_choice(problem)}
+    if with_priors:
+        stated |= {name: (p.mean, p.sigma) for name, p in choices.priors.items() if name in values}
+    if not stated:
+        return
+    wide = {
+        name: _wide_prior(problem, state, name, values[name], sigma)
+        for name, (_, sigma) in stated.items()
+    }
+    wider_choices = replace(
+        choices, fixed=choices.fixed - wide.keys(), priors={**choices.priors, **wide}
+    )
+    wider = problem.with_choices(wider_choices)
+    # Parameters determined by ties stay fixed: no measurement depends on them.
+    stated = {name: value for name, value in stated.items() if name in wider.named}
+    if not stated:
+        return
+    comparisons: list[_Comparison] = []
+    for start_state in (wider.begin(start), state):
+        try:
+            fit, held = _refit(wider, start_state)
+        except (DidNotConverge, NotIdentifiable):
+            continue
+        comparisons = _compare(fit, held, stated, wide)
+        break
+    contradicted = [
+        comparison for comparison in comparisons if comparison.sigmas_joint > _SIGNIFICANT
+    ]
+    contradicted = contradicted or [
+        comparison for comparison in comparisons if comparison.sigmas_alone > _SIGNIFICANT
+    ]
+    if contradicted:
+        raise DidNotConverge([str(comparison) for comparison in contradicted])
+
+
+def _fixed_by_choice(problem: FitProblem) -> tuple[str, ...]:
     """Names of parameters fixed by choice: kinematic ones, radii, intrinsics with a value."""
     legs, choices = problem.legs, problem.choices
     radii = (radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts)
     candidates = {*legs.parametrization.names, *radii, *choices.values}
     return tuple(sorted(choices.fixed & candidates))
+
+
+def _values(problem: FitProblem, state: State) -> dict[str, float]:
+    """Values of all parameters that can be stated, by name."""
+    legs = problem.legs
+    values = dict(zip(legs.parametrization.names, legs.vector(state.legs).tolist(), strict=True))
+    for (leg, part), radius in zip(problem.outlines.parts, state.radii.tolist(), strict=True):
+        values[radius_name(legs.names[leg], part)] = radius
+    for view, camera in zip(problem.outlines.views, state.cameras, strict=True):
+        for key in intrinsic_names(camera):
+            values[f"{view}.{key}"] = intrinsic_of(camera, key)
+    return values
+
+
+def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigma: float) -> Prior:
+    """Return a nearly uninformative prior around a value."""
+    names, units = problem.legs.parametrization.names, problem.legs.parametrization.units
+    parameter = ParameterId.parse(name)
+    if name in names:
+        wide = _WIDE_SIGMA * (state.mean_length if units[names.index(name)] == "m" else 1.0)
+    elif parameter.kind == "radius":
+        wide = _WIDE_RADIUS * value
+    else:
+        camera = state.cameras[problem.outlines.views.index(parameter.owner)]
+        is_px = intrinsic_unit(parameter.kind) == "px"
+        wide = _WIDE_SIGMA * (camera.K[0, 0] if is_px else 1.0)
+    return Prior(value, max(float(wide), sigma))
+
+
+def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
+    """Fit with the stated parameters free; return the fit and its held directions."""
+    first = first_minimum(problem, state)
+    normal = information(problem, first.state, first.linear, problem.loss)
+    held = undetermined_directions(problem, first.state, normal)
+    if len(held.basis):
+        problem, state = held_at_nominal(problem, first.state, held)
+        continued = first_minimum(problem, state)
+        first = replace(continued, iterations=first.iterations + continued.iterations)
+    return fit_in_rounds(problem, first), held
+
+
+def _compare(
+    fit: Fit,
+    held: HeldDirections,
+    stated: Mapping[str, tuple[float, float]],
+    wide: Mapping[str, Prior],
+) -> list[_Comparison]:
+    """Compare stated values with their estimates, where the measurements depend on them.
+
+    M is the information of these parameters, including their wide priors P around w, and f the
+    estimates. The measurements alone have the information K = M - P, and the gradient
+    M f - P w - K m at the stated values m.
+    """
+    problem, state = fit.problem, fit.state
+    normal = information(problem, state, fit.minimum.linear, problem.loss)
+    total_information = named_information(problem, state, normal) + _held_information(
+        problem, held, state.mean_length
+    )
+    unknowns = np.array([problem.named.index(name) for name in stated], dtype=np.intp)
+    fitted = problem.coordinates(state)[unknowns]
+    M, P = (
+        marginal(total_information, unknowns),
+        np.array([wide[name].sigma ** -2 for name in stated]),
+    )
+    mean, sigma = np.array(list(stated.values())).T
+    wide_mean = np.array([wide[name].mean for name in stated])
+    covariance = inverse_on_range(M)
+    slope = M @ (fitted - mean) - P * (wide_mean - mean)
+    comparisons = []
+    for i, name in enumerate(stated):
+        measured = M[i, i] - P[i]
+        if measured < _MIN_INFORMATION_WIDE * P[i]:
+            continue
+        joint_sigmas = abs(fitted[i] - mean[i]) / np.sqrt(covariance[i, i] + sigma[i] ** 2)
+        comparisons.append(
+            _Comparison(
+                name,
+                problem.units[unknowns[i]],
+                float(mean[i]),
+                float(sigma[i]),
+                float(fitted[i]),
+                float(joint_sigmas) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0,
+                float(abs(slope[i] / measured) / np.sqrt(1.0 / measured + sigma[i] ** 2)),
+            )
+        )
+    return comparisons
+
+
+def _held_information(problem: FitProblem, held: HeldDirections, length: float) -> Array:
+    """Information (n_named, n_named) of the nominal model along held directions.
+
+    A stated value may determine a direction that the fit holds at nominal, as a radius does the
+    size of a translational 3-UPU; the measurements then do not contradict it.
+    """
+    n = problem.n_named
+    rows, sigma = np.zeros((len(held.basis), n)), _NOMINAL_SIGMA * length * held.unit
+    rows[:, np.setdiff1d(np.arange(n), problem.where("biases"))] = held.basis / sigma
+    return rows.T @ rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +539,7 @@ def stated_parameters(problem: FitProblem) -> list[str]:
     priors = sorted(problem.choices.priors.items())
     return [
         *(name for name, prior in priors if nominal_twists.get(name) != prior.mean),
-        *fixed_by_choice(problem),
+        *_fixed_by_choice(problem),
     ]
 
 

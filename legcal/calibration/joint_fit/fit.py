@@ -21,6 +21,8 @@ from legcal.calibration.joint_fit.diagnostics import (
     blaming_stated_values,
     refuse_contradicted_board,
     refuse_contradicted_priors,
+    refuse_contradicted_values,
+    rejected_notes,
     wrong_arms,
     wrong_arms_in_words,
 )
@@ -37,7 +39,6 @@ from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
-from legcal.calibration.joint_fit.sensitivity import refuse_contradicted_values
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
@@ -294,6 +295,7 @@ def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None
         first = first_minimum(*_hold_undetermined_at_start(problem, begin))
         return _in_best_assembly_modes(problem, first)
     except DidNotConverge as failure:
+        refuse_contradicted_values(problem, start, begin, with_priors=True)
         _refuse_undetermined(problem, begin)
         raise blaming_stated_values(problem, failure) from None
 
@@ -361,7 +363,7 @@ def _refine_minimum(
     first: Minimum[State],
 ) -> Solution:
     """Refine a first minimum: held directions, rounds, checks, result."""
-    refuse_contradicted_values(problem, first.state)
+    refuse_contradicted_values(problem, start, first.state)
     normal = information(problem, first.state, first.linear, problem.loss)
     held = undetermined_directions(problem, first.state, normal)
     refuse_contradicted_board(problem, first.state, normal)
@@ -379,11 +381,14 @@ def _refine_minimum(
         refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
+        refuse_contradicted_values(without_held, start, state, with_priors=True)
         _refuse_contradicted(without_held, state)
         _refuse_undetermined(without_held, state)
         if isinstance(failure, DidNotConverge):
             raise blaming_stated_values(without_held, failure) from None
         raise
+    if rejected_notes(fit.problem, fit.accepted):
+        refuse_contradicted_values(without_held, start, state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
 

@@ -1,4 +1,4 @@
-"""Score tests of cameras and fixed values, and what wrong cameras do to the parameters.
+"""Score tests of cameras, and what an error in what counts as known does to the parameters.
 
 Encoders carry the absolute scale, and no other parameter of the fit imitates the perspective of a
 wrong focal length completely. The cost then has a gradient by the focal length at the minimum:
@@ -14,17 +14,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter, fixed_by_choice
-from legcal.calibration.joint_fit.held_out import with_weights
-from legcal.calibration.joint_fit.outline_errors import robust_noise
+from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.variables import LegConstraints, State, intrinsic_of
-from legcal.errors import DidNotConverge
-from legcal.estimation.problem import Linearization, linearize
+from legcal.calibration.joint_fit.variables import State, intrinsic_of
+from legcal.estimation.problem import Linearization
 from legcal.estimation.solver import NormalEquations, normal_equations
-from legcal.estimation.uncertainty import Scores, residual_changes, response
+from legcal.estimation.uncertainty import Scores, response
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import ParameterId, radius_name
 from legcal.vision.camera import shared_cameras
 
 FITTED_CAMERA = (
@@ -33,71 +29,6 @@ FITTED_CAMERA = (
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
-
-
-def refuse_contradicted_values(problem: FitProblem, state: State) -> None:
-    """Refuse fixed values that contradict the measurements, by their scores at a minimum.
-
-    The noise of outlines is estimated, so that too small claimed covariances refuse no right value.
-
-    Raises
-    ------
-    DidNotConverge
-        With the value that contradicts them most; others may only follow from that.
-    """
-    names, legs = fixed_by_choice(problem), problem.legs
-    names = tuple(n for n in names if not (legs.ties and n in legs.parametrization.names))
-    if not names or not problem.settings.judges_stated_values:
-        return
-    if len(problem.outlines):
-        noise = robust_noise(problem.offsets(state), problem.outlines.covariance)
-        problem = problem.weighted(noise)
-    problem = with_weights(problem, state)
-    linear = linearize(problem, state)
-    cameras = CameraResiduals(problem, state, linear)
-    changes = [_changes_by(cameras, name) for name in names]
-    columns = {
-        factor.name: np.stack(
-            [one.get(factor.name, np.zeros((factor.n, factor.n_rows))) for one in changes], axis=-1
-        )
-        for factor in problem.factors
-    }
-    scores = Scores.of(problem, linear, normal_equations(problem, state, linear), columns)
-    apart = [float(np.sqrt(scores.estimate(np.array([i])).square)) for i in range(len(names))]
-    worst = int(np.argmax(apart))
-    if apart[worst] > _SIGNIFICANT:
-        raise DidNotConverge(
-            f"The fixed value of {names[worst]} contradicts the measurements, by "
-            f"{apart[worst]:.0f} standard deviations (limit {_SIGNIFICANT:g}); correct it, state "
-            f"its standard deviation beside it, or free it (--set {names[worst]}=free)."
-        )
-
-
-def _changes_by(cameras: CameraResiduals, name: str) -> dict[str, Array]:
-    """Return the changes of whitened residuals (n, q) by a parameter, poses on the constraints."""
-    problem, state, linear = cameras.problem, cameras.state, cameras.linear
-    legs, outlines, parameter = problem.legs, problem.outlines, ParameterId.parse(name)
-    if name in legs.parametrization.names:
-        place = legs.parametrization.place
-        is_of_name = place == legs.parametrization.names.index(name)
-        changes = residual_changes(problem, linear, "legs", is_of_name.astype(np.float64))
-        constraints = LegConstraints(problem.parameters)
-        for j, column in np.argwhere(is_of_name).tolist() if constraints.binds else ():
-            motion = constraints.following(state, j, column)
-            for factor in problem.factors:
-                if factor.element is not None:
-                    J = linear[factor.name].J_element
-                    changes[factor.name] += np.einsum("nqk,nk->nq", J, motion[factor.element])
-        return changes
-    parts = [radius_name(legs.names[leg], part) for leg, part in outlines.parts]
-    if name in parts:
-        error = np.equal(parts, name).astype(np.float64)[:, None]
-        return residual_changes(problem, linear, "radii", error)
-    owners = np.array(shared_cameras(outlines.views, problem.first_cameras))
-    error = np.zeros((len(owners), len(_KEYS)))
-    if parameter.kind in _KEYS:
-        error[owners == parameter.owner, _KEYS.index(parameter.kind)] = 1.0
-    return cameras.changes(error)
 
 
 @dataclass(frozen=True)
