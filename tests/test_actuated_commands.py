@@ -78,11 +78,11 @@ def test_commands_know_that_joints_at_A_move(
         looked = json.loads(said("doctor", session, "--json", "-q", code=1))
         assert [one["column"] for one in looked["encoders"]] == list(truth.motor_names)
         assert {one["unit"] for one in looked["encoders"]} == {"rad"}
-        assert "scale" in json.loads(said("identify", session, "--json"))
+        assert json.loads(said("identify", session, "--json"))["scale_is_open"]
         written = tmp_path / "session" / "dataset.yaml"
         length = "{'leg1.base:leg1.platform': 400+-0.5mm}"
         written.write_text(f"{written.read_text()}parameters: {{lengths: {length}}}\n")
-        assert "scale" not in json.loads(said("identify", session, "--json"))
+        assert not json.loads(said("identify", session, "--json"))["scale_is_open"]
     inspected = said("inspect", name)
     assert all(f"{joint} " in inspected for joint in truth.motor_names)
     assert f" {unit}" in inspected
