@@ -69,6 +69,9 @@ from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import camera_numbers, shared_cameras
 
 
+REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether the calibrated model should replace the nominal one."""
