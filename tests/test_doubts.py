@@ -358,6 +358,8 @@ def test_exit_code_document_summary_and_page_agree(
     printed = json.loads(capsys.readouterr().out)
     following = printed.pop("next")  # in what is printed alone
     written = load_result(out).result
+    read = load_result(out).verdict
+    assert (read.sentence, read.doubts) == (calibration.verdict.sentence, calibration.doubts)
     page: Any = html.document_fromstring((out / "report.html").read_text())
     light, first = (
         page.xpath("//section[@id='verdict']/@class")[0],

@@ -68,6 +68,8 @@ from legcal.perception.diagnostics import images_left_out
 from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import camera_numbers, shared_cameras
 
+REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
+
 
 @dataclass(frozen=True)
 class Verdict:

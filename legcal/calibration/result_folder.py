@@ -23,10 +23,11 @@ from legcal.calibration.documents import (
     Result,
     unreadable,
 )
+from legcal.calibration.doubts import Doubt
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.parameter_choices import KnownIntrinsics
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.result import Calibration
+from legcal.calibration.result import REFUSED, Calibration, Verdict
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset
@@ -187,6 +188,17 @@ class EarlierResult(Summarised):
     def result(self) -> Result:
         """The document."""
         return self.document
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether to use it, as it was written; the file does not hold its ``remedy``."""
+        sentence = self.document.verdict
+        is_refused = sentence.startswith(REFUSED)
+        doubts = [
+            Doubt(**block.model_dump(), is_grave=is_refused and k == 0)  # the worst is the first
+            for k, block in enumerate(self.document.doubts)
+        ]
+        return Verdict(tuple(doubts), sentence)
 
     def __repr__(self) -> str:
         return few_lines(f"Calibration in {self.folder}", self.result)

@@ -29,7 +29,7 @@ from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnes
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.only import GroupEstimate
 from legcal.calibration.quantities import mm_deg
-from legcal.calibration.result import Calibration, Verdict
+from legcal.calibration.result import REFUSED, Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.data.corners import Corners
 from legcal.data.dataset import POSES_NAME, Dataset
@@ -291,7 +291,7 @@ def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
         return Verdict(doubts, f"Calibrated: {found}.", remedy)
     more = len(doubts) - 1
     others = f" {more} more doubt{'s' * (more > 1)} beside that." if more else ""
-    heading = "Do not load this into the controller" if doubts[0].is_grave else "In doubt"
+    heading = REFUSED if doubts[0].is_grave else "In doubt"
     return Verdict(doubts, f"{heading}: {found}. {doubts[0].sentence}{others}", remedy)
 
 

@@ -134,11 +134,18 @@ def new(
     description = machine_document(created.machine)
     description["diagnostics"] = [*model.notes, *description["diagnostics"]]
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
-    written_line = f"written: {paths['yaml']} {paths['urdf']}"
+    lines = (
+        f"written: {paths['yaml']} {paths['urdf']}",
+        "Next, with a folder of photographs and a table of readings:",
+        f"  legcal init PHOTOGRAPHS --readings READINGS.csv --model {shlex.quote(paths['yaml'])} "
+        "-o session",
+    )
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report(inspect_table(description), Text(written_line, overflow="ignore")),
+        lambda: report(
+            inspect_table(description), [Text(printable(line), overflow="ignore") for line in lines]
+        ),
     )
 
 

@@ -30,7 +30,8 @@ from legcal.causes import Cause
 from legcal.errors import BadValue, Code, DatasetError, LegcalError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
-_MOST_NAMES = 10  # maximum number of names in a hint
+_MOST_NAMES = 30  # maximum number of names in a hint that lists all
+_NEAREST_NAMES = 10  # in a hint that does not
 _LONGEST_WORD = 100  # maximum length of words for the search of a similar one
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}$=-]*")  # parsed equally by all parsers
@@ -293,18 +294,21 @@ def describe(value: object) -> str:
     return "nothing" if value is None else short.repr(value)
 
 
-def closest(word: str, candidates: Iterable[str]) -> str:
-    """Return a hint at the name most similar to a word, or a list of at most ten names."""
+def closest(word: str, candidates: Iterable[str], where: str = "") -> str:
+    """Return a hint at the name most similar to a word, or the names that there are.
+
+    Of more than a sentence holds, the nearest stand there, and ``where`` says what lists all.
+    """
     names = list(candidates)
     near = nearest(word, names)
     if near:
         return f"did you mean '{near}'?"
     if not names:
         return "there are none: remove it, or add what it names"
-    more = len(names) - _MOST_NAMES
-    shown = names[:_MOST_NAMES]
-    others = f" and {more} more" if more > 0 else ""
-    return f"known are: {', '.join(shown)}{others}"
+    if len(names) <= _MOST_NAMES:
+        return f"known are: {', '.join(names)}"
+    kept = difflib.get_close_matches(word[:_LONGEST_WORD], names, n=_NEAREST_NAMES, cutoff=0.0)
+    return f"the nearest of {len(names)} are: {', '.join(kept)}{where and f'; {where}'}"
 
 
 def nearest(word: str, names: Iterable[str]) -> str:

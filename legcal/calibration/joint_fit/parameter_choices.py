@@ -29,6 +29,8 @@ from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_valu
 
 Group = Literal["zeros", "lengths", "all"]  # what --only reports, and writes into the model
 
+_ALL_NAMES = "docs/formats.md, Parameter names, lists all kinds"
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -405,7 +407,7 @@ def _no_match(override: Override, known: KnownParameters) -> str:
     found = "a pattern that no name matches" if is_pattern else "an unknown name"
     return (
         f"{override.where} could not be used: found {found}, needed a parameter of this machine or "
-        f"of its cameras; {closest(override.name, known.names)}"
+        f"of its cameras; {closest(override.name, known.names, _ALL_NAMES)}"
     )
 
 
