@@ -8,8 +8,10 @@ import pytest
 
 from legcal import load_mechanism
 from legcal.calibration.location.tool_poses import read_tool_poses
+from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description
 from legcal.descriptions.new_model import Dimensions, description_of
+from legcal.descriptions.table import read_columns
 from legcal.errors import ModelError
 from legcal.machine.kinematics import forward_kinematics_many
 
@@ -151,6 +153,36 @@ def test_other_workbooks_are_refused(content: bytes, tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(ModelError, match=r"workbook.*save the sheet as CSV"):
         described(path, "mm", ())
+
+
+def test_axes_of_joints_are_no_coordinates_of_their_centres(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    header = "type," + ",".join(f"{name}_{x}" for name in ("base_axis", "base") for x in "xyz")
+    joints = [(0, 1, 0, 100, 0, 0), (-0.866, -0.5, 0, -50, 86, 0), (0.866, -0.5, 0, -50, -86, 0)]
+    rows = [f"RPS,{','.join(map(str, one))},{one[3] / 2},{one[4] / 2},0" for one in joints]
+    path.write_text("\n".join([f"{header},platform_x,platform_y,platform_z", *rows]))
+    found = read_columns(path, "mm")
+    assert found["base_axes"] == [list(one[:3]) for one in joints]
+    assert found["base_joints"] == [list(one[3:]) for one in joints]
+
+
+@pytest.mark.parametrize("mark", [";", " "])
+@pytest.mark.parametrize("heading", ["ID", "Label", "Name", "Foto-Nr."])
+def test_the_column_of_photographs_is_the_one_that_says_so(
+    heading: str, mark: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.csv"
+    lines = [[heading, "Datei", *(f"Zylinder{j}" for j in range(1, 7))]]
+    lines += [[f"{9 - k}", f"p{k}.jpg", *(f"0,0{k}{j}" for j in range(6))] for k in range(1, 9)]
+    path.write_text("\n".join(map(mark.join, lines)))
+    sheet = ReadingsSheet(path, load_mechanism("hexapod"), "photograph")
+    assert sheet.text("image") == tuple(f"p{k}.jpg" for k in range(1, 9))
+
+
+def test_a_running_number_is_no_photograph(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    path.write_text("ID,1,2,3,4,5,6\n1,0.01,0.02,0.03,0.04,0.05,0.06\n")
+    assert "image" not in ReadingsSheet(path, load_mechanism("hexapod"), "photograph")
 
 
 def test_poses_of_a_tracker_beside_whole_lengths_in_mm_are_read(tmp_path: Path) -> None:

@@ -111,6 +111,7 @@ def test_what_is_written_down_loads_with_an_equal_analysis(
         {"machine_kind": "printed"},
         {"tolerance": {"joints": "0.3 mm", "lengths": 1e-4, "zeros": "0.2 mm"}, "spline_teeth": 25},
         {"tolerance": {"axes": "0.5 deg", "zeros": 1e-3}},
+        {"tolerance": {"travel": "0.02%"}},
     ],
 )
 def test_a_copied_model_says_how_well_the_machine_is_built(

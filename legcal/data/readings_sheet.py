@@ -251,7 +251,8 @@ class _Headings:
         readings = [split_heading(text, known, others=True) for text in header]
         meaning: dict[int, str] = {}
         clock: dict[int, float] = {}  # seconds in a unit of a column of times
-        for i, (key, _) in enumerate(split):
+        for i in sorted(range(len(header)), key=lambda i: _is_vague(header[i])):
+            key = split[i][0]
             for name in _COLUMNS:
                 timed = _TIME.fullmatch(key) if name == "time" else None
                 if (_means(header[i]) == name or timed) and name not in meaning.values():
@@ -331,11 +332,17 @@ class _Headings:
 def _means(heading: str) -> str:
     """Return which of the columns beside readings a heading speaks of, "" if none."""
     what = set(concepts(heading)) - {"name", "number"}
-    if not what and "name" in concepts(heading):
+    if split_heading(heading)[0] == "name":
         return "image"
     if what == {"view", "pose"}:  # camera position
         return "view"
     return next((name for name in _COLUMNS if what == {name}), "")
+
+
+def _is_vague(heading: str) -> bool:
+    """Return whether a heading counts only where no other says the same: name, photo nr."""
+    found = set(concepts(heading))
+    return found == {"name"} or "number" in found
 
 
 def _is_known(unit: str) -> bool:

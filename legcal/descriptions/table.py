@@ -963,7 +963,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     lines = [(number, [_column(text, names) for text in header]), *lines[1:]]
     if {"x", "y"} <= set(lines[0][1]) and len(lines) > 1:
         lines = _from_points(lines, path)
-    coordinates = [_place(text) for text in lines[0][1]]
+    coordinates = [None if text in names else _place(text) for text in lines[0][1]]
     sides = _sides(side for side, *_ in filter(None, coordinates))
     if any(coordinate is not None and coordinate[1] for coordinate in coordinates):
         lines = _from_one_row(lines, coordinates, sides, path)

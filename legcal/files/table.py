@@ -630,7 +630,15 @@ def _delimiter(text: str) -> str:
     """Return the separator of cells, the first that is in most of the lines that are not blank."""
     lines = [line for line in map(str.strip, text.splitlines()) if line]
     counts = {mark: sum(mark in line for line in lines) for mark in ";\t, "}
+    counts[","] -= sum(map(_has_decimal_commas, lines))
     return next((mark for mark, n in counts.items() if 2 * n > len(lines)), ",")
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Return whether all commas of a line are in numbers between blanks (``a.jpg 0,12 0,34``)."""
+    words = line.split()
+    with_comma = [word for word in words if "," in word]
+    return len(words) > 1 and bool(with_comma) and all(map(_COMMA.fullmatch, with_comma))
 
 
 def _with_point(cell: str) -> str:

@@ -164,7 +164,8 @@ class Tolerance:
             unit = "rad" if self.zeros is None else "m"
             zeros = f"{self.zeros or self.angles_at_zero!r} {unit}"
         numbers = {"joints": self.joints, "axes": self.axes, "lengths": self.lengths}
-        stated = {name: x for name, x in {**numbers, "zeros": zeros}.items() if x is not None}
+        others = {"zeros": zeros, "travel": self.travel}
+        stated = {name: x for name, x in {**numbers, **others}.items() if x is not None}
         return {"tolerance": stated} if stated else {}
 
     def completed(self, size: float) -> Tolerance:

@@ -40,8 +40,6 @@ NAMES = tuple(
 _WHAT = "location file"
 _KEY = "legcal_location"
 LOCATION_FILE = OutputFile("the location", _WHAT, _KEY, "a new file or an earlier location")
-_SYMMETRY_TOLERANCE = 1e-9  # relative
-_NEGATIVE_TOLERANCE = 1e-12  # size of a negative eigenvalue, relative to the largest entry
 _Vector = Annotated[
     tuple[Number, Number, Number], BeforeValidator(lambda v: tuple(v) if type(v) is list else v)
 ]
