@@ -248,7 +248,7 @@ class _Headings:
             )
         split = [split_heading(text) for text in header]
         known = (*LENGTH, *READING_ANGLES)
-        readings = [split_heading(text, known, others=True) for text in header]
+        readings = [split_heading(x.replace("°", "deg"), known, others=True) for x in header]
         meaning: dict[int, str] = {}
         clock: dict[int, float] = {}  # seconds in a unit of a column of times
         for i in sorted(range(len(header)), key=lambda i: _is_vague(header[i])):
