@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from boards import before
 from rendering import photograph
+from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
@@ -175,8 +176,10 @@ def projection_errors(truth: Camera, camera: Camera, covariance: Array) -> Array
     return np.asarray(np.sqrt(np.sum(off**2, axis=1) / np.trace(covariance, axis1=1, axis2=2)))
 
 
-def drawings(folder: Path, camera: Camera, n_images: int) -> list[Path]:
-    """Write pictures of the board from all sides, drawn without a scene; return their paths.
+def drawings(
+    folder: Path, camera: Camera, n_images: int, board: Board = BOARD, distance: float = 0.42
+) -> list[Path]:
+    """Write pictures of a chessboard or circles, drawn without a scene; return their paths.
 
     Quick for a camera without distortion.
     """
@@ -189,13 +192,16 @@ def drawings(folder: Path, camera: Camera, n_images: int) -> list[Path]:
     paths = []
     for k in range(n_images):
         turn = np.array([0.5 * np.cos(2.4 * k), 0.5 * np.sin(2.4 * k), rng.uniform(-0.3, 0.3)])
-        T = before(BOARD, 0.42, turn)
+        T = before(board, distance, turn)
         normal = T.rotation.as_matrix()[2]
         direction = rays @ T.rotation.as_matrix().T.astype(np.float32)
         hit = T.translation - direction * (T.translation[2] / (rays @ normal))[..., None]
-        i, j = (np.floor(hit[..., a] / BOARD.side).astype(np.intp) for a in (0, 1))
-        on_board = (i >= -1) & (i < BOARD.columns - 1) & (j >= -1) & (j < BOARD.rows - 1)
-        black = on_board & ((i + j) % 2 == 0)
+        if board.has_circles:
+            black = KDTree(board.points[:, :2]).query(hit[..., :2])[0] < 0.5 * board.marker
+        else:
+            i, j = (np.floor(hit[..., a] / board.side).astype(np.intp) for a in (0, 1))
+            on_board = (i >= -1) & (i < board.columns - 1) & (j >= -1) & (j < board.rows - 1)
+            black = on_board & ((i + j) % 2 == 0)
         levels = np.where(black, 30.0, 190.0).astype(np.float32)
         fine = np.asarray(cv2.GaussianBlur(levels, (0, 0), 0.6 * n))
         image = fine.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
@@ -230,8 +236,8 @@ def together(*sets: BoardImages) -> BoardImages:
     """Return the images of several sets as one."""
     first = np.cumsum([0, *(int(part.image[-1]) + 1 for part in sets)])
     image = [part.image + start for part, start in zip(sets, first, strict=False)]
-    rest = (
+    points, px, sigma_px = (
         np.concatenate([getattr(part, name) for part in sets])
         for name in ("points", "px", "sigma_px")
     )
-    return BoardImages(np.concatenate(image), *rest)
+    return BoardImages(np.concatenate(image), points, px, sigma_px)

@@ -40,6 +40,7 @@ from legcal.calibration.camera_calibration.projection import compare_cameras, pr
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages
+from legcal.vision.board import board_of
 from legcal.vision.camera import intrinsic_names, intrinsic_values, with_intrinsics
 from legcal.vision.camera_file import read_camera
 from legcal.vision.distortion import DistortionModel
@@ -405,6 +406,17 @@ def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> No
     assert tilts[:N_IMAGES] == pytest.approx([0.5] * N_IMAGES, abs=0.05)  # as they were drawn
     assert tilts[N_IMAGES] is None
     assert [i["sigma"] for i in document["intrinsics"]] == found.sigma.tolist()
+
+
+@pytest.mark.parametrize("spec", ["circles:9x6:30mm:20mm", "asymmetric_circles:4x11:20mm:14mm"])
+def test_grids_of_circles_give_the_camera_that_took_them(tmp_path: Path, spec: str) -> None:
+    images = drawings(tmp_path, PINHOLE, 4, board_of(spec), 0.46)
+    found = calibrate_camera(images, spec, model="plumb_bob")
+    assert np.abs((found.values - intrinsic_values(PINHOLE)) / found.sigma).max() < 3.0
+    assert all(image.used for image in found.images)
+    assert found.rms_px < 0.1
+    with pytest.raises(UsageError, match="gaps"):
+        calibrate_camera(images, spec.rsplit(":", 1)[0] + ":30mm")
 
 
 def test_the_file_is_a_camera_info_with_the_whole_covariance(

@@ -54,6 +54,7 @@ from legcal.vision.camera import (
 from legcal.vision.point_pose import closed_form_poses
 
 _MAX_ITERATIONS = 60
+_RIM = 16  # points of a circle by which its image is known
 LOSS = Huber(3.0)  # standard deviations from which a corner counts less and less
 _PRIOR_PX = 10.0  # image widths: prior of focal lengths and principal point
 SHEET = ("warp_x", "warp_y", "twist", "print_ratio")  # numbers of a sheet
@@ -69,6 +70,7 @@ class BoardImages:
     points: Array  # (n, 3) where it is on the board [m]
     px: Array  # (n, 2) where it is seen [px]
     sigma_px: Array  # (n,) standard deviation of either coordinate [px]
+    radius: float = 0.0  # of circles whose centres in the image px are [m]; 0 for corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,10 +271,26 @@ def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residual
     else:
         predicted, by_point = camera.project_with_derivative(P)
         by_intrinsics = np.zeros((*shape, 0))
+    if seen.radius:  # the derivative of this small shift is left out
+        predicted = _centres(camera, P, R, seen.radius, predicted)
     by_turn = cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
     by_pose = np.concatenate([by_turn, by_point], axis=-1)
     by_kept = np.concatenate([by_intrinsics, by_point @ (R @ by_sheet)], axis=-1)
     return Residuals.of(predicted - seen.px, by_kept, by_pose)
+
+
+def _centres(camera: Camera, P: Array, R: Array, radius: float, px: Array) -> Array:
+    """Return the centroids of the images of circles about P (n, 3), whose own images are px (n, 2).
+
+    They differ by perspective and distortion. R (n, 3, 3) is T_camera_board's.
+    """
+    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    rim = radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(_RIM)], axis=-1)
+    here = camera.project(P[:, None] + rim @ np.swapaxes(R, 1, 2)) - px[:, None]
+    following = np.roll(here, -1, axis=1)
+    area = here[..., 0] * following[..., 1] - here[..., 1] * following[..., 0]
+    moment = np.sum((here + following) * area[..., None], axis=1)
+    return np.asarray(px + moment / (3.0 * area.sum(axis=1))[:, None])
 
 
 SAME_ANGLE, SIMILAR_ANGLE = 1e-3, np.deg2rad(3.0)  # between poses of one plane: of an image, a view

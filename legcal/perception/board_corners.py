@@ -39,6 +39,7 @@ _MEASURED_BLUR = 1.4  # where it is so much
 _N_ASKED = 9  # corners by which the blur is known
 _SAME = 0.45  # scale of a search from which on corners are found in the image itself
 _MIN_LINE = 0.34  # of the corners of the line inside it, that an outer line of a lattice has
+_SIGMA_CIRCLE = 0.03  # standard deviation of the centre of a circle [px]
 _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
 
 
@@ -129,12 +130,29 @@ def search_board(
     """Detect a board in an image; a chessboard of any extent."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
     tags = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    if board.has_circles:
+        return _circles(board, grey)
     if board.kind == "chessboard":
         ij, saddles = _chessboard(grey)
     else:
         (ij, saddles), tags = _tags_and_corners(board, grey)
     black = np.where(saddles.contrast > 0.0, 1, -1)
     return SeenBoard(board.kind, ij, saddles.px, saddles.sigma_px, black, *tags)
+
+
+def _circles(board: Board, grey: Grey) -> SeenBoard:
+    """Detect the whole grid of circles by OpenCV; of one that is cut off nothing is found."""
+    how = cv2.SimpleBlobDetector.Params()
+    how.maxArea = float(grey.size)
+    is_plain = board.kind == "circles"
+    layout = cv2.CALIB_CB_SYMMETRIC_GRID if is_plain else cv2.CALIB_CB_ASYMMETRIC_GRID
+    blobs = cv2.SimpleBlobDetector.create(how)
+    with quiet_opencv():
+        found, px = cv2.findCirclesGrid(_eight_bits(grey), board.grid, None, layout, blobs)
+    k = np.arange(board.n_corners if found else 0)
+    ij = np.column_stack([k % board.columns, k // board.columns])
+    at = np.reshape(px, (-1, 2)).astype(np.float64) if found else np.zeros((0, 2))
+    return SeenBoard(board.kind, ij, at, np.full(len(k), _SIGMA_CIRCLE), np.ones_like(k))
 
 
 def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
@@ -427,10 +445,14 @@ def require_board(
         raise NotVisible(problems)
 
 
+_GRIDS = {"circles": "a grid", "asymmetric_circles": "an asymmetric grid"}
+
+
 def board_in_words(board: Board) -> str:
     """Return a board in words."""
-    what = "tags" if board.kind == "aprilgrid" else "squares"
+    what = _things(board) if board.kind in ("aprilgrid", *_GRIDS) else "squares"
     name = {"chessboard": "a chessboard", "charuco": "a ChArUco board", "aprilgrid": "an AprilGrid"}
+    name |= _GRIDS
     return f"{name[board.kind]} of {board.columns} x {board.rows} {what}"
 
 
@@ -571,7 +593,7 @@ def describe_image(
 ) -> str | None:
     """Describe what an image shows instead of the board."""
     grey = np.ascontiguousarray(image, dtype=np.float32)
-    if board.kind != "chessboard" and (markers := _other_markers(board, grey)):
+    if board.dictionary and (markers := _other_markers(board, grey)):
         return markers
     extent, most = search_board(replace(board, kind="chessboard"), grey).extent, _extent(board)
     if extent[1] < _MIN_SIDE:
@@ -583,6 +605,8 @@ def describe_image(
 
 
 def _things(board: Board) -> str:
+    if board.has_circles:
+        return "circles"
     return "tags" if board.kind == "aprilgrid" else "markers"
 
 

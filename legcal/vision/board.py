@@ -26,7 +26,7 @@ from legcal.files.table import is_number
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
 
-BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
+BoardKind = Literal["chessboard", "charuco", "aprilgrid", "circles", "asymmetric_circles"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +34,12 @@ class Board:
     """A flat calibration board."""
 
     kind: BoardKind
-    columns: int  # along x: squares, black and white (chessboard, ChArUco), or tags
+    # along x: squares, black and white (chessboard, ChArUco), tags, or circles in a row
+    columns: int
     rows: int  # along y, the same
-    side: float  # side of a square, or of the black frame of a tag (AprilGrid) [m]
-    marker: float = 0.0  # side of a marker of a ChArUco board [m]; zero for other kinds
+    # side of a square, of the black frame of a tag (AprilGrid), or distance of rows of circles [m]
+    side: float
+    marker: float = 0.0  # side of a marker (ChArUco), diameter of a circle [m]; zero for others
     spacing: float = 0.0  # gap between the tags of an AprilGrid as a part of their side
     dictionary: str = ""  # of markers and tags, as OpenCV names it
     legacy: bool = False  # ChArUco as OpenCV printed it before version 4.6
@@ -47,7 +49,14 @@ class Board:
         """Number of corners along x and along y."""
         if self.kind == "aprilgrid":
             return 2 * self.columns, 2 * self.rows
+        if self.has_circles:
+            return self.columns, self.rows
         return self.columns - 1, self.rows - 1
+
+    @property
+    def has_circles(self) -> bool:
+        """Whether its corners are the centres of circles, of the radius ``marker / 2``."""
+        return self.kind in ("circles", "asymmetric_circles")
 
     @property
     def towards_viewer(self) -> float:
@@ -65,10 +74,13 @@ class Board:
 
         Corner 0 is the origin of a chessboard; the inner corner at (side, side) of a ChArUco board,
         whose origin is the outer corner of its first square; the first corner of tag 0, the
-        origin, of an AprilGrid.
+        origin, of an AprilGrid; the centre of the first circle. In every second row of an
+        asymmetric grid circles are between those of the row before.
         """
-        x, y = (self._along(n) for n in self.grid)
-        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        x, y = np.meshgrid(*(self._along(n) for n in self.grid))
+        if self.kind == "asymmetric_circles":
+            x = 2.0 * x + self.side * (np.arange(self.rows) % 2)[:, None]
+        grid = np.stack([x, y], axis=-1).reshape(-1, 2)
         return np.column_stack([grid, np.zeros(len(grid))])
 
     @cached_property
@@ -77,6 +89,8 @@ class Board:
         if self.kind == "aprilgrid":
             gap = self.spacing * self.side
             low, high = np.array([-gap, -gap]), self.points[-1, :2] + gap
+        elif self.has_circles:
+            low, high = -self.side * np.ones(2), self.points[:, :2].max(axis=0) + self.side
         else:
             first = self.points[0, :2]
             low = first - self.side
@@ -325,6 +339,29 @@ class AprilgridEntry(_BoardEntry):
         )
 
 
+class CirclesEntry(FileSchema):
+    """A grid of dark circles, in the words of ``--board``."""
+
+    kind: Literal["circles", "asymmetric_circles"]
+    circles_x: Annotated[Count, Field(ge=3)]
+    circles_y: Annotated[Count, Field(ge=3)]
+    distance: Side
+    diameter: Side
+
+    @model_validator(mode="after")
+    def _has_gaps(self) -> Self:
+        if not self.diameter < self.distance:
+            raise ValueError(
+                f"found circles of {self.diameter:g} m with a distance of {self.distance:g} m, "
+                "needed gaps between them; exchange distance and diameter, or correct them."
+            )
+        return self
+
+    def board(self) -> Board:
+        """Return the board."""
+        return Board(self.kind, self.circles_x, self.circles_y, self.distance, self.diameter)
+
+
 class _ForeignTarget(FileSchema):
     model_config = ConfigDict(extra="ignore")
 
@@ -459,12 +496,17 @@ FORMS = {
     "chessboard": "chessboard:9x6:25mm (squares, side)",
     "charuco": "charuco:7x5:40mm:29mm:DICT_4X4_50 (squares, side, marker, dictionary)",
     "aprilgrid": "aprilgrid:6x6:88mm:0.3 (tags, side, gap as a part of it)",
+    "circles": "circles:9x7:30mm:15mm (circles, distance, diameter)",
+    "asymmetric_circles": "asymmetric_circles:4x11:20mm:15mm (circles in a row, rows, distance of "
+    "rows, diameter)",
 }
 # The keys of a block in the order of the words of --board
 _KEYS = {
     "chessboard": ("squares_x", "squares_y", "square"),
     "charuco": ("squares_x", "squares_y", "square", "marker", "dictionary", "legacy_pattern"),
     "aprilgrid": ("tags_x", "tags_y", "tag_size", "tag_spacing"),
+    "circles": ("circles_x", "circles_y", "distance", "diameter"),
+    "asymmetric_circles": ("circles_x", "circles_y", "distance", "diameter"),
 }
 _USUAL_SQUARE = 0.025  # [m]: the size does not matter to a camera
 _COUNTS = re.compile(r"(\d{1,4})[xX](\d{1,4})", re.ASCII)
@@ -479,7 +521,7 @@ def board_of(spec: str | Path | Board) -> Board:
     if kind not in FORMS:
         return read_board_file(Path(spec))
     counts, keys = _COUNTS.fullmatch(words[0]) if words else None, _KEYS[kind]
-    n_optional = 0 if kind == "aprilgrid" else 1
+    n_optional = 1 if kind in ("chessboard", "charuco") else 0
     if counts is None or not 0 <= len(keys) - 1 - len(words) <= n_optional:
         raise _refused(str(spec), describe(str(spec)), FORMS[kind])
     block: dict[str, Any] = {"kind": kind, keys[0]: int(counts[1]), keys[1]: int(counts[2])}
@@ -499,6 +541,8 @@ def board_of(spec: str | Path | Board) -> Board:
     if kind == "chessboard":
         block.setdefault("square", _USUAL_SQUARE)
     try:
+        if kind not in _KINDS:  # datasets have no circles
+            return validate(CirclesEntry, block, Path(_OPTION), "board").board()
         return _entry(block, Path(_OPTION)).board()
     except DatasetError as error:
         raise UsageError(error.facts) from error

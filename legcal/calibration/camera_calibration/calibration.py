@@ -203,6 +203,7 @@ class _ShownBoard:
             np.concatenate([self.board.points[corners.number] for corners in tables]),
             np.concatenate([corners.px for corners in tables]),
             np.concatenate([corners.sigma_px for corners in tables]),
+            0.5 * self.board.marker if self.board.has_circles else 0.0,
         )
 
 
@@ -250,7 +251,7 @@ def _shown_in(
     if len(distinct) < MIN_IMAGES:
         same = _by_reason((paths[k].name, reason) for k, reason in copies.items())
         raise too_few_images(len(distinct), [paths[k].name for k in distinct], copies=same)
-    without = set(range(len(paths))).difference(usable) if board.kind != "chessboard" else ()
+    without = set(range(len(paths))).difference(usable) if board.dictionary else ()
     mirrored = {
         k: "mirrored, left and right exchanged"
         for k in sorted(without)

@@ -341,7 +341,11 @@ def _faults(
     points, sheet = corners.points[of_image], adjusted.sheet or Sheet.flat(corners.points)
     only = np.zeros(len(points), dtype=np.intp)
     image = BoardImages(
-        only, sheet.placed(points)[0], corners.px[of_image], corners.sigma_px[of_image]
+        only,
+        sheet.placed(points)[0],
+        corners.px[of_image],
+        corners.sigma_px[of_image],
+        corners.radius,
     )
     plain = adjust_board(camera, [T], image)
     if plain is None:

@@ -161,5 +161,6 @@ def part_of(
         corners.points[is_kept],
         corners.px[is_kept],
         corners.sigma_px[is_kept],
+        corners.radius,
     )
     return part, tuple(images)
