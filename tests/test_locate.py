@@ -166,8 +166,8 @@ def _mirrored() -> Located:
     return replace(hexapod, poses=poses)
 
 
-def _w_first() -> Located:
-    hexapod = located("hexapod", 6)
+def _w_first(n: int = 6) -> Located:
+    hexapod = located("hexapod", n)
     quaternions = Rotation.from_matrix(hexapod.poses.rotation).as_quat()
     wrong = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
     return replace(hexapod, poses=replace(hexapod.poses, rotation=wrong))
@@ -226,10 +226,10 @@ def _loose() -> Located:
         (lambda: _position(np.copy, 20, oriented=np.arange(20) == 4), {}, NotIdentifiable,
          ("orientations of 20 rows", "--angle-sigma")),
         (lambda: _position(_displaced, 4), {}, NotIdentifiable, ("measure them better",)),
-        (lambda: _position(lambda p: 1e3 * p), {}, DatasetError,
-         ("positions in metres",)),
-        (_w_first, {}, DatasetError, ("quaternions x, y, z, w",)),
-        (_mirrored, {}, DatasetError, ("right-handed axes",)),
+        (lambda: _position(lambda p: 1e3 * p), {}, DatasetError, ("millimetres", "1000")),
+        (_w_first, {}, DatasetError, ("order w, x, y, z",)),
+        (lambda: _w_first(20), {}, DatasetError, ("order w, x, y, z",)),
+        (_mirrored, {}, DatasetError, ("left-handed axes", "mirror")),
         (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
         (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
         (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),

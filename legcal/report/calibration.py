@@ -117,7 +117,7 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step
     if calibration.verdict.trustworthy:
         steps.append(
             Step(
-                "Load calibrated.urdf, or the numbers of the table below, into the controller, and "
+                "Load calibrated.urdf, or the numbers of its parameters, into the controller, and "
                 "move to a few poses whose place you can measure."
             )
         )
@@ -149,7 +149,9 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step
                 Step(f"More images help where least is known: {result.weakest[0].in_words}.")
             )
         steps.append(
-            Step("Look at the worst outlines below: blur, reflections and wrong edges show there.")
+            Step(
+                "Look at the worst outlines in report.html: blur, reflections and wrong edges show there."
+            )
         )
     if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
         steps.append(

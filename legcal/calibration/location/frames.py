@@ -4,12 +4,15 @@ Frames are arrays (..., 2, 3, 4): rotation beside position [m] of T_world_base a
 leading dimensions make a batch. They move by steps (..., 12): displacement of the base in the world
 [m], its rotation vector about world axes [rad], and the same of the tool in the platform.
 
-The search needs no start: closed forms on subsets of rows, and robust descent from them.
+The search needs no start: closed forms on subsets of rows, and robust descent from them. If no
+frames explain the poses, common mistakes (units, mirrored axes, orders) are undone one by one to
+name the likeliest.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +32,15 @@ _N_CONTINUED = 12  # best starts, which are continued
 _MAX_ITERATIONS = 30
 _MAX_TURN = 0.5  # [rad] in one step
 _MAX_STALLED = 4  # iterations without a clear decrease of the cost
+# Mistakes
+_BETTER = 10.0  # ratio of residuals before and after a mistake is undone
+_CLEAR = 0.01  # residual, relative to the spread of positions, that ends the search for mistakes
+_MISTAKE_ROWS, _MISTAKE_SUBSETS = 12, 8
+_LENGTHS = (
+    (1e-3, "millimetres", "divide x, y and z by 1000"),
+    (1e-2, "centimetres", "divide x, y and z by 100"),
+    (0.0254, "inches", "multiply x, y and z by 0.0254"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +166,14 @@ class FrameCandidates(NamedTuple):
 def search(
     pairs: PosePairs,
     fewest: int,  # rows that determine the frames
+    *,
+    subsets: int = _SUBSETS,  # number of starts from small subsets of rows
 ) -> FrameCandidates:
     """Return the frames that agree best with most rows, from starts all over SO(3)."""
     if len(pairs) > _MAX_ROWS:
         pairs = pairs.of(np.linspace(0, len(pairs) - 1, _MAX_ROWS).astype(np.intp))
     n_kept = kept_rows(len(pairs), fewest)
-    starts, rows = _starts(pairs, fewest)
+    starts, rows = _starts(pairs, fewest, subsets)
     frames = _descended(pairs, starts, rows.astype(np.float64), _FIRST_ITERATIONS)
     order = np.argsort(_trimmed_cost(frames, pairs, n_kept), kind="stable")[:_N_CONTINUED]
     frames = _descended(pairs, frames[order], n_kept, _MAX_ITERATIONS)
@@ -173,7 +187,7 @@ def kept_rows(n: int, fewest: int) -> int:
     return max(min(n, fewest), (n + fewest + 1) // 2)
 
 
-def _starts(pairs: PosePairs, fewest: int) -> tuple[Array, BoolArray]:
+def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Array, BoolArray]:
     """Return k starts and a mask (k, n) of the rows of each."""
     n = len(pairs)
     rng = np.random.default_rng(0)
@@ -183,7 +197,7 @@ def _starts(pairs: PosePairs, fewest: int) -> tuple[Array, BoolArray]:
         starts.append(_solve_by_kronecker(pairs))
     rows: list[BoolArray] = [np.ones(n, dtype=np.bool_)] * len(starts)
     size = max(_SUBSET, fewest)
-    for k in range(_SUBSETS if n > size else 0):
+    for k in range(subsets if n > size else 0):
         chosen = np.sort(rng.choice(n, size, replace=False)).astype(np.intp)
         subset, R_base = pairs.of(chosen), everywhere[k % len(everywhere)]
         if subset.oriented.sum() >= 3:
@@ -275,3 +289,50 @@ def _best(r: Array, n_kept: int) -> Array:
     """Return weights (k, n): one for the rows of each start with the smallest residuals."""
     rank: IntArray = np.argsort(np.argsort((r**2).sum(axis=2), axis=1, kind="stable"), axis=1)
     return (rank < n_kept).astype(np.float64)
+
+
+def likely_mistake(
+    pairs: PosePairs,
+    cost: float,  # cost of the best candidate
+    fewest: int,  # rows that determine the frames
+) -> tuple[str, str] | None:
+    """Return a description of the likeliest mistake and its remedy, or None."""
+    best, mistake = cost / _spread(pairs) / _BETTER**2, None
+    selected = pairs.of(
+        np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp)
+    )
+    for changed, looks_like, remedy in _alternatives(selected):
+        other = float(search(changed, fewest, subsets=_MISTAKE_SUBSETS).cost[0]) / _spread(changed)
+        if other < best:
+            best, mistake = other / _BETTER**2, (looks_like, remedy)
+            if other < _CLEAR**2:
+                break
+    return mistake
+
+
+def _spread(pairs: PosePairs) -> float:
+    """Return the total variance of the positions in units of ``pairs.length``."""
+    return float(pairs.p.var(axis=0).sum()) / pairs.length**2 + 1e-300
+
+
+def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
+    """Yield the poses with each mistake undone, a description of the mistake, and its remedy."""
+    has_orientations = bool(pairs.oriented.any())
+    for size, unit, remedy in _LENGTHS:
+        yield replace(pairs, p=size * pairs.p), f"positions in {unit}", remedy
+    mirror = np.diag([1.0, 1.0, -1.0])
+    name = "left-handed axes, a mirror image", "give poses in right-handed axes"
+    yield replace(pairs, p=pairs.p @ mirror, M=mirror @ pairs.M @ mirror), *name
+    if not has_orientations:
+        return
+    wrong_order = "quaternions in the order w, x, y, z", "write qx, qy, qz, qw under their names"
+    yield replace(pairs, M=_reordered(pairs.M)), *wrong_order
+    back = np.swapaxes(pairs.M, 1, 2)
+    world = replace(pairs, M=back, p=-np.einsum("nij,nj->ni", back, pairs.p))
+    yield world, "poses of the world in the tool", "give those of the tool in the world"
+
+
+def _reordered(M: Array) -> Array:
+    """Return orientations with quaternions w, x, y, z that were read as x, y, z, w."""
+    quaternions = Rotation.from_matrix(M).as_quat()
+    return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()

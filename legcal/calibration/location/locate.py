@@ -21,6 +21,7 @@ from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit
 from legcal.calibration.location.frames import (
     FrameCandidates,
     jacobian,
+    likely_mistake,
     residuals,
     search,
     transforms,
@@ -41,7 +42,8 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 
 _MAX_OUTLIERS = 4  # rows per outlier at least; one outlier is always allowed
-_MAX_RESIDUAL = 0.2  # spreads of positions, [rad]; larger ones are refused
+# residuals that suggest a mistake, and that are refused [spreads of positions, rad]
+_LARGE_RESIDUAL, _MAX_RESIDUAL = 0.05, 0.2
 _MIN_DOF = 1.0  # smallest degrees of freedom for an estimated scatter
 _MAX_SIGMA, _MAX_TOOL = 2.5, 250.0  # mean leg lengths
 _SAME_CHI2 = 30.0  # largest difference in chi2 of two answers that explain the poses equally well
@@ -143,7 +145,7 @@ def _check_numbers(
 def _check_plausible(
     measurements: ToolMeasurements, candidates: FrameCandidates, name: str
 ) -> None:
-    """Refuse poses that no frames explain.
+    """Refuse poses that no frames explain, naming the likeliest mistake.
 
     Only the rows that agree best are considered: most rows are right, or all share one mistake.
     """
@@ -151,6 +153,15 @@ def _check_plausible(
     spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
     rms = float(np.sqrt(candidates.cost[0]))  # [machine lengths, rad]
     relative = rms / min(1.0, spread / pairs.length + 1e-12)
+    if relative <= _LARGE_RESIDUAL:
+        return
+    mistake = likely_mistake(pairs, float(candidates.cost[0]), measurements.fewest)
+    if mistake is not None:
+        raise DatasetError(
+            f"{name}: base and tool could not be located: found poses that look like {mistake[0]}, "
+            "needed positions in metres and quaternions x, y, z, w of the tool in right-handed "
+            f"axes of the world; {mistake[1]}."
+        )
     if relative > _MAX_RESIDUAL:
         size = f"{1e3 * rms * pairs.length:.3g} mm"
         turn = f" or {np.degrees(rms):.3g} deg" * measurements.is_oriented
