@@ -150,7 +150,8 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step
             )
         steps.append(
             Step(
-                "Look at the worst outlines in report.html: blur, reflections and wrong edges show there."
+                "Look at the worst outlines in report.html: blur, reflections and wrong edges "
+                "show there."
             )
         )
     if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
