@@ -36,10 +36,6 @@ class PlacedModel(NamedTuple):
     standing: Array  # (n_motors, 2, 3) their rails and axes
     moving: Array  # (k, m, 2, 3) carriages, arms, and bars between the joints of one motor
 
-    def moved_towards(self, other: PlacedModel, share: float) -> PlacedModel:
-        """Return the geometry at a share of the difference to another model, or beyond it."""
-        return PlacedModel(*(a + share * (b - a) for a, b in zip(self, other, strict=True)))
-
 
 class MachineScene:
     """A machine with the models that it is compared with.
