@@ -198,3 +198,4 @@ def test_poses_of_a_tracker_beside_whole_lengths_in_mm_are_read(tmp_path: Path) 
     found = read_tool_poses(path, machine)
     np.testing.assert_allclose(found.q, q, atol=6e-8)
     np.testing.assert_allclose(found.position, poses, atol=6e-8)
+    assert "readings are in mm, as the heading says, whole lengths" in found.notes[-1]

@@ -132,6 +132,9 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     table.check()
     q = np.full((len(table), machine.n_legs), math.nan)
     q[:, list(machine.motors)] = readings
+    if sheet is not None:
+        read = sheet.readings()
+        notes = (*notes, f"{path}: readings are in {read.unit}, {read.unit_from}.")
     if worst > _NORM_TOLERANCE:
         notes = (
             *notes,
