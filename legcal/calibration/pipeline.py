@@ -429,8 +429,8 @@ def _leaves_out_many(estimate: Estimate) -> bool:
         return False
     shown = o.choose(is_measurable(o))
     images, legs = (
-        np.bincount(of, shown.used)[np.unique(of)] / np.bincount(of)[np.unique(of)]
-        for of in (shown.row, shown.leg)
+        np.bincount(of, shown.used)[n > 0] / n[n > 0]
+        for of, n in ((of, np.bincount(of)) for of in (shown.row, shown.leg))
     )
     return bool(np.mean(images < _LEAST_OF_IMAGE) > MAX_LEFT_OUT or legs.min() < _LEAST_OF_LEG)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -104,9 +104,11 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     Raises DatasetError with one sentence for each problem, naming row and column.
     """
     joints = [column.name for column in reading_columns(machine.legs)]
-    sheet = None
-    if not any(re.search(rf"\b{re.escape(joint)}\b", _first_line(path)) for joint in joints):
+    sheet = read = None
+    header = _first_line(path)
+    if not any(re.search(rf"\b{re.escape(joint)}\b", header) for joint in joints):
         sheet = ReadingsSheet(path, machine, "pose")
+        read = sheet.readings()
     table = read_table(
         path,
         "table of tool poses",
@@ -114,7 +116,11 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         [*reading_columns(machine.legs), *_COLUMNS],
         needed="a row for each pose; measure some",
         unknown=lambda name: _about_angles(path, name),
-        reshape=None if sheet is None else lambda lines: _tool_columns(lines, sheet, joints),
+        reshape=(
+            None
+            if sheet is None or read is None
+            else lambda lines: _tool_columns(lines, sheet.taken, read.q, joints)
+        ),
     )
     readings, notes = readings_in(table, machine.legs)
     position = table.numbers(_POSITION)
@@ -132,8 +138,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     table.check()
     q = np.full((len(table), machine.n_legs), math.nan)
     q[:, list(machine.motors)] = readings
-    if sheet is not None:
-        read = sheet.readings()
+    if read is not None:
         notes = (*notes, f"{path}: readings are in {read.unit}, {read.unit_from}.")
     if worst > _NORM_TOLERANCE:
         notes = (
@@ -157,10 +162,14 @@ def _first_line(path: Path) -> str:
     return next((line for line in text.splitlines() if line.strip()), "")
 
 
-def _tool_columns(lines: Lines, sheet: ReadingsSheet, joints: Sequence[str]) -> Lines:
-    """Return lines under our names in metres and radians, with the readings of their sheet."""
+def _tool_columns(
+    lines: Lines,
+    taken: Mapping[str, str],  # meaning of each heading that the sheet of readings uses
+    q: Array,  # (n_rows, n_motors) [m or rad]
+    joints: Sequence[str],
+) -> Lines:
+    """Return lines under our names in metres and radians, with readings."""
     (number, header), below = lines[0], lines[1:]
-    readings = sheet.readings()
     known = {split_heading(column.name)[0]: column.name for column in _COLUMNS}
     names, factors = dict[int, str](), dict[int, Decimal]()
     for i, text in enumerate(header):
@@ -168,12 +177,12 @@ def _tool_columns(lines: Lines, sheet: ReadingsSheet, joints: Sequence[str]) -> 
         found = set(concepts(text)) - {"tool", "joint", "pose"}
         axis = found.pop() if len(found) == 1 else ""
         name = axis if axis in _POSITION else known.get(key, "")
-        if name or sheet.taken.get(text) not in (*joints, "view", "image", "pose", "time"):
+        if name or taken.get(text) not in (*joints, "view", "image", "pose", "time"):
             names[i] = name or text.lower()
             factors[i] = Decimal(repr({**LENGTH, **ANGLE}.get(unit, 1.0)))
     rows: Lines = []
-    for (line, cells), q in zip(below, readings.q.tolist(), strict=True):
-        rows.append((line, [*map(str, q), *(in_unit(cells[i], factors[i]) for i in names)]))
+    for (line, cells), of_row in zip(below, q.tolist(), strict=True):
+        rows.append((line, [*map(str, of_row), *(in_unit(cells[i], factors[i]) for i in names)]))
     return [(number, [*joints, *names.values()]), *rows]
 
 
