@@ -41,7 +41,6 @@ from legcal.machine.leg import (
 )
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
-    free_coordinates,
     geometries,
     moved_legs,
     to_vector,
@@ -423,12 +422,6 @@ def disturbed_start(
 def joint_errors(parameters: KinematicParameters) -> Array:
     """Return the errors of the free parameters [m]."""
     return to_vector(parameters, FRAME_LEGS) - to_vector(TRUTH, FRAME_LEGS)
-
-
-def gauge_is_kept(parameters: KinematicParameters) -> bool:
-    """Return whether the coordinates that define the frames are still exactly zero."""
-    fixed = ~free_coordinates(6, FRAME_LEGS)
-    return not (parameters.base_joints[fixed].any() or parameters.platform_joints[fixed].any())
 
 
 def _camera_around(angle: float) -> RigidTransform:

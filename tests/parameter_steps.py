@@ -1,13 +1,10 @@
 """Legs with other parameters, and the models that are written of them, for tests."""
 
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
@@ -33,12 +30,3 @@ def written_with(
     write_urdf(nominal, legs, folder / "other.urdf")
     write_calibrated_yaml(nominal, folder / "other.yaml", "other.urdf")
     return load_mechanism(folder / "other.yaml")
-
-
-def with_joints(geometry: Sequence[Leg], parameters: KinematicParameters) -> tuple[Leg, ...]:
-    """Return legs with other joint centres and offsets; passive legs keep theirs."""
-    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
-    return tuple(
-        replace(leg, A=A, B=B, q0=float(q0))
-        for leg, (A, B), q0 in zip(geometry, joints, parameters.offsets, strict=True)
-    )

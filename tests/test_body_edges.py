@@ -47,9 +47,8 @@ def error(session: MachineSession, solution: Solution) -> float:
     return float(max(np.abs(a.A - b.A).max() + np.abs(a.B - b.B).max() for a, b in pairs))
 
 
-@pytest.mark.parametrize("name", ["hexapod", "3-rps"])
-def test_a_leg_with_a_body_and_no_round_part_is_found_exactly(name: str) -> None:
-    session = machine_session(name)
+def test_a_leg_with_a_body_and_no_round_part_is_found_exactly() -> None:
+    session = machine_session("3-rps")
     solution = fitted(session, body_edges(session), without_leg(session, 0))
     assert error(session, solution) < 1e-7
     start = zip(session.start.legs, session.truth.legs, strict=True)

@@ -149,11 +149,6 @@ def test_files_of_other_programs_and_open_loops_get_their_sentence(
         load_mechanism(path)
 
 
-def test_a_file_is_xml_by_its_content(tmp_path: Path) -> None:
-    path = write_head_urdf(tmp_path).rename(tmp_path / "head.urdf.txt")
-    _check(load_mechanism(path))
-
-
 @pytest.fixture(scope="module")
 def reachy_mini() -> Path:
     """The descriptions of the robot Reachy Mini, as its package has them."""

@@ -236,18 +236,6 @@ def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
 # Files, refusals and notes.
 
 
-def test_an_interrupted_run_leaves_nothing_behind(
-    planar: tuple[Path, Calibration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*args: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("legcal.calibration.result_folder.write_observations", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        calibrate(planar[0], output=tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(
     ("shown", "named"),

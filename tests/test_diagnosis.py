@@ -47,10 +47,8 @@ def test_a_fit_with_exchanged_columns_is_not_trusted_and_they_are_named(tmp_path
     assert [one["kind"] for one in block] == ["columns exchanged"]
 
 
-@pytest.mark.parametrize("model", ["3-rpr", "hexapod-strut"])
-def test_every_mistake_can_be_tried_on_every_kind_of_machine(model: str, tmp_path: Path) -> None:
-    """Legs of other types, passive ones, a plane: joints are known or left out."""
-    dataset = load_dataset(simulated(tmp_path / "set", model).folder)
+def test_every_mistake_can_be_tried_on_a_machine_with_a_passive_leg(tmp_path: Path) -> None:
+    dataset = load_dataset(simulated(tmp_path / "set", "hexapod-strut").folder)
     data = order_dataset(dataset, in_turn, no_progress)
     tried = mistakes(data)
     kinds = {"columns exchanged", "columns rotated", "readings shifted", "handedness"}
@@ -172,21 +170,10 @@ def _with_readings(d: Dataset, change: Callable[[Array], Array]) -> Dataset:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(
-    ("change", "kinds", "what"),
-    [
-        (np.deg2rad, {"unit", "direction of encoders"}, "the readings appear to be radians"),
-    ],
-)
-def test_wrong_readings_of_arms_are_named(
-    delta: Dataset,
-    change: Callable[[Array], Array],
-    kinds: set[str],
-    what: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    found = _diagnosed(_with_readings(delta, change), kinds, monkeypatch)
-    assert found.what.startswith(what)
+def test_wrong_readings_of_arms_are_named(delta: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = {"unit", "direction of encoders"}
+    found = _diagnosed(_with_readings(delta, np.deg2rad), kinds, monkeypatch)
+    assert found.what.startswith("the readings appear to be radians")
     assert found.after >= 11 > found.before
 
 

@@ -18,7 +18,6 @@ from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Run
 from lxml import html
-from numpy.testing import assert_allclose
 from rich.console import Console
 from simulated import simulated
 
@@ -33,7 +32,6 @@ from legcal import (
 from legcal.calibration import doubts, verdict
 from legcal.calibration.doubts import Doubt, model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
-from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, FocalLength
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
@@ -145,7 +143,6 @@ def _tolerance_and_hint(found: dict[str, Any]) -> None:
 
 
 _stated_wrongly = _yaml(_tolerance_and_hint)
-_travel_known_to_a_thousandth = _yaml(lambda found: found.update(tolerance={"travel": "0.1 %"}))
 
 
 @pytest.mark.parametrize(
@@ -154,7 +151,6 @@ _travel_known_to_a_thousandth = _yaml(lambda found: found.update(tolerance={"tra
         ("noise", _table("observations.csv", _overrated), "all views scatter"),
         ("reading_noise", BACKLASH, "leg1 scatter"),
         ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
-        ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
         ("few_outlines", _rejected(lambda row: row["edge"] == "1"), "50 %"),
         ("tolerance", _stated_wrongly, "tolerance 0.02"),
         ("strayed_camera", _stated_wrongly, "view c2"),
@@ -180,41 +176,17 @@ def _length(machine: Machine, other: str, times: float = 1.0) -> str:
     return f"leg1.base:{other}.base={length:.6f}+-0.05mm"
 
 
-@pytest.mark.parametrize(
-    ("times", "wrong"),
-    [
-        ((1.02,), "the stated leg1.base:leg2.base"),
-        pytest.param(*((1.02, 1.02), "the travel of the motors"), marks=pytest.mark.system),
-        ((1.0, 1.0), ""),
-    ],
-)
-def test_the_witness_of_the_scale_that_others_contradict_is_named_alone(
-    times: tuple[float, ...], wrong: str, session: Path
-) -> None:
+def test_the_witness_of_the_scale_that_others_contradict_is_named_alone(session: Path) -> None:
     true = load_mechanism(next((session / "truth/models").glob("*.yaml")))
-    stated = [_length(true, f"leg{k}", x) for k, x in enumerate(times, 2)]
-    calibration = calibrate(session, priors=stated)
-    assert [one.code for one in calibration.doubts] == (["scale"] if wrong else [])
-    for doubt in calibration.doubts:
-        assert "the machine is 2 % larger than by" in doubt.what
-        assert f"the likelier wrong is {wrong}, as the others agree without it" in doubt.what
-        assert doubt.sigma_dX_m is not None
-        assert calibration.platform is not None
-        assert doubt.sigma_dX_m > calibration.platform.sigma.mean_displacement
-
-
-def test_an_error_of_all_travel_is_stated_beside_sigma_as_large_as_it_may_be(
-    healthy: Calibration, calibrated: Callable[[Spoil], Calibration]
-) -> None:
-    stated = calibrated(_travel_known_to_a_thousandth)
-    assert "travel of the motors alone; an error of 0.20% of the" in healthy.verdict.sentence
-    assert "an error of 0.10% of the travel (1 sigma) moves" in stated.verdict.sentence
-    by_default, halved = (
-        next(effect.error for effect in found.platform.effects if effect.what == ALL_READINGS)
-        for found in (healthy, stated)
-        if found.platform is not None
-    )
-    assert_allclose(halved.displacement, 0.5 * by_default.displacement, rtol=0.05)
+    calibration = calibrate(session, priors=[_length(true, "leg2", 1.02)])
+    (doubt,) = calibration.doubts
+    assert doubt.code == "scale"
+    assert "the machine is 2 % larger than by" in doubt.what
+    wrong = "the stated leg1.base:leg2.base"
+    assert f"the likelier wrong is {wrong}, as the others agree without it" in doubt.what
+    assert doubt.sigma_dX_m is not None
+    assert calibration.platform is not None
+    assert doubt.sigma_dX_m > calibration.platform.sigma.mean_displacement
 
 
 def test_a_stated_length_that_is_the_nominal_one_is_asked_about(session: Path) -> None:
@@ -323,7 +295,7 @@ def test_verdict_document_summary_and_next_step_follow_any_doubt(
         assert first.what == "Something is wrong. Mend it, and calibrate again."
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 8])
+@pytest.mark.parametrize("count", [0, 8])
 def test_the_first_screen_has_24_lines_of_80_columns(
     count: int, healthy: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:

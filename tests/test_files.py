@@ -2,12 +2,7 @@
 
 import errno
 import os
-import signal
-import subprocess
-import sys
 import tempfile
-import textwrap
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -148,33 +143,6 @@ def test_an_interrupted_move_leaves_everything_as_it_was(
         write_result(out, begin)
     assert contents(out) == before
     assert list(out.parent.iterdir()) == [out]
-
-
-def test_a_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(out: Path) -> None:
-    before = contents(out)
-    script = textwrap.dedent(
-        f"""
-        import time
-        from pathlib import Path
-        from legcal.files.folder import result_folder
-        with result_folder(Path({str(out)!r})) as folder:
-            (folder / "result.json").write_text("half")
-            print("writing", flush=True)
-            time.sleep(60)
-        """
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, cwd=Path(__file__).parents[1]
-    ) as run:
-        assert run.stdout is not None
-        assert run.stdout.readline() == b"writing\n"
-        run.send_signal(signal.SIGKILL)
-        run.wait(timeout=10.0)
-    assert contents(out) == before
-    start = time.monotonic()
-    write_result(out)
-    assert time.monotonic() - start < 1.0
-    assert contents(out) == REPLACED
 
 
 REFUSED: dict[str, tuple[dict[str, str | None], str, str]] = {  # files, destination, named

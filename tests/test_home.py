@@ -42,17 +42,6 @@ def check_closed(machine: Machine) -> None:
     assert np.abs(constraints(machine, machine.home)[0]).max(initial=0.0) < 2e-13
 
 
-@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "3-upu", "tricept", "delta"])
-def test_a_slightly_wrong_home_is_projected_onto_all_constraints(name: str, tmp_path: Path) -> None:
-    nominal = machine_of(name)
-    off = displaced(nominal.home, np.random.default_rng(3).normal(0.0, 5e-4, 6))
-    machine = load_mechanism(write_home(tmp_path, name, off))
-    check_closed(machine)
-    moved = np.abs(machine.home.as_matrix() - off.as_matrix()).max()
-    free = nominal.spatial and not len(constraints(nominal, nominal.home)[0])
-    assert moved < 1e-15 if free else 0.0 < moved < 5e-3
-
-
 @pytest.mark.parametrize(
     ("description", "carried"),
     [("6-UPS", True), ("3-RPR, tilted plane", False), ("3-UPU", True), ("Tricept", False)],
@@ -94,17 +83,6 @@ def test_without_a_home_one_at_mid_travel_above_the_base_is_found(
             assert leg.travel[0] <= value <= leg.travel[1]
     assert machine.home.apply(machine.B_platform)[:, 2].mean() > -1e-9
     assert machine.home.rotation.magnitude() < np.deg2rad(60.0)
-
-
-@pytest.mark.parametrize("description", ["3-RPR, tilted plane", "hexapod with a rod"])
-def test_a_home_is_found_for_general_machines(description: str, tmp_path: Path) -> None:
-    path = write_machine(tmp_path, MACHINES[description](), Layout(home=False))
-    machine = load_mechanism(path)
-    check_closed(machine)
-    motors = list(machine.motors)
-    middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
-    q = readings_at(machine, machine.home)
-    np.testing.assert_allclose(q[motors], middle[motors], atol=1e-9)
 
 
 def test_that_there_is_no_home_at_all_is_said(

@@ -102,16 +102,10 @@ def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None
     np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["3-RPR", "hexapod with a strut"],
-)
-def test_planned_poses_close_every_leg_inside_its_travel(
-    name: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_planned_poses_close_every_leg_inside_its_travel(tmp_path: Path) -> None:
     """Pinocchio closes the loops of the nominal machine; ours is a micrometre away from it."""
-    folder = tmp_path_factory.getbasetemp() / name.replace(" ", "_")
-    machine = legcal.load_mechanism(write_machine(folder / "m", MACHINES[name](), Layout()))
+    drawn = MACHINES["Tricept"]()
+    machine = legcal.load_mechanism(write_machine(tmp_path / "m", drawn, Layout()))
     session = planned_session(machine, [range(machine.n_legs)], 8)
     assert len(session.t) == 8
     for j, (leg, nominal) in enumerate(zip(session.legs, machine.legs, strict=True)):
@@ -125,7 +119,7 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             assert nominal.travel[0] - slack < q.min()
             assert q.max() < nominal.travel[1] + slack
     assert np.ptp(session.u, axis=0).max() > 0.02
-    if machine.is_determined and "strut" not in name:
+    if machine.is_determined:
         q = machine.sign * (session.length - machine.q0)
         q[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
         for T, R, t in zip(

@@ -19,7 +19,6 @@ from fit_sessions import (
     axes_session,
     corners_of,
     disturbed_start,
-    gauge_is_kept,
     irregular_hexapod,
     joint_errors,
     machine_session,
@@ -49,11 +48,9 @@ from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.geometry.types import Array
-from legcal.machine.leg import ARMS, Leg, ParameterId, parameters_of_legs, radius_name
-from legcal.machine.parameters import moved_legs, parametrize
+from legcal.machine.leg import ARMS, ParameterId, parameters_of_legs, radius_name
+from legcal.machine.parameters import parametrize
 from legcal.simulation.observe import moved_outlines
-
-SCALE = 2.5
 
 
 def true_values(session: MachineSession) -> dict[str, float]:
@@ -288,19 +285,6 @@ def small() -> HexapodSession:
     return irregular_hexapod(6, legs_seen=5)
 
 
-def test_a_hexapod_is_found_from_5_mm_and_3_degrees_away() -> None:
-    session = irregular_hexapod(8, camera=LENS, shared_poses=True)
-    start = disturbed_start(session, joints=0.005, camera=0.02, angle=np.deg2rad(3.0))
-    assert np.abs(joint_errors(parameters_of_legs(start.legs))).min() > 0.0045
-    found = refine(session.legs, session.measurements, session.outlines, start)
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
-    assert gauge_is_kept(found.parameters)
-    assert found.outlines.used.all()
-    for pose, true in zip(found.T_Rb_Re, session.T_Rb_Re, strict=True):
-        assert np.linalg.norm((pose.inv() * true).translation) < 1e-9
-        assert (pose.inv() * true).rotation.magnitude() < 1e-8
-
-
 def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign() -> None:
     session, sign = irregular_hexapod(12), np.array([1, -1, 1, 1, -1, 1])
     shown = replace(session.outlines, used=session.outlines.leg != 2)
@@ -409,68 +393,6 @@ def noisy(name: str) -> MachineSession:
 @cache
 def fitted(session: MachineSession) -> Solution:
     return refine(session.legs, session.measurements, session.outlines, session.start)
-
-
-@cache
-def noisy_fit(name: str) -> tuple[MachineSession, Solution]:
-    session = noisy(name)
-    return session, fitted(session)
-
-
-def test_where_the_fit_starts_does_not_show_in_the_result() -> None:
-    session, one = noisy_fit("tricept")
-    legs = session.legs
-    units = np.array(legs.parametrization.units)
-    step = np.random.default_rng(5).choice([-1.0, 1.0], len(units))
-    step *= np.where(units == "m", 0.003, np.deg2rad(1.0))
-    elsewhere = moved_legs(legs.nominal, legs.parametrization.place, step)
-    other = fitted(replace(session, start=replace(session.start, legs=elsewhere)))
-    assert len(one.estimates.names) >= len(units) - 1  # the twist of a Tricept is fixed
-    names = one.estimates.names
-    away = other.estimates.vector(names) - one.estimates.vector(names)
-    assert np.abs(away / one.estimates.sigma).max() < 1e-3
-    assert other.quality.cost == pytest.approx(one.quality.cost, rel=1e-6)
-
-
-def test_a_machine_in_another_size_gives_the_same_in_that_size() -> None:
-    session, found = noisy_fit("tricept")
-    again = fitted(scaled(session))
-    assert again.estimates.names == found.estimates.names
-    unit = np.where([found.estimates.units[n] == "m" for n in found.estimates.names], SCALE, 1.0)
-    values, others = (
-        solution.estimates.vector(found.estimates.names) for solution in (found, again)
-    )
-    assert np.abs((others / unit - values) / found.estimates.sigma).max() < 1e-3
-    np.testing.assert_allclose(again.estimates.sigma / unit, found.estimates.sigma, rtol=1e-4)
-    assert again.quality.rms_px == pytest.approx(found.quality.rms_px)
-
-
-def scaled(session: MachineSession) -> MachineSession:
-    """Return a session in which all lengths are larger; images stay as they are."""
-    m, legs, start = session.measurements, session.legs, session.start
-
-    def motion(T: RigidTransform) -> RigidTransform:
-        return RigidTransform.from_components(SCALE * T.translation, T.rotation)
-
-    return replace(
-        session,
-        measurements=replace(m, q=SCALE * m.q, sigma_q=SCALE * m.sigma_q),
-        legs=replace(
-            legs,
-            nominal=larger(legs.nominal),
-            radii={part: SCALE * r for part, r in legs.radii.items()},
-        ),
-        start=Start(
-            larger(start.legs),
-            tuple(map(motion, start.T_camera_Rb)),
-            tuple(map(motion, start.T_Rb_Re)),
-            start.label,
-        ),
-    )
-
-
-def larger(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
-    return tuple(replace(leg, A=SCALE * leg.A, B=SCALE * leg.B, q0=SCALE * leg.q0) for leg in legs)
 
 
 def test_exact_axes_give_the_truth() -> None:

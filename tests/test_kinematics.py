@@ -57,17 +57,6 @@ def without_a_motor(name: str) -> Machine:
 # --- a shipped machine of each kind --------------------------------------------------------------
 
 
-def test_the_mobility_is_the_rank_of_the_platforms_motions(name: str) -> None:
-    machine = machine_of(name)
-    spins = sum(leg.idle_spins for leg in machine.legs)
-    for configuration in drawn_of(name).configurations[:3]:
-        motions = free_motions(machine, configuration)
-        twists = machine.chain.twist(machine.base, machine.platform) @ motions
-        values = np.linalg.svd(twists, compute_uv=False)
-        assert int(np.sum(values > 1e-6)) == machine.mobility == len(machine.motors)
-        assert motions.shape[1] == machine.mobility + spins
-
-
 def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: str) -> None:
     machine, drawn = machine_of(name), drawn_of(name)
     lower, upper = np.array([leg.travel for leg in machine.legs]).T

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 from model_formats import FORMATS, write_format
-from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_mechanism
@@ -21,12 +20,8 @@ from legcal.machine.chain import ClosedChain
 from legcal.machine.mjcf import MjcfReader
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import (
-    reload_and_check,
-    write_calibrated_yaml,
     write_model,
-    write_urdf,
 )
-from legcal.machine.parameters import geometries
 from legcal.machine.spanning_tree import close_loop
 from legcal.machine.urdf import XmlProblems, parse_xml
 
@@ -67,25 +62,6 @@ def test_every_format_gives_the_same_analysis(name: str, machine: str, tmp_path:
     if not name.startswith("mjcf"):  # these have no pose where they are closed
         found = replace(found, home=expected.home)
     assert_same_analysis(found, expected)
-
-
-def test_a_calibrated_model_of_another_format_is_complete(tmp_path: Path) -> None:
-    nominal = load_mechanism(write_format(machine_of("hexapod"), "mjcf sites", tmp_path))
-    rng = np.random.default_rng(3)
-    known = nominal.parameters
-    base, platform = known.base_joints.copy(), known.platform_joints.copy()
-    moved = [j for j in range(6) if j not in nominal.frame_legs]
-    base[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
-    platform[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
-    offsets = known.offsets + rng.uniform(-1e-3, 1e-3, 6)
-    calibrated = replace(known, base_joints=base, platform_joints=platform, offsets=offsets)
-    write_urdf(nominal, with_joints(geometries(nominal), calibrated), tmp_path / "calibrated.urdf")
-    write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf")
-    written = reload_and_check(tmp_path / "calibrated.yaml")
-    assert written.leg_names == nominal.leg_names
-    for key in ("base_joints", "platform_joints", "offsets"):
-        found, wanted = getattr(written.parameters, key), getattr(calibrated, key)
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
 
 
 def test_what_is_written_down_loads_with_an_equal_analysis(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def test_counts_by_analogy_are_those_written_out() -> None:
     assert (eq12.equations, eq12.unknowns) == (6 + 2 * 3 + 1, 3 + 9 + 3 * 2)
 
 
-@pytest.mark.parametrize("name", ["hexaglide", "delta", "3-prs"])
+@pytest.mark.parametrize("name", ["hexaglide", "delta"])
 def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: str) -> None:
     analysis = Analysis(session(name))
     assert (analysis.full.rank, analysis.full.of) == (RANKS[name], RANKS[name])

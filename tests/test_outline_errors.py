@@ -381,11 +381,6 @@ def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> N
     assert " px to 0." in note
 
 
-@pytest.mark.parametrize("level", [0.03])
-def test_a_fit_with_the_usual_rounds_converges(session: HexapodSession, level: float) -> None:
-    assert _fit_in_rounds(session, level, DEFAULT_SETTINGS.noise_rounds).notes == ()
-
-
 def test_inliers_that_change_have_not_converged() -> None:
     sizes, claimed = np.array([1.0, 0.0, 0.0]), np.broadcast_to(0.01 * np.eye(2), (100, 2, 2))
     assert check_convergence(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()

@@ -175,16 +175,12 @@ def test_a_solid_hides_and_its_edges_are_not_taken_for_outlines(name: str) -> No
     assert np.all(share < 0.6) if name == "before half of it" else np.all(share == 1.0)
 
 
-@pytest.mark.parametrize(
-    ("level", "blur"),
-    [(252.0, 0.5), (300.0, 1.0)],
-)
-def test_a_saturated_background_moves_no_outline(level: float, blur: float) -> None:
+def test_a_saturated_background_moves_no_outline() -> None:
     cam = camera()
     bars = [bar(-0.05, 0.02, 60.0), bar(0.06, 0.02, 60.0)]
     behind = np.full((270, 360), 120.0)
-    behind[:, 181:] = level  # behind the second leg
-    image = render(cam, bars, behind, blur=blur, noise=1.0, supersample=3)
+    behind[:, 181:] = 300.0  # behind the second leg
+    image = render(cam, bars, behind, blur=1.0, noise=1.0, supersample=3)
     clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
     found, seen = detect_with_blur(cam, bars, clipped, off=1e-3)
     assert np.all(found.used), found.reason
@@ -192,7 +188,7 @@ def test_a_saturated_background_moves_no_outline(level: float, blur: float) -> N
     sigma = np.sqrt([np.diag(c) for c in found.covariance])
     assert np.abs(error).max() < 0.15
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
-    assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.15)  # with that of the pixels
+    assert seen == pytest.approx(np.hypot(1.0, 0.29), rel=0.15)  # with that of the pixels
 
 
 def test_outlines_are_rejected_where_saturation_leaves_nothing_of_the_step() -> None:

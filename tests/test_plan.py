@@ -33,7 +33,6 @@ from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.configurations import Configurations
 from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.leg import Cylinder
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning import places as camera_places
@@ -361,28 +360,6 @@ def test_what_cannot_be_planned_is_refused(
         legcal.plan("3-rpr", **({"cameras": 2} | asked))
     assert len(refusal.value.problems) == 1
     assert named in str(refusal.value)
-
-
-def test_a_machine_whose_legs_always_collide_says_so() -> None:
-    """Its legs touch when it sinks or tilts, and counterweights below its base when it rises."""
-    machine = load_mechanism("3-rps")
-    A, B = machine.A_base, machine.home.apply(machine.B_platform)
-    u = (B - A) / np.linalg.norm(B - A, axis=1)[:, None]
-
-    def touching(end: float, start: float, nearest: float) -> Cylinder:
-        """Return a cylinder from start to end [m] that all but touches that of the next leg."""
-        gap = float(np.linalg.norm((A[0] + nearest * u[0]) - (A[1] + nearest * u[1])))
-        of_leg = machine.legs[0].cylinders[0]
-        return replace(of_leg, start=start, end=end, radius=0.5 * gap * (1.0 - 1e-9))
-
-    both = touching(0.3, 0.0, 0.3), touching(-0.2, -0.3, -0.2)
-    legs = tuple(replace(leg, cylinders=both) for leg in machine.legs)
-    with pytest.raises(DidNotConverge) as refusal:
-        legcal.plan(replace(machine, legs=legs), images=6)
-    message = str(refusal.value)
-    assert "found 0 that the machine reaches in 300 draws" in message
-    assert "excluded 300 times by collisions of legs" in message
-    assert "check radii and ends of the cylinders" in message
 
 
 def test_photographs_of_one_site_share_errors_at_its_places() -> None:

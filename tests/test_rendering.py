@@ -355,38 +355,6 @@ def profiles(image: Array, camera: Camera, ends: Array, other: Array) -> Array:
     return np.asarray(found, dtype=np.float64)
 
 
-def outward_errors(levels: Array) -> Array:
-    """Return how far outside of an outline the edge is [px]: areas of profiles between two levels.
-
-    Profiles that another edge crosses have no constant level at one end, and are left out.
-    """
-    flat = round(2.0 / STEP)
-    inside, outside = levels[:, :flat], levels[:, -flat:]
-    step = outside.mean(axis=1) - inside.mean(axis=1)
-    clean = np.maximum(np.ptp(inside, axis=1), np.ptp(outside, axis=1)) < 0.01 * np.abs(step)
-    levels, step, first = levels[clean], step[clean], inside[clean].mean(axis=1)
-    covered = 1.0 - (levels - first[:, None]) / step[:, None]
-    return np.asarray((covered.sum(axis=1) - 0.5) * STEP - REACH)
-
-
-def test_clean_photographs_show_the_true_outlines_on_both_sides(tmp_path: Path) -> None:
-    dataset = photographs("tricept", tmp_path, (640, 480), Appearance.clean())
-    truth, (view,) = true_outlines(dataset), dataset.measurements.views
-    image = picture(dataset)
-    medians: dict[int, list[float]] = {1: [], 2: []}
-    for i in range(len(truth.row)):
-        same = (truth.leg == truth.leg[i]) & (np.array(truth.part) == truth.part[i])
-        (pair,) = np.flatnonzero(same & (truth.edge != truth.edge[i]))
-        levels = profiles(image, view.camera, truth.ends[i], truth.ends[pair])
-        errors = outward_errors(levels)
-        if len(errors) > 40:
-            medians[int(truth.edge[i])].append(float(np.median(errors)))
-    for side in medians.values():
-        assert len(side) >= 3
-        assert np.abs(side).max() < 0.02
-        assert abs(np.mean(side)) < 0.01
-
-
 OF_EACH_CLASS = ("tricept", "3-rpr", "3-rps", "3-upu", "hexapod-rod", "hexaglide", "delta")
 
 

@@ -163,15 +163,6 @@ def _with_radius(radius: float, folder: Path) -> Machine:
     )
 
 
-def test_legs_do_not_run_through_each_other(tmp_path: Path) -> None:
-    thick = _with_radius(0.037, tmp_path)
-    assert _penetration(thick, thick.home) < 0.0
-    thin = _drawn(load_mechanism("hexapod"), 12)
-    assert max(_penetration(thick, T) for T in thin.poses) > 2e-3
-    kept = _drawn(thick, 12)
-    assert max(_penetration(thick, T) for T in kept.poses) < 0.0
-
-
 def test_two_legs_that_cross_are_named(tmp_path: Path) -> None:
     thick = _with_radius(0.037, tmp_path)
     feasibility = Feasibility(thick)
@@ -192,19 +183,6 @@ def _csv(folder: Path, machine: Machine, rows: Array, names: list[str] | None = 
     lines = [",".join(header), *[",".join(repr(float(q)) for q in row) for row in rows]]
     path.write_text("\n".join([*lines, ""]))
     return path
-
-
-def test_given_readings_are_reached_in_their_order(tmp_path: Path) -> None:
-    machine = load_mechanism("tricept")
-    motors = list(machine.motors)
-    drawn = _drawn(machine, 4)
-    path = _csv(tmp_path, machine, drawn.readings[:, motors])
-    found = given_poses(machine, path)
-    np.testing.assert_allclose(found.readings, drawn.readings, atol=1e-10)
-    for T, T_drawn, q in zip(found.poses, drawn.poses, found.readings, strict=True):
-        np.testing.assert_allclose(T.as_matrix(), T_drawn.as_matrix(), atol=1e-9)
-        alone = forward_kinematics(machine, q).as_matrix()
-        np.testing.assert_allclose(T.as_matrix(), alone, atol=1e-9)
 
 
 def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) -> None:

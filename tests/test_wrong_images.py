@@ -186,25 +186,6 @@ def _observed(made: Spoiled) -> MeasuredImages:
     return place_and_measure(session.photographs, scene, no_progress)
 
 
-def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: Path) -> None:
-    made = spoiled(tmp_path / "read", 4, ("c1", "c2"))
-    del made.entry["views"]["c2"]["T_base_camera"]
-    session = _session(made)
-    scene, _ = rough_placement(session)
-    photographs, read = session.photographs, list[int]()
-
-    def load(row: int) -> Any:
-        read.append(row)
-        return photographs.load(row)
-
-    observed = place_and_measure(replace(photographs, load=load), scene, no_progress)
-    assert observed.placement.unplaced == {}
-    rows = photographs.detect.tolist()
-    assert read[: 2 * len(rows)] == [*rows, *rows]
-    missing = read[2 * len(rows) :]  # legs are looked for once more where some were not found
-    assert len(set(missing)) == len(missing) < len(rows)
-
-
 def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
     tmp_path: Path,
 ) -> None:
