@@ -32,7 +32,7 @@ from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, ImageReader
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
 from legcal.data.measurements import row_names
-from legcal.data.outlines import format_observations, write_observations
+from legcal.data.outlines import are_of_bodies, format_observations, write_observations
 from legcal.data.reasons import WORDS_BY_CODE, Reason, reason_in_words
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
@@ -238,7 +238,7 @@ def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
 def _caption(detection: Detection, row: int) -> str:
     view, outlines = detection.view_of(row), detection.outlines
     measurements = detection.dataset.measurements
-    used = outlines.used[outlines.row == row]
+    used = outlines.used[(outlines.row == row) & ~are_of_bodies(outlines)]
     state = f"{np.count_nonzero(used)} of {len(used)} outlines used"
     if view in detection.unplaced:
         state = "the camera could not be placed: edge pairs that were found"
