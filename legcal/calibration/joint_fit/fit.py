@@ -6,12 +6,14 @@ estimate the noise of outlines, reject outliers, and fit the inliers again.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from legcal.calibration.joint_fit.determinacy import (
+    HeldDirections,
     held_at_nominal,
     refuse_undetermined_inliers,
     undetermined_directions,
@@ -53,7 +55,7 @@ from legcal.data.outlines import Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize
-from legcal.estimation.solver import Minimum, information
+from legcal.estimation.solver import Minimum, information, minimise
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
@@ -368,29 +370,51 @@ def _refine_minimum(
     held = undetermined_directions(problem, first.state, normal)
     refuse_contradicted_board(problem, first.state, normal)
     without_held, state = problem, first.state
-    try:
-        if len(held.basis):
-            problem, state = held_at_nominal(problem, state, held)
-            continued = first_minimum(problem, state)
-            state = continued.state
-            first = dataclasses.replace(
-                continued, iterations=first.iterations + continued.iterations
-            )
-        fit = fit_in_rounds(problem, first)
-        normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-        refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
-        _refuse_other_radii(problem, fit.state)
-    except (DidNotConverge, NotIdentifiable) as failure:
-        refuse_contradicted_values(without_held, start, state, with_priors=True)
-        _refuse_contradicted(without_held, state)
-        _refuse_undetermined(without_held, state)
-        if isinstance(failure, DidNotConverge):
-            raise blaming_stated_values(without_held, failure) from None
-        raise
+    while True:
+        try:
+            if len(held.basis):
+                problem, state = held_at_nominal(without_held, state, held)
+                continued = first_minimum(problem, state)
+                state = continued.state
+                first = dataclasses.replace(
+                    continued, iterations=first.iterations + continued.iterations
+                )
+            fit = fit_in_rounds(problem, first)
+            normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
+            refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
+            _refuse_other_radii(problem, fit.state)
+            break
+        except (DidNotConverge, NotIdentifiable) as failure:
+            more = _open_farther_on(without_held, problem, state, len(held.basis))
+            if more is not None:
+                held = more
+                continue
+            refuse_contradicted_values(without_held, start, state, with_priors=True)
+            _refuse_contradicted(without_held, state)
+            _refuse_undetermined(without_held, state)
+            if isinstance(failure, DidNotConverge):
+                raise blaming_stated_values(without_held, failure) from None
+            raise
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(without_held, start, state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
+
+
+def _open_farther_on(
+    problem: FitProblem, held: FitProblem, state: State, n_held: int
+) -> HeldDirections | None:
+    """Return the open directions near the minimum if they are more than those held so far.
+
+    Axes of a translational 3-UPU look determined where the first minimum has them, and are not
+    where they are parallel.
+    """
+    with contextlib.suppress(DidNotConverge, NotIdentifiable):
+        near = minimise(held, state, held.loss, must_converge=False).state
+        there = linearize(problem, near)
+        found = undetermined_directions(problem, near, information(problem, near, there))
+        return found if len(found.basis) > n_held else None
+    return None
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
