@@ -10,7 +10,7 @@ from legcal import load_mechanism
 from legcal.calibration.location.tool_poses import read_tool_poses
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description, assemble
-from legcal.descriptions.new_model import Dimensions, description_of
+from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.descriptions.table import read_columns
 from legcal.errors import ModelError
 from legcal.machine.kinematics import forward_kinematics_many
@@ -173,6 +173,10 @@ def test_rods_on_upright_rails_are_named_by_their_towers(tmp_path: Path) -> None
     assert {motor and motor.travel for motor in motors} == {(0.0, 0.2)}
     assert {(leg.name, leg.rod) for leg in made.legs} == {(f"leg{j}", 0.005) for j in range(1, 7)}
     assert any("slide along z" in note for note in made.notes)
+    created = create_model(description_of(path, Dimensions(type="PSS", height=150.0)), tmp_path)
+    path.write_text("Photo,Tower B (mm),Turm A (mm),C (mm)\np1.jpg,20,10,30\np2.jpg,25,15,35\n")
+    q = ReadingsSheet(path, created.machine, "photograph").readings().q
+    np.testing.assert_allclose(q, [[0.01, 0.02, 0.03], [0.015, 0.025, 0.035]])
 
 
 def test_the_sheet_of_a_workbook_that_has_a_table_is_read(tmp_path: Path) -> None:
