@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
+from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from legcal.calibration.camera_calibration.document import CameraCalibration
     from legcal.calibration.camera_calibration.projection import CameraComparison
     from legcal.calibration.location.document import Location
+    from legcal.calibration.location.tool_poses import ToolPoses
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
@@ -29,6 +31,7 @@ _PARTS = (
     ("left", "middle", "right"),
     ("bottom left", "bottom", "bottom right"),
 )
+_FIRST = 3  # tool poses shown before they are used
 _MAX_ROWS = 60  # rows of residuals shown; the file has all
 
 
@@ -194,6 +197,30 @@ def _length(leg: dict[str, Any]) -> str:
     """Return the length law of a leg in millimetres."""
     q0 = f"{1e3 * leg['q0']:.2f}"
     return q0 if leg["kind"] == "constant" else f"{q0} {'+' if leg['sign'] > 0 else '-'} q"
+
+
+def understood(columns: Mapping[str, str], noun: str, unit: str) -> list[str]:
+    """Return lines on how the headings of a table and the unit of its readings were read."""
+    renamed = [f"{text} is {name}" for text, name in columns.items() if text != name]
+    return [
+        printable(f"Columns: {', '.join(renamed)}.") if renamed else "",
+        f"Unit of the {noun}: {unit}.",
+    ]
+
+
+def poses_table(poses: ToolPoses) -> Report:
+    """Return the interpretation of a table of tool poses: columns, unit, the first poses."""
+    rows = [
+        (str(number), *(f"{1e3 * x:z.3f}" for x in position), "yes" if oriented else "no")
+        for number, position, oriented in zip(
+            poses.numbers[:_FIRST], poses.position, poses.oriented, strict=False
+        )
+    ]
+    return report(
+        heading(printable(poses.source), f": {len(poses)} tool poses"),
+        understood(poses.columns, "readings", poses.unit),
+        table(">row", ">x [mm]", ">y [mm]", ">z [mm]", "orientation", rows=rows),
+    )
 
 
 def location_table(location: Location, written: Sequence[str]) -> Report:

@@ -19,7 +19,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
 from legcal.recordings.importing import Import
-from legcal.report.machine import scale_option
+from legcal.report.machine import scale_option, understood
 from legcal.report.render import Report, heading, report, table
 
 _MOST = 200  # largest number of rows shown
@@ -54,8 +54,8 @@ def matching_table(new: NewDataset) -> Report:
     if len(pairs) > _MOST:
         rows.append(("...", "", f"{len(pairs) - _MOST} more", "", ""))
     counts = {view: new.views.count(view) for view in new.cameras}
-    columns = [f"{text} is {name}" for text, name in new.columns.items() if text != name]
     noun = "whole lengths of legs" if new.are_lengths else "readings"
+    unit_in_table = f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
         heading(
             printable(str(new.destination)),
@@ -63,8 +63,7 @@ def matching_table(new: NewDataset) -> Report:
             f"{len(joints)} encoders",
         ),
         [
-            printable(f"Columns: {', '.join(columns)}.") if columns else "",
-            f"Unit of the {noun}: {new.readings.unit}, {new.readings.unit_from}.",
+            *understood(new.columns, noun, unit_in_table),
             f"Photographs are matched {new.matching.how}.",
         ],
         table(

@@ -95,8 +95,8 @@ def locate(
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     _check_numbers(position_sigma, angle_sigma, tool_position, machine.size)
-    name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
+    name = measured.source
     measurements = tool_measurements(
         machine,
         measured,

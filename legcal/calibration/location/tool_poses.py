@@ -15,7 +15,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
 
@@ -93,6 +93,9 @@ class ToolPoses:
     oriented: BoolArray  # (n,): whether the orientation was measured too
     numbers: IntArray  # (n,): numbers of the rows in the file, from 1
     notes: tuple[str, ...] = ()  # warnings about the table
+    source: str = "The tool poses"  # the file, for messages
+    columns: Mapping[str, str] = field(default_factory=dict)  # meaning of its headings
+    unit: str = "m and rad"  # of the readings in it, and where that is from, in words
 
     def __len__(self) -> int:
         return len(self.position)
@@ -105,6 +108,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     """
     joints = [column.name for column in reading_columns(machine.legs)]
     sheet = read = None
+    columns: dict[str, str] = {}  # meaning of the other headings
     header = _first_line(path)
     if not any(re.search(rf"\b{re.escape(joint)}\b", header) for joint in joints):
         sheet = ReadingsSheet(path, machine, "pose")
@@ -119,7 +123,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         reshape=(
             None
             if sheet is None or read is None
-            else lambda lines: _tool_columns(lines, sheet.taken, read.q, joints)
+            else lambda lines: _tool_columns(lines, sheet.taken, read.q, joints, columns)
         ),
     )
     readings, notes = readings_in(table, machine.legs)
@@ -138,8 +142,6 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     table.check()
     q = np.full((len(table), machine.n_legs), math.nan)
     q[:, list(machine.motors)] = readings
-    if read is not None:
-        notes = (*notes, f"{path}: readings are in {read.unit}, {read.unit_from}.")
     if worst > _NORM_TOLERANCE:
         notes = (
             *notes,
@@ -153,6 +155,9 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         oriented=oriented,
         numbers=np.arange(1, len(table) + 1),
         notes=notes,
+        source=str(path),
+        columns={} if sheet is None else {**sheet.taken, **columns},
+        unit="m and rad" if read is None else f"{read.unit}, {read.unit_from}",
     )
 
 
@@ -167,8 +172,9 @@ def _tool_columns(
     taken: Mapping[str, str],  # meaning of each heading that the sheet of readings uses
     q: Array,  # (n_rows, n_motors) [m or rad]
     joints: Sequence[str],
+    columns: dict[str, str],
 ) -> Lines:
-    """Return lines under our names in metres and radians, with readings."""
+    """Return lines under our names in metres and radians, with readings; fill *columns*."""
     (number, header), below = lines[0], lines[1:]
     known = {split_heading(column.name)[0]: column.name for column in _COLUMNS}
     names, factors = dict[int, str](), dict[int, Decimal]()
@@ -180,6 +186,7 @@ def _tool_columns(
         if name or taken.get(text) not in (*joints, "view", "image", "pose", "time"):
             names[i] = name or text.lower()
             factors[i] = Decimal(repr({**LENGTH, **ANGLE}.get(unit, 1.0)))
+            columns[text] = names[i]
     rows: Lines = []
     for (line, cells), of_row in zip(below, q.tolist(), strict=True):
         rows.append((line, [*map(str, of_row), *(in_unit(cells[i], factors[i]) for i in names)]))
