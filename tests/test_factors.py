@@ -227,7 +227,7 @@ def _board(free: tuple[str, ...] = (), model: str = "plumb_bob") -> None:
 
 
 def _tool_poses() -> None:
-    pairs, noise = pairs_at(BASE, TOOL), PoseNoise(np.ones((8, 2)), np.ones(2), (True, True))
+    pairs, noise = pairs_at(BASE, TOOL), PoseNoise(np.ones(2), (True, True))
     by_model = np.random.default_rng(0).normal(size=(8, 6, 4))
     fit(pairs, frames_of(BASE, TOOL), noise, by_model)
 

@@ -28,7 +28,7 @@ from legcal.calibration.location.frames import (
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.tool_poses import PoseNoise, ToolMeasurements
+from legcal.calibration.location.tool_poses import MIN_SIGMA, PoseNoise, ToolMeasurements
 from legcal.estimation.problem import (
     EstimationProblem,
     Factor,
@@ -44,7 +44,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 RANK_TOLERANCE = 1e-9  # smallest singular value of a determined direction, relative to the largest
 _MAX_ROUNDS = 30  # alternations of frames and variances
 _MAX_REML_ITERATIONS = 300
-_FACTOR_TOLERANCE = 1e-7
+_SIGMA_TOLERANCE = 1e-7
 _MAX_STEP = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # turn [rad], displacement [m]
 _TURN_FIRST = [3, 4, 5, 0, 1, 2]  # components of a step in the order of estimation.Frames
 _MAX_HOLD_ROUNDS = 60
@@ -60,7 +60,7 @@ class FrameFit:
     """The most likely frames."""
 
     frames: Array  # (2, 3, 4)
-    noise: PoseNoise  # standard deviations with the stated or estimated factors
+    noise: PoseNoise  # stated or estimated
     whitened: Array  # (n, 6): residuals in standard deviations, errors of the model subtracted
     # (n * 6 + k, 12 + k): whitened derivative by a step in units of ``pairs.scale``, and by the k
     # errors of the model, whose priors are the last rows
@@ -85,7 +85,7 @@ def fit(
     pairs: PosePairs,
     # within the basin of convergence; undetermined directions stay there
     start: Array,
-    noise: PoseNoise,  # standard deviations; factors that were not stated are estimated
+    noise: PoseNoise,  # standard deviations; those that were not stated are estimated
     motions: Array | None = None,  # (n, 6, k): platform motions by errors of the model
 ) -> FrameFit:
     """Return the most likely frames near a start.
@@ -97,9 +97,9 @@ def fit(
         frames = _most_likely(pairs, frames, noise, motions)
         if all(noise.stated):
             break
-        factor, _ = _variances(pairs, frames, noise, motions)
-        converged = np.abs(factor / noise.factor - 1.0).max() < _FACTOR_TOLERANCE
-        noise = noise.scaled(factor)
+        sigma, _ = _variances(pairs, frames, noise, motions)
+        converged = np.abs(sigma / noise.sigma - 1.0).max() < _SIGMA_TOLERANCE
+        noise = replace(noise, sigma=sigma)
         if converged:
             break
     return fit_at(pairs, frames, noise, motions)
@@ -197,37 +197,36 @@ def _most_likely(
 def _variances(
     pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
 ) -> tuple[Array, Array]:
-    """Return the factors of restricted maximum likelihood (2,) and their degrees of freedom (2,).
+    """Return sigmas by restricted maximum likelihood, (2,), and their degrees of freedom (2,).
 
     With P = S^-1 - S^-1 A (A^T S^-1 A)^-1 A^T S^-1 the estimate of a variance v with dS/dv = D
     satisfies y^T P D P y = tr(P D): v is multiplied by the ratio of both sides until it is one.
-    Stated factors stay.
+    Stated sigmas stay.
     """
-    factor, dof = noise.factor, np.zeros(2)
-    base = np.repeat(noise.sigma, 3, axis=1)
+    sigma, dof, n = noise.sigma, np.zeros(2), len(pairs)
     raw = _unweighted(pairs, frames, motions)
     for _ in range(_MAX_REML_ITERATIONS):
-        W = noise.scaled(factor).whitening(pairs.oriented)
+        W = replace(noise, sigma=sigma).whitening(pairs.oriented)
         y, A = _whitened(*raw, W)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * s[0]]
-        remaining = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
+        remaining = (y - U @ (U.T @ y))[: 6 * n].reshape(n, 6)
         W_T = np.swapaxes(W, 1, 2)
-        Py = (W_T @ remaining[:, :, None])[:, :, 0] * base
-        spread = W_T @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]
-        diagonal = (W**2).sum(axis=1) * base**2 - (spread**2).sum(axis=2)
+        Py = (W_T @ remaining[:, :, None])[:, :, 0]
+        spread = W_T @ U[: 6 * n].reshape(n, 6, -1)
+        diagonal = (W**2).sum(axis=1) - (spread**2).sum(axis=2)
         squares = (Py**2).reshape(-1, 2, 3).sum(axis=(0, 2))
         traces = diagonal.reshape(-1, 2, 3).sum(axis=(0, 2))
-        dof = factor**2 * traces
+        dof = sigma**2 * traces
         ratio = np.sqrt(squares / np.maximum(traces, 1e-300))
         ratio[list(noise.stated)] = 1.0
         ratio[dof < 1e-6] = 1.0
-        after = np.maximum(factor * ratio, np.where(noise.stated, factor, noise.min_factor))
-        converged = bool(np.abs(after / factor - 1.0).max() < 0.1 * _FACTOR_TOLERANCE)
-        factor = after
+        after = np.maximum(sigma * ratio, np.where(noise.stated, sigma, MIN_SIGMA))
+        converged = bool(np.abs(after / sigma - 1.0).max() < 0.1 * _SIGMA_TOLERANCE)
+        sigma = after
         if converged:
             break
-    return factor, dof
+    return sigma, dof
 
 
 def frame_design_at(
@@ -300,7 +299,7 @@ class Inliers:
     distance: Array
     angle: Array
     frames: Array  # frames estimated from the inliers
-    factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`PoseNoise`
+    sigma: Array  # (2,): the scatter of the inliers, as of :class:`PoseNoise`
 
 
 def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
@@ -315,12 +314,16 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
     inside[np.argsort(distance, kind="stable")[: kept_rows(n, measurements.fewest)]] = True
     frames = start
     while True:
-        frame_fit = _fit_to(pairs.of(inside), frames, noise.of(inside))
+        # With the estimated scatter, or the stated one if it is larger
+        frame_fit = fit(pairs.of(inside), frames, replace(noise, stated=(False, False)))
+        least = np.where(noise.stated, noise.sigma, 0.0)
+        scatter = replace(frame_fit.noise, sigma=np.maximum(frame_fit.noise.sigma, least))
+        frame_fit = replace(frame_fit, noise=scatter)
         frames = frame_fit.frames
         outside: IntArray = np.flatnonzero(~inside)
         if not len(outside):
             break
-        likely = _probability(pairs.of(outside), noise.of(outside), frame_fit, noise.stated)
+        likely = _probability(pairs.of(outside), noise, frame_fit)
         best = int(np.argmax(likely))
         if likely[best] < FALSE_ALARM / n:
             break
@@ -332,32 +335,23 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
         np.linalg.norm(r[:, :3], axis=1),
         np.linalg.norm(r[:, 3:], axis=1),
         frames,
-        frame_fit.noise.factor,
+        frame_fit.noise.sigma,
     )
 
 
-def _fit_to(pairs: PosePairs, start: Array, noise: PoseNoise) -> FrameFit:
-    """Return the fit of rows with their estimated scatter, or the stated one if it is larger."""
-    result = fit(pairs, start, replace(noise, stated=(False, False)))
-    min_factor = np.where(noise.stated, noise.factor, 0.0)
-    return replace(result, noise=result.noise.scaled(np.maximum(result.noise.factor, min_factor)))
-
-
-def _probability(
-    pairs: PosePairs, noise: PoseNoise, frame_fit: FrameFit, stated: tuple[bool, bool]
-) -> Array:
+def _probability(pairs: PosePairs, noise: PoseNoise, frame_fit: FrameFit) -> Array:
     """Return the probability of residuals as large as those of the given rows, (n,)."""
-    sigma = noise.scaled(frame_fit.noise.factor).standard_deviations()
+    sigma = frame_fit.noise.sigma
     H = frame_fit.information
     H = H + _UNKNOWN * float(np.linalg.norm(H, 2)) * np.eye(len(H))
     J = jacobian(frame_fit.frames, pairs) * pairs.scale
     covariance = J @ np.linalg.solve(H, np.swapaxes(J, 1, 2))
-    covariance[:, range(6), range(6)] += sigma**2
+    covariance[:, range(6), range(6)] += np.repeat(sigma**2, 3)
     r = residuals(frame_fit.frames, pairs)
     smallest = np.ones(len(pairs))
     for kind, rows in enumerate((slice(0, 3), slice(3, 6))):
         dof = float(frame_fit.kind_dof[kind])
-        at_stated = stated[kind] and bool(frame_fit.noise.factor[kind] <= noise.factor[kind])
+        at_stated = noise.stated[kind] and bool(sigma[kind] <= noise.sigma[kind])
         if dof < _MIN_DOF and not at_stated:
             continue
         part = np.linalg.solve(covariance[:, rows, rows], r[:, rows, None])[:, :, 0]
