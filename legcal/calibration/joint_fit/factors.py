@@ -1,4 +1,4 @@
-"""Measurements and their factors: outlines, edges of bodies, readings, axes, corners of boards.
+"""Measurements and their factors: outlines, edges of bodies, readings, corners of boards.
 
 Each kind is a class of arrays, one row per measurement, with its ``Factor``; :class:`Observed`
 registers the kinds. A measurement in an image depends on both ends of a leg in the camera frame,
@@ -20,7 +20,6 @@ import numpy as np
 
 from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_length
 from legcal.calibration.joint_fit.variables import FittedLegs, State
-from legcal.data.axes import LegAxes, join_axes
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, polished_parts
@@ -46,7 +45,6 @@ class Observed(NamedTuple):
 
     outlines: ObservedOutlines
     readings: Readings
-    axes: ObservedAxes
     edges: ObservedEdges  # of bodies
     corners: ObservedCorners  # of the board on the base
     platform_corners: ObservedCorners
@@ -58,7 +56,7 @@ class Observed(NamedTuple):
     @property
     def views(self) -> IntArray:
         """Indices of views with measurements."""
-        seen = (self.outlines, self.axes, self.edges, self.corners, self.platform_corners)
+        seen = (self.outlines, self.edges, self.corners, self.platform_corners)
         return np.unique(np.concatenate([kind.view for kind in seen]))
 
     @property
@@ -77,7 +75,6 @@ def observed_arrays(
     measurements: Measurements,
     legs: FittedLegs,
     outlines: Outlines,
-    axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     cameras: Sequence[Camera] | None = None,
     edges: Outlines | None = None,
@@ -87,7 +84,7 @@ def observed_arrays(
     Raises
     ------
     DatasetError
-        If an outline or an axis cannot be used.
+        If an outline cannot be used.
     """
     view_cameras = [view.camera for view in measurements.views]
     observed = observed_outlines(outlines, measurements, legs)
@@ -96,7 +93,6 @@ def observed_arrays(
     return Observed(
         observed,
         observed_readings(measurements, legs),
-        observed_axes(axes, measurements, legs),
         observed_edges(edges, measurements, legs, view_cameras if cameras is None else cameras),
         *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
     )
@@ -724,95 +720,6 @@ def measured_lengths(names: Sequence[str], choices: Choices) -> MeasuredLengths:
     )
 
 
-# ----------------------------------------------------------------------------------------- axes
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedAxes:
-    """The n measured axes of the fit."""
-
-    leg: IntArray  # (n,) indices
-    view: IntArray  # (n,) indices
-    pose: IntArray  # (n,) indices
-    M: Array  # (n, 3) a point of each axis in the camera frame [m]
-    basis: Array  # (n, 2, 3) unit vectors e1, e2 normal to the axis; its direction is e1 x e2
-    # (n, 4, 4) Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1,
-    # alpha2, beta1, beta2) [1/rad, 1/m]
-    whitening: Array
-    on_actuators: bool = False  # some joints at A move
-
-    def __len__(self) -> int:
-        return len(self.leg)
-
-    def rows(self, state: State) -> Residuals:
-        """Return alpha and beta (n, 4) with their derivatives."""
-        arm = np.zeros(len(self), dtype=np.bool_)
-        ends = _ends_in_camera(state, self.leg, self.view, self.pose, arm)
-        r, slope = axis_offsets(ends.A, ends.B, self.M.T, self.basis.T)
-        return Residuals(r.T, slope.T, ends.chain)
-
-    def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor; axes are in the camera frame and do not depend on intrinsics."""
-        del keys
-        touches: tuple[Touch, ...] = (("legs", self.leg, _SIX), ("camera_pose", self.view, _ALL))
-        if self.on_actuators:
-            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
-        n, whitening = len(self), self.whitening
-        return Factor("axes", self.rows, touches, n, 4, self.pose, whitening, robust=True)
-
-
-def observed_axes(
-    axes: LegAxes | None, measurements: Measurements, legs: FittedLegs
-) -> ObservedAxes:
-    """Return measured axes as arrays.
-
-    Raises
-    ------
-    DatasetError
-        If the covariance of an axis is not positive definite.
-    """
-    if axes is None or len(axes) == 0:
-        none = np.zeros(0, dtype=np.intp)
-        return ObservedAxes(
-            none,
-            none,
-            none,
-            np.zeros((0, 3)),
-            np.zeros((0, 2, 3)),
-            np.zeros((0, 4, 4)),
-            legs.n_actuators > 0,
-        )
-    scale = np.sqrt(np.abs(np.einsum("nii->ni", axes.covariance)))
-    scale = np.where(scale > 0.0, scale, 1.0)  # rows in rad and m
-    correlation = axes.covariance / (scale[:, :, None] * scale[:, None, :])
-    least = np.linalg.eigvalsh(correlation)[:, 0]
-    problems = [
-        Problem(
-            f"The axis of {legs.names[axes.leg[i]]} in "
-            f"{measurements.image[axes.row[i]] or f'row {axes.row[i] + 1}'} could not be used",
-            "a covariance that is not positive definite",
-            remedy="correct its standard deviations",
-            code=Code.BAD_ROW,
-        )
-        for i in np.flatnonzero(~(least > 0.0))
-    ]
-    if problems:
-        raise DatasetError(problems)
-    whitening = whitener(correlation) / scale[:, None, :]
-    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
-    moves = legs.n_actuators > 0
-    return ObservedAxes(axes.leg, view, pose, axes.M, axes.basis, whitening, moves)
-
-
-def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
-    """Average the axes of each leg by pose and view, weighted by their covariances.
-
-    The mean is a sufficient statistic; the fit has fewer measurements.
-    """
-    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
-    return join_axes(axes, view * measurements.n_poses + pose)
-
-
 # -------------------------------------------------------------------------------------- corners
 
 
@@ -1030,37 +937,6 @@ def outline_offsets(
     np.einsum("ien,in->en", by_h, epsilon * across, out=by_leg[6])
     by_leg[6] += along * (radius * squared)
     return offset, by_leg, by_xy
-
-
-def axis_offsets(A: Array, B: Array, M: Array, basis: Array) -> tuple[Array, Array]:
-    """Return the errors of measured axes from predicted ones, and derivatives.
-
-    A measured axis passes through M along e1 x e2. alpha are the components of the predicted
-    direction along e1 and e2, over its component along the axis; beta is the intersection of the
-    predicted axis with the plane of e1 and e2 through M, relative to M [m].
-
-    Parameters
-    ----------
-    A, B, M : (3, n) array
-        Both ends and M in the camera frame [m].
-    basis : (3, 2, n) array
-        e1 and e2.
-
-    Returns
-    -------
-    r : (4, n) array
-        alpha1, alpha2, beta1, beta2.
-    by_ends : (6, 4, n) array
-        Derivatives by A and B.
-    """
-    leg, to_A, axis = B - A, A - M, _cross(basis[:, 0], basis[:, 1])
-    length, height = np.einsum("in,in->n", axis, leg), np.einsum("in,in->n", axis, to_A)
-    alpha = np.einsum("ien,in->en", basis, leg) / length
-    by_leg = (basis - alpha * axis[:, None]) / length
-    beta = np.einsum("ien,in->en", basis, to_A) - alpha * height
-    by_A = np.concatenate([-by_leg, (length + height) * by_leg], axis=1)
-    by_B = np.concatenate([by_leg, -height * by_leg], axis=1)
-    return np.concatenate([alpha, beta]), np.concatenate([by_A, by_B])
 
 
 def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Array]:

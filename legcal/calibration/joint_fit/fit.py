@@ -1,4 +1,4 @@
-"""The joint fit (bundle adjustment): outlines in pixels or measured axes, readings and corners.
+"""The joint fit (bundle adjustment): outlines, readings and corners of boards.
 
 A first minimum with a wide robust loss, which outliers cannot lead astray; then rounds that
 estimate the noise of outlines, reject outliers, and fit the inliers again.
@@ -47,15 +47,12 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
 )
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize
 from legcal.estimation.solver import Minimum, information
-from legcal.estimation.uncertainty import named_covariance
-from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
@@ -75,7 +72,6 @@ def refine(
     start: Start | Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
-    axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
     edges: Outlines | None = None,
@@ -97,9 +93,6 @@ def refine(
         Starting values.
     settings : RefinementSettings
         Settings of the fit.
-    axes : LegAxes, optional
-        Measured axes, in addition to outlines or instead of them (pass
-        :func:`legcal.data.outlines.no_outlines`). Their covariances are not re-estimated.
     board : BoardCorners, optional
         Calibration boards fixed to base and platform, and their corners in images.
     choices : Choices
@@ -116,16 +109,15 @@ def refine(
     NotIdentifiable
         If the data do not determine the parameters, from any start.
     DidNotConverge
-        If the solver does not converge from any start, or most outlines or axes are outliers of the
-        fit.
+        If the solver does not converge from any start, or most outlines are outliers of the fit.
     DatasetError
-        If an outline or an axis cannot be used.
+        If an outline cannot be used.
     """
     starts = [start] if isinstance(start, Start) else start
 
     def fitted(used: Outlines) -> Solution:
         problem = build_fit(
-            legs, measurements, used, settings, axes=axes, board=board, choices=choices, edges=edges
+            legs, measurements, used, settings, board=board, choices=choices, edges=edges
         )
         problem.require_determined()
         with explaining_missing_scale(problem):
@@ -422,33 +414,3 @@ def _refuse_other_radii(problem: FitProblem, state: State) -> None:
     ]
     if problems:
         raise DidNotConverge(problems)
-
-
-def bound(problem: FitProblem, truth: Start, radii: Array | None = None) -> Array:
-    """Return the Cramer-Rao bound: the inverse of the information at the true state.
-
-    Parameters
-    ----------
-    problem : FitProblem
-        Built from data with the true covariances; outlines and axes are the linearisation points,
-        exact ones for the exact bound.
-    truth : Start
-        The true legs, cameras and poses.
-    radii : (n_radii,) array, optional
-        The true radii [m]; nominal by default.
-
-    Returns
-    -------
-    (n, n) array
-        Covariance of ``problem.named`` with all other unknowns marginalised out; includes priors.
-
-    Raises
-    ------
-    NotIdentifiable
-        If an open direction moves the platform.
-    """
-    state = problem.begin(truth)
-    state = state if radii is None else dataclasses.replace(state, radii=radii)
-    normal = information(problem, state, linearize(problem, state))
-    undetermined_directions(problem, state, normal)
-    return named_covariance(problem, state, normal.kept_covariance())

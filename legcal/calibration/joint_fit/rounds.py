@@ -176,7 +176,6 @@ def first_minimum(
 def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
-    Axes keep their claimed covariances; only the robust loss guards against outliers among them.
     *first* is the result of :func:`first_minimum`. Readings of redundant motors that contradict
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
@@ -184,7 +183,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     Raises
     ------
     DidNotConverge
-        If a minimisation fails, most outlines or axes are outliers, or the rounds do not converge.
+        If a minimisation fails, most outlines are outliers, or the rounds do not converge.
     """
     try:
         return _fit_in_rounds(problem, first)
@@ -213,7 +212,6 @@ def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
         fit, minimum=_minimise_near(fit.problem, fit.minimum, computed_rows=computed_rows)
     )
     _refuse_disagreement(fit)
-    _refuse_wrong_axes(fit)
     return replace(
         fit,
         at_places=_repeated_errors(fit),
@@ -440,18 +438,6 @@ def _refuse_disagreement(fit: Fit) -> None:
             f"The joint fit ended with {n - n_accepted} of {n} outlines rejected and an error of "
             f"{rms:.1f} px (rms) of the others; more than half must agree within {most_px:g} px. "
             "Check camera poses, readings and outlines."
-        )
-
-
-def _refuse_wrong_axes(fit: Fit) -> None:
-    """Raise DidNotConverge if most axes are outliers."""
-    n, most = len(fit.problem.axes), fit.problem.settings.axis_disagreement
-    wrong = int(np.sum(fit.minimum.linear["axes"].squared_norms > most**2))
-    if 2 * wrong > n:
-        raise DidNotConverge(
-            f"The joint fit ended with errors of {wrong} of {n} axes above {most:g} standard "
-            "deviations; more than half must agree. Check the camera poses, the readings, and the "
-            "units (rad, m) of axes and their sigmas."
         )
 
 
