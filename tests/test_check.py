@@ -14,7 +14,7 @@ from machines import with_round_arms
 from simulated import files_of, simulated
 
 from legcal import calibrate, check
-from legcal.calibration.change_detection import (
+from legcal.calibration.verification import (
     Change,
     LikelihoodRatio,
     Movement,

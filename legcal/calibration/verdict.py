@@ -8,12 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from legcal.calibration.clicks import click_notes
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.calibration.doubts import (
     CAMERA,
     TOLERANCE,
     Doubt,
+    click_notes,
     doubts_of,
     model_error,
     no_improvement,
@@ -28,9 +28,9 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_acc
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.only import GroupEstimate
-from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import REFUSED, Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
+from legcal.calibration.summary import mm_deg
 from legcal.data.corners import Corners
 from legcal.data.dataset import POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of

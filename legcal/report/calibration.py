@@ -13,9 +13,11 @@ from rich.text import Text
 
 from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
 from legcal.calibration.pipeline import exact_cameras
-from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
+    DIGITS,
     brief_sentences,
+    joints_of,
+    parameters_of,
     sentences,
     tables,
 )
@@ -27,10 +29,9 @@ from legcal.pages.document import Step, Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
-    from legcal.calibration.change_detection import Explanation
     from legcal.calibration.evaluation import Evaluation
     from legcal.calibration.result import Calibration
-    from legcal.calibration.verification import Check
+    from legcal.calibration.verification import Check, Explanation
 
 _SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
 _LARGEST = 3  # largest changes of parameters shown

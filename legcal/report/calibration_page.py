@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration.evaluation import Evaluation, evaluate
-from legcal.calibration.quantities import joints_of, parameters_of
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
 from legcal.calibration.summary import (
     brief_sentences,
     fit_lines,
+    joints_of,
     parameter_charts,
+    parameters_of,
     platform_chart,
     tables,
 )

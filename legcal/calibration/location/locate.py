@@ -10,14 +10,21 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtrc
 
-from legcal.calibration.location.determinacy import Determinacy, determine, hold_open_part
 from legcal.calibration.location.document import (
     Location,
     LocationStatus,
     MeasurementNoise,
     RowResidual,
 )
-from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit
+from legcal.calibration.location.fit import (
+    Determinacy,
+    FrameFit,
+    Inliers,
+    determine,
+    find_inliers,
+    fit,
+    hold_open_part,
+)
 from legcal.calibration.location.frames import (
     FrameCandidates,
     jacobian,
