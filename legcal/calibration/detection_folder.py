@@ -25,7 +25,6 @@ from legcal.calibration.detection import (
     PHOTOGRAPHS,
     Detection,
     Examination,
-    ViewCondition,
     unique_names,
 )
 from legcal.data.corners import write_corners
@@ -311,7 +310,21 @@ def tables_of(examination: Examination) -> list[Table]:
         Table(
             ("view", ">legs", ">outlines used", ">contrast", ">length [px]", ">residual [px]",
              "not used"),
-            [_outline_cells(view) for view in examination.views if view.outlines is not None],
+            [
+                [
+                    view.view,
+                    _share(view.legs_found, view.legs_visible),
+                    _share(view.outlines_used, view.outlines),
+                    number(view.contrast, 1),
+                    number(view.length, 0),
+                    number(view.residual, 3),
+                    "camera not placed" if view.problem else ", ".join(
+                        f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items()
+                    ),
+                ]
+                for view in examination.views
+                if view.outlines is not None
+            ],
         ),
     ]  # fmt: skip
     units = dict.fromkeys(SHOWN_IN[check.unit][1] for check in examination.encoders)
@@ -331,19 +344,6 @@ def tables_of(examination: Examination) -> list[Table]:
     heading = f"encoder [{', '.join(units)}]"
     tables.append(Table((heading, ">least", ">greatest", ">travel", ">used [%]"), rows))
     return [table for table in tables if table.rows]
-
-
-def _outline_cells(view: ViewCondition) -> list[Cell]:
-    rejected = ", ".join(f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items())
-    return [
-        view.view,
-        _share(view.legs_found, view.legs_visible),
-        _share(view.outlines_used, view.outlines),
-        number(view.contrast, 1),
-        number(view.length, 0),
-        number(view.residual, 3),
-        "camera not placed" if view.problem else rejected,
-    ]
 
 
 def _share(part: int | None, whole: int | None) -> Cell:

@@ -7,7 +7,7 @@ true, where that can be computed.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -99,11 +99,6 @@ class Doubt:
         return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
 
 
-def worst_first(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
-    """Return doubts with grave ones first, then those of known effects, the largest first."""
-    return tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
-
-
 def model_error(doubts: Sequence[Doubt]) -> tuple[float, float]:
     """Return the displacement [m] and rotation [rad] of the platform by all doubts together."""
     displacement = float(np.hypot.reduce([one.sigma_dX_m or 0.0 for one in doubts] or [0.0]))
@@ -176,12 +171,6 @@ def doubts_of(
         *causes,
         *symptoms,
     )
-
-
-def no_improvement(remedy: str) -> Doubt:
-    """Return the doubt in a result whose predicted improvement is below two sigma."""
-    what = "a predicted improvement below two sigma is no improvement"
-    return Doubt("no_improvement", what, remedy, is_grave=True)
 
 
 def _legs_left_out(solution: Solution, explained: Collection[str]) -> list[Doubt]:

@@ -357,7 +357,7 @@ def session_tests(
                 noise.subject,
                 "rad" if noise.kind == "vibration" else hypotheses[noise.group[0][0]].unit,
                 noise.ratio * noise.stated,
-                noise.sigma_of_ratio * noise.stated,
+                0.5 * noise.spread * noise.further**2 / noise.ratio * noise.stated,
                 None,
                 noise.p_value,
                 np.hstack(steps),
@@ -960,11 +960,6 @@ class _Scatter:
     def ratio(self) -> float:
         """Standard deviation of readings over the stated one."""
         return math.hypot(1.0, self.further)
-
-    @property
-    def sigma_of_ratio(self) -> float:
-        """Standard deviation of the ratio."""
-        return 0.5 * self.spread * self.further**2 / self.ratio
 
     @classmethod
     def of(

@@ -256,13 +256,6 @@ def _cell(column: str, x: Any, digits: int) -> str:
     return f"{x:{'+' if column == 'change' else ''}{'' if column == 'sigma' else 'z'}.{digits}f}"
 
 
-def joints_title(side: str, link: str, joints_move: bool) -> str:
-    """Return the title of a table of joints; *joints_move* if motors move the joints at A."""
-    return (
-        f"Joints of the {side} in the link {link}{AT_ZERO * (joints_move and side == 'base')} [mm]"
-    )
-
-
 def mark_in_words(side: str, status: str, defines: FrameMark | None) -> str:
     """Return the remark on a coordinate that is not simply estimated: ``defines R_b``."""
     if status == "frame":
@@ -281,9 +274,10 @@ def tables(result: Result) -> list[tuple[str, ParameterTable]]:
     for side, block in result.links.items():
         joints = ParameterTable.of_joints(result, side).without("joint", "link", "unit")
         columns = tuple(f"in {FRAMES[side]}" if c == "in_frame" else c for c in joints.columns)
+        at_zero = AT_ZERO * (result.actuators is not None and side == "base")
         found.append(
             (
-                joints_title(side, block.link, result.actuators is not None),
+                f"Joints of the {side} in the link {block.link}{at_zero} [mm]",
                 replace(joints, columns=columns),
             )
         )
@@ -307,7 +301,8 @@ def fit_lines(result: Result, *, verbose: bool) -> list[str]:
     return [
         *(result.details if verbose else ()),
         *_observation_lines(result),
-        *_board_lines(result),
+        *_of_board("base", result.board),
+        *_of_board("platform", result.platform_board),
         *_steps_lines(result),
         _fit_line(result),
         *_direction_lines(result),
@@ -416,10 +411,6 @@ def _left_out_lines(seen: Observations) -> list[str]:
 
 _MAX_REASONS = 4
 _NONE = 5e-4  # [px, mm] and a tenth of it [deg]: would be shown as zero
-
-
-def _board_lines(result: Result) -> list[str]:
-    return [*_of_board("base", result.board), *_of_board("platform", result.platform_board)]
 
 
 def _of_board(link: Link, board: BoardBlock | None) -> list[str]:

@@ -16,9 +16,7 @@ from legcal.calibration.doubts import (
     click_notes,
     doubts_of,
     model_error,
-    no_improvement,
     nominal_lengths,
-    worst_first,
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import HeldOut
@@ -116,8 +114,12 @@ def judge(
         found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"
     of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
     if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
-        doubts = (*doubts, no_improvement(remedy or "take more images or better ones"))
-    verdict = _verdict(worst_first(doubts), found, remedy)
+        what = "a predicted improvement below two sigma is no improvement"
+        more = remedy or "take more images or better ones"
+        doubts = (*doubts, Doubt("no_improvement", what, more, is_grave=True))
+    # Grave ones first, then those of known effects, the largest first
+    doubts = tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
+    verdict = _verdict(doubts, found, remedy)
     causes = {finding.what for finding in session.findings}
     if any(doubt.what in causes or doubt.code in ("scale", "mistake") for doubt in doubts):
         # What a named cause does to cameras and readings accuses neither

@@ -82,40 +82,6 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """A change with its fitted amount and the remaining statistic."""
-
-    change: Change
-    values: Array  # (m,): amounts [m or rad]
-    sigma: Array  # (m,)
-    remaining: float  # statistic that the change does not explain
-    p_value: float  # probability of a larger remaining statistic if nothing else changed
-
-
-@dataclass(frozen=True, eq=False)
-class LikelihoodRatio:
-    """Reduction of the squares by a fit with wide priors, relative to one with the earlier result.
-
-    Along a direction with posterior variance v, relative to that of the wide prior, the reduction
-    is 1 - v times a chi2 variable with one degree of freedom.
-    """
-
-    saved: float  # reduction of the squares, in variances of the noise
-    parts: Array  # (p,): 1 - v by direction
-
-    @classmethod
-    def of(cls, saved: float, covariance: Array, prior: Array) -> LikelihoodRatio:
-        """Return the ratio for a *covariance* (p, p) and priors as in :func:`difference`."""
-        v = np.linalg.eigvalsh(covariance / np.outer(prior, prior))
-        return cls(saved, np.clip(1.0 - v, 0.0, 1.0))
-
-    def p_value(self, noise_dof: int) -> float:
-        """Return the probability of a larger reduction if nothing moved, by moment matching."""
-        mean, variance = float(np.sum(self.parts)), 2.0 * float(np.sum(self.parts**2))
-        return float(fdtrc(2.0 * mean**2 / variance, max(noise_dof, 1), self.saved / mean))
-
-
-@dataclass(frozen=True, eq=False)
 class Movement:
     """Test of an earlier result by new images."""
 
@@ -124,7 +90,7 @@ class Movement:
     noise_dof: int  # degrees of freedom of the noise of the new images
     p_value: float  # probability of a larger statistic if nothing moved
     significance: float  # largest p-value of a movement
-    explanations: tuple[Explanation, ...]  # the best first; empty if nothing moved
+    explanations: tuple[ExplanationBlock, ...]  # the best first; empty if nothing moved
 
     @property
     def moved(self) -> bool:
@@ -168,6 +134,11 @@ def difference(
     )
 
 
+def determined_parts(covariance: Array, prior: Array) -> Array:
+    """Return 1 - v by direction, (p,): v is the posterior variance over that of the wide prior."""
+    return np.clip(1.0 - np.linalg.eigvalsh(covariance / np.outer(prior, prior)), 0.0, 1.0)
+
+
 def noise_dof(dof: int, covariance: Array, prior: Array) -> int:
     """Return the degrees of freedom of the noise in a fit with wide priors.
 
@@ -181,23 +152,28 @@ def noise_dof(dof: int, covariance: Array, prior: Array) -> int:
 
 def judge_movement(
     measured_difference: tuple[Array, Array, Array],
-    ratio: LikelihoodRatio,
+    saved: float,
+    parts: Array,
     noise_dof: int,
     changes: Sequence[Sequence[Change]],
     significance: float,
 ) -> Movement:
     """Return the test of the earlier result, with the simplest sufficient explanations.
 
-    ``measured_difference`` is the result of :func:`difference`, ``significance`` the probability of
-    a false alarm.
+    ``measured_difference`` is the result of :func:`difference`, ``saved`` the reduction of the
+    squares by a fit with wide priors against one with the earlier result. Along each direction it
+    is its ``part`` (:func:`determined_parts`) times a chi2 variable with one degree of freedom; the
+    probability of a larger sum comes by moment matching.
+    ``significance`` is the probability of a false alarm.
     """
     directions, values, covariance = measured_difference
     whitening = whitener(covariance)
     residual = whitening @ values
     # Linear theory counts far outliers in full, the costs do not.
-    share = ratio.saved / max(float(residual @ residual), np.finfo(np.float64).tiny)
-    p_value = ratio.p_value(noise_dof)
-    explanations: list[Explanation] = []
+    share = saved / max(float(residual @ residual), np.finfo(np.float64).tiny)
+    mean, variance = float(np.sum(parts)), 2.0 * float(np.sum(parts**2))
+    p_value = float(fdtrc(2.0 * mean**2 / variance, max(noise_dof, 1), saved / mean))
+    explanations: list[ExplanationBlock] = []
     if p_value < significance:
         for of_kind in changes:
             candidates = [
@@ -208,14 +184,12 @@ def judge_movement(
             if sufficient:
                 explanations = sufficient
                 break
-    return Movement(
-        ratio.saved, len(residual), noise_dof, p_value, significance, tuple(explanations)
-    )
+    return Movement(saved, len(residual), noise_dof, p_value, significance, tuple(explanations))
 
 
 def _explain(
     directions: Array, residual: Array, change: Change, noise_dof: int, share: float
-) -> Explanation:
+) -> ExplanationBlock:
     """Return the fit of a change to a whitened difference (k,); *share* scales the statistic."""
     by_change = directions @ change.columns
     inverse = np.linalg.pinv(by_change, rcond=1e-9)
@@ -223,13 +197,16 @@ def _explain(
     remainder = residual - by_change @ values
     remaining = share * float(remainder @ remainder)
     dof = len(residual) - int(np.linalg.matrix_rank(by_change))
-    sigma = np.sqrt(np.sum(inverse**2, axis=1))
-    return Explanation(change, values, sigma, remaining, _p_value(remaining, dof, noise_dof))
-
-
-def _p_value(statistic: float, dof: int, noise_dof: int) -> float:
-    """Return the probability of a larger statistic with estimated noise."""
-    return float(fdtrc(dof, max(noise_dof, 1), statistic / dof)) if dof > 0 else 0.0
+    return ExplanationBlock(
+        what=change.what,
+        components=list(change.components),
+        units=list(change.units),
+        links=list(change.links),
+        values=values.tolist(),
+        sigma=np.sqrt(np.sum(inverse**2, axis=1)).tolist(),
+        remaining=remaining,
+        p_value=float(fdtrc(dof, max(noise_dof, 1), remaining / dof)) if dof > 0 else 0.0,
+    )
 
 
 _Moved = Callable[[float], Sequence[Leg]]  # the legs after a step of a component
@@ -419,19 +396,7 @@ class Check:
             of=len(self.earlier.names),
             noise_dof=movement.noise_dof,
             verdict=self.sentence,
-            explanations=[
-                ExplanationBlock(
-                    what=explanation.change.what,
-                    components=list(explanation.change.components),
-                    units=list(explanation.change.units),
-                    links=list(explanation.change.links),
-                    values=explanation.values.tolist(),
-                    sigma=explanation.sigma.tolist(),
-                    remaining=explanation.remaining,
-                    p_value=explanation.p_value,
-                )
-                for explanation in movement.explanations
-            ],
+            explanations=list(movement.explanations),
             platform=self.at_platform,
             images=self.dataset.measurements.n_rows,
             residuals=FitQuality.model_validate(self.solution.quality),
@@ -664,9 +629,9 @@ def _compare(
     dof = earlier.document.residuals.dof
     if variance_factor == 1.0:
         dof = noise_dof(solution.quality.dof, covariance, prior.sigma)
-    ratio = LikelihoodRatio.of(saved, covariance, prior.sigma)
+    parts = determined_parts(covariance, prior.sigma)
     changes = possible_changes(machine, _only(parametrization, columns))
-    movement = judge_movement(measured_difference, ratio, dof, changes, significance)
+    movement = judge_movement(measured_difference, saved, parts, dof, changes, significance)
     fit = free if movement.moved else near
     J = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, *fit.poses)
     at_platform = _moved_platform(J[:, :, columns], fit, prior)

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.text import Text
 
-from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.documents import (
+    ExplanationBlock,
+    NextStep,
+    PlatformBlock,
+    Result,
+    WorkspaceAccuracy,
+)
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.summary import (
     DIGITS,
@@ -31,7 +37,7 @@ from legcal.report.render import Report, report, table
 if TYPE_CHECKING:
     from legcal.calibration.evaluation import Evaluation
     from legcal.calibration.result import Calibration
-    from legcal.calibration.verification import Check, Explanation
+    from legcal.calibration.verification import Check
 
 _SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
 _LARGEST = 3  # largest changes of parameters shown
@@ -213,7 +219,7 @@ def check_summary(check: Check) -> Report:
     ]
     if movement.explanations:
         best, *others = movement.explanations
-        change, amount = best.change.what, _amount(best)
+        change, amount = best.what, _amount(best)
         if best.p_value < movement.significance:
             lines.append(
                 f"No single leg explains it; {change} explains most ({amount}; residual statistic "
@@ -221,17 +227,17 @@ def check_summary(check: Check) -> Report:
             )
         else:
             lines.append(f"It is explained by {change}: {amount}.")
-            named = ", ".join(other.change.what for other in others[:_EXPLANATIONS])
+            named = ", ".join(other.what for other in others[:_EXPLANATIONS])
             lines += [f"These images cannot distinguish that from: {named}."] if named else []
     style = "bold red" if movement.moved else "bold green"
     return report([*lines, Text(check.sentence, style=style)])
 
 
-def _amount(explanation: Explanation) -> str:
+def _amount(change: ExplanationBlock) -> str:
     """Return the amount of a change in words."""
-    change, parts = explanation.change, []
+    parts = []
     components = zip(change.components, change.units, change.links, strict=True)
-    numbers = zip(explanation.values.tolist(), explanation.sigma.tolist(), strict=True)
+    numbers = zip(change.values, change.sigma, strict=True)
     for (name, unit, link), (value, sigma) in zip(components, numbers, strict=True):
         scale, shown = SHOWN_IN[unit]
         digits = DIGITS[shown]

@@ -230,12 +230,6 @@ def identifiability_of_dataset(
     return report.model_copy(update={"notes": (*report.notes, note)})
 
 
-def _named_conditions(machine: Machine, session: Session) -> tuple[ConditionBlock, ...]:
-    """Return the paper's conditions with the names of legs."""
-    conditions = conditions_of(machine, session)
-    return tuple(ConditionBlock.of(condition, machine.leg_names) for condition in conditions)
-
-
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
     chosen = (*choices.free, *choices.priors)
     twists = any(is_held_by_default(name) for name in chosen)
@@ -276,7 +270,9 @@ def _report_on(
     replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
     session = analysis.session
-    conditions = _named_conditions(machine, session)
+    conditions = tuple(
+        ConditionBlock.of(one, machine.leg_names) for one in conditions_of(machine, session)
+    )
     on_platform = np.unique(session.view[np.flatnonzero(session.platform_board)])
     full = analysis.full
     notes = []
@@ -484,8 +480,12 @@ def find_remedies(
     """
     n_parameters = analysis.full.of
     before = _score(analysis)
+    images, more = int(np.bincount(analysis.session.view).min()), list[_Candidate]()
+    if replanned is not None and images < _ENOUGH_IMAGES:
+        text = f"take {_ENOUGH_IMAGES} images a view instead of {images}"
+        more = [(text, analysis.elsewhere(replanned(_ENOUGH_IMAGES)), ())]
     kinds: list[Iterable[_Candidate]] = [
-        _more_images(analysis, replanned),
+        more,
         _further_cameras(analysis),
         _board(analysis),
         _known_parameters(analysis),
@@ -534,16 +534,6 @@ def _try_kind(kind: Iterable[_Candidate], before: _Score, n_parameters: int) -> 
         if len(sufficient) == _MOST_OF_A_KIND or tried + 1 >= _MOST_TRIED:
             break
     return sufficient or [r for _, r in sorted(helpful, key=lambda pair: -pair[0])[:1]]
-
-
-def _more_images(
-    analysis: Analysis, replanned: Callable[[int], Session] | None
-) -> Iterator[_Candidate]:
-    """Yield a session with more images a view."""
-    images = int(np.bincount(analysis.session.view).min())
-    if replanned is not None and images < _ENOUGH_IMAGES:
-        text = f"take {_ENOUGH_IMAGES} images a view instead of {images}"
-        yield text, analysis.elsewhere(replanned(_ENOUGH_IMAGES)), ()
 
 
 def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:

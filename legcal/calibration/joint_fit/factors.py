@@ -255,7 +255,7 @@ class ObservedOutlines:
 
         def predicted() -> tuple[Array, Array, _EndsInCamera, Array]:
             ends = _ends_in_camera(state, self.leg, self.view, self.pose, self.on_arm)
-            xy, by_key = self._feet, None
+            xy, by_key = np.ascontiguousarray(self.feet.T), None
             if keys:
                 moved, slopes = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
                 xy, by_key = np.ascontiguousarray(moved.T), slopes.transpose(3, 2, 1, 0)
@@ -271,11 +271,6 @@ class ObservedOutlines:
             predicted, keys, *inputs, state.legs, state.radii, state.cameras, *poses
         )
         return prediction
-
-    @cached_property
-    def _feet(self) -> Array:
-        """Feet by coordinate and end, (2, 2, n)."""
-        return np.ascontiguousarray(self.feet.T)
 
     @cached_property
     def _lens(self) -> Array:

@@ -212,7 +212,14 @@ def _fit_from_best_start(
             continue
         if solution.left_out or _common_mode_px(solution) > problem.settings.largest_rms_px:
             solution = _retry_from_other_starts(problem, outlines, start, minimum, solution)
-        _refuse_common_mode(solution, problem.settings.largest_rms_px)
+        shifted, most_px = _common_mode_px(solution), problem.settings.largest_rms_px
+        if shifted > most_px:
+            kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
+            raise DidNotConverge(
+                f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
+                f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or "
+                "start from a better nominal model."
+            )
         return dataclasses.replace(
             solution, notes=(*solution.notes, *notes), details=tuple(details)
         )
@@ -264,18 +271,6 @@ def _retry_from_other_starts(
 def _common_mode_px(solution: Solution) -> float:
     """Largest standard deviation of common-mode edge biases [px]."""
     return max(solution.quality.shared_px.values(), default=0.0)
-
-
-def _refuse_common_mode(solution: Solution, most_px: float) -> None:
-    """Raise DidNotConverge if common-mode edge biases are too large for light and blur."""
-    shifted = _common_mode_px(solution)
-    if shifted > most_px:
-        kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
-        raise DidNotConverge(
-            f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
-            f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or start "
-            "from a better nominal model."
-        )
 
 
 def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None) -> Minimum[State]:

@@ -365,14 +365,9 @@ def with_edge_biases(
     problem: FitProblem, state: State, biases: EdgeBiases
 ) -> tuple[FitProblem, State]:
     """Replace the biases of problem and state; biases of the same name keep their value."""
-    values = _values_of_biases(problem, state, biases)
-    return problem.with_biases(biases), replace(state, biases=values)
-
-
-def _values_of_biases(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
-    """Values of biases at a state, zero for new ones."""
     value_of = dict(zip(problem.block("biases").labels, state.biases.tolist(), strict=True))
-    return np.array([value_of.get(name, 0.0) for name in biases.names])
+    values = np.array([value_of.get(name, 0.0) for name in biases.names])
+    return problem.with_biases(biases), replace(state, biases=values)
 
 
 def _noise(fit: Fit, included: NoiseModel) -> NoiseModel:

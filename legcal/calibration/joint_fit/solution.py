@@ -305,8 +305,9 @@ def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> Goodness
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
+    claimed = problem.weighted(NoiseModel())
     return GoodnessOfFit(
-        cost=_comparable_cost(problem, state),
+        cost=robust_cost(claimed, linearize(claimed, state), claimed.loss),
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
         dof=n_residuals - problem.n_unknowns + n_held,
         rms_px=_rms(used),
@@ -319,12 +320,6 @@ def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> Goodness
         shared_px=fit.shared_px,
         redundant_readings=readings,
     )
-
-
-def _comparable_cost(problem: FitProblem, state: State) -> float:
-    """Robust cost of all observations with their claimed covariances."""
-    claimed = problem.weighted(NoiseModel())
-    return robust_cost(claimed, linearize(claimed, state), claimed.loss)
 
 
 def _gammas(

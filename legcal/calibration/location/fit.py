@@ -238,14 +238,6 @@ def _variances(
     return sigma, dof
 
 
-def frame_design_at(
-    pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
-) -> Array:
-    """Return the whitened columns (m, 12) of the frames, errors of the model eliminated."""
-    raw = _unweighted(pairs, frames, motions)
-    return frame_design(_whitened(*raw, noise.whitening(pairs.oriented))[1])
-
-
 def frame_design(design: Array) -> Array:
     """Return the columns (m, 12) of the frames, projected off the errors of the model."""
     F, E = design[:, :N_STEP], design[:, N_STEP:]
@@ -492,7 +484,8 @@ def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
 def _open_at(measurements: ToolMeasurements, fit: FrameFit, k: int, frames: Array) -> Array:
     """Return the k least determined directions (12, k) at given frames."""
     n = 12 if measurements.is_oriented else 9
-    design = frame_design_at(measurements.pairs, frames, fit.noise, measurements.by_model)
+    raw = _unweighted(measurements.pairs, frames, measurements.by_model)
+    design = frame_design(_whitened(*raw, fit.noise.whitening(measurements.pairs.oriented))[1])
     _, _, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
     basis = np.zeros((12, k))
     basis[:n] = Vt[n - k :].T
@@ -528,7 +521,8 @@ def _check_machine(measurements: ToolMeasurements, fit: FrameFit, basis: Array, 
             "displaced in another direction or further apart, from all over the workspace, or "
             "measure them better."
         )
-    if not _is_resolved_by_the_tool(basis):
+    by_tool = np.linalg.svd(basis[6:], compute_uv=False)
+    if np.any(by_tool <= _RESOLVED) or len(by_tool) < basis.shape[1]:
         raise NotIdentifiable(
             f"{start} no pose of this machine tells "
             f"{open_parts_in_words(_open_parts(basis, fit.frames))}, even with the tool held in "
@@ -553,12 +547,6 @@ def _held_words(parts: list[OpenPart], tool_position: Array) -> str:
         f"{' and '.join(assumptions)} there, "
         "and the base follows; where the tool is in the world does not depend on it."
     )
-
-
-def _is_resolved_by_the_tool(basis: Array) -> bool:
-    """Return whether holding the tool fixes all undetermined directions (12, k)."""
-    s = np.linalg.svd(basis[6:], compute_uv=False)
-    return bool(np.all(s > _RESOLVED)) and len(s) >= basis.shape[1]
 
 
 def _kept_directions(basis: Array) -> Array:
