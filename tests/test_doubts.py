@@ -34,7 +34,7 @@ from legcal.calibration import doubts, verdict
 from legcal.calibration.doubts import Doubt, model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.scale import ALL_READINGS
-from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, FocalLength
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
@@ -242,7 +242,7 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
     (shared,) = solution.sensitivities
     focal = replace(shared, what=FITTED_CAMERA, steps=0.01 * shared.steps)
     fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
-    wrong = FocalLength("c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
+    wrong = WrongIntrinsic("focal_length", "c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
         "camera_doubts": (wrong,),
         "sensitivities": (shared, focal),

@@ -68,14 +68,6 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 
 
 @dataclass(frozen=True, eq=False)
-class RepeatedErrors:
-    """Errors of edges that return to places; not estimated as biases."""
-
-    sigma: Array  # (2,) of ``PLACES``, root mean squares over all places [px]
-    covariance: Array  # (n_kept, n_kept) added to the covariance of the kept unknowns
-
-
-@dataclass(frozen=True, eq=False)
 class Fit:
     """A minimum with the noise, biases and weights of its outlines."""
 
@@ -84,7 +76,9 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
-    at_places: RepeatedErrors | None = None  # errors shared there, None where there are none
+    # Errors of edges that return to places, not estimated as biases: root mean squares (2,) of
+    # ``PLACES`` [px], and what they add to the covariance of the kept unknowns; None without any
+    at_places: tuple[Array, Array] | None = None
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
     edge_scale: float = 1.0  # of the standard deviations of edges of bodies
 
@@ -119,7 +113,7 @@ class Fit:
     @property
     def shared_px(self) -> dict[str, float]:
         """Standard deviations of common-mode errors by kind [px]."""
-        there = () if self.at_places is None else self.at_places.sigma.tolist()
+        there = () if self.at_places is None else self.at_places[0].tolist()
         return self.edge_biases.sizes | dict(zip(PLACES, there, strict=False))
 
 
@@ -309,7 +303,7 @@ def _without_wrong_readings(
     return problem, minimum
 
 
-def _repeated_errors(fit: Fit) -> RepeatedErrors | None:
+def _repeated_errors(fit: Fit) -> tuple[Array, Array] | None:
     """Return errors at places and their effect on the covariance; None where there are none.
 
     They are estimated where residuals show biases at all; those of polished parts are there anyway.
@@ -332,7 +326,7 @@ def _repeated_errors(fit: Fit) -> RepeatedErrors | None:
     normal = information(problem, state, linear, problem.loss)
     moved = response(problem, linear, normal, columns) * of_places
     sigma = np.sqrt(np.mean(of_places.reshape(len(PLACES), -1) ** 2, axis=1))
-    return RepeatedErrors(sigma, moved @ moved.T)
+    return sigma, moved @ moved.T
 
 
 def _approach_minimum(
