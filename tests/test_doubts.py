@@ -210,7 +210,7 @@ def test_an_error_of_all_travel_is_stated_beside_sigma_as_large_as_it_may_be(
     assert "travel of the motors alone; an error of 0.20% of the" in healthy.verdict.sentence
     assert "an error of 0.10% of the travel (1 sigma) moves" in stated.verdict.sentence
     by_default, halved = (
-        next(effect.error for effect in found.platform.effects if effect.what == ALL_READINGS)
+        found.platform.effects[ALL_READINGS]
         for found in (healthy, stated)
         if found.platform is not None
     )
@@ -239,22 +239,22 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
 
 def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
     solution = healthy.solution
-    (shared,) = solution.sensitivities
-    focal = replace(shared, what=FITTED_CAMERA, steps=0.01 * shared.steps)
+    ((what, shared),) = solution.sensitivities.items()
+    focal = 0.01 * shared
     fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
     wrong = WrongIntrinsic("focal_length", "c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
         "camera_doubts": (wrong,),
-        "sensitivities": (shared, focal),
+        "sensitivities": {what: shared, FITTED_CAMERA: focal},
     }
     found = _judged(healthy, **changes)
     (doubt,) = found.doubts
     assert found.platform is not None
-    effect = found.platform.effects[-1].error
+    effect = found.platform.effects[FITTED_CAMERA]
     assert (doubt.code, doubt.sigma_dX_m) == ("camera", effect.mean_displacement)
     assert model_error(found.doubts) == (effect.mean_displacement, effect.mean_rotation)
-    large = replace(focal, steps=1e4 * focal.steps)
-    found = _judged(healthy, **changes | {"sensitivities": (large,)})
+    large = {FITTED_CAMERA: 1e4 * focal}
+    found = _judged(healthy, **changes | {"sensitivities": large})
     assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
     assert found.verdict.is_to_be_refused
 

@@ -399,14 +399,13 @@ class _Evidence:
         views = list(dict.fromkeys(wrong.view for wrong in self.solution.camera_doubts))
         if not views:
             return []
-        effects = () if self.platform is None else self.platform.effects
-        errors = [effect.error for effect in effects if effect.what == FITTED_CAMERA]
+        error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
         what = f"the measurements contradict the camera of {few_views(views)}"
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "
             "zoomed, scaled or cropped"
         )
-        return [Doubt(CAMERA, what, remedy, *_mean(errors[0] if errors else None))]
+        return [Doubt(CAMERA, what, remedy, *_mean(error))]
 
     def left_out(self) -> list[Doubt]:
         """Return whether images without a part in the fit are predicted as well as it claims."""

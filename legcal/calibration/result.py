@@ -415,7 +415,7 @@ def _platform(calibration: Calibration) -> PlatformBlock | None:
         ],
         workspace=None if workspace is None else WorkspaceAccuracy(**_predicted(workspace)),
         sensitivities=[
-            SensitivityRow(what=effect.what, **_errors(effect.error)) for effect in platform.effects
+            SensitivityRow(what=what, **_errors(error)) for what, error in platform.effects.items()
         ],
     )
 

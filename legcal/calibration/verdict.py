@@ -241,11 +241,12 @@ def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
 def _share_of_scale(platform: PlatformAccuracy) -> str:
     """Return a clause on the scale where it is the largest part of the predicted error, or ""."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
-    parts = [e.error.mean_displacement for e in platform.effects if e.what == SCALE]
-    if not parts or 2.0 * parts[0] ** 2 < predicted**2:
+    scale = platform.effects.get(SCALE)
+    if scale is None or 2.0 * scale.mean_displacement**2 < predicted**2:
         return ""
     return (
-        f"the largest part of that is the scale of the machine ({1e3 * parts[0]:.3f} of "
+        "the largest part of that is the scale of the machine "
+        f"({1e3 * scale.mean_displacement:.3f} of "
         f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
     )
 
@@ -253,8 +254,8 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
 def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance) -> str:
     """Return a clause on what an error of all travel does, "" where that is negligible."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
-    parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
-    if not parts or parts[0].mean_displacement <= NEGLIGIBLE * predicted:
+    moved = platform.effects.get(ALL_READINGS)
+    if moved is None or moved.mean_displacement <= NEGLIGIBLE * predicted:
         return ""
     problem = solution.posterior.problem
     witnesses = scale_witnesses(problem)
@@ -264,7 +265,7 @@ def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: 
         f"the scale rests on {rests}an error of {problem.legs.sigma_travel:.2%} of the travel "
         f"(1 sigma{assumed}) "
         + ("" if len(witnesses) == 1 else "what these leave ")
-        + f"moves the platform by {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)}"
+        + f"moves the platform by {mm_deg(moved.mean_displacement, moved.mean_rotation)}"
     )
 
 

@@ -31,24 +31,16 @@ _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
 
 
-@dataclass(frozen=True)
-class Sensitivity:
-    """Change of the kinematic parameters by an error of a fixed quantity."""
-
-    what: str  # the error, in words
-    steps: Array  # (p, c) steps of all parameters [m, rad], for c independent errors
-
-
 def sensitivity_to_cameras(
     cameras: CameraResiduals, normal: NormalEquations, contradicted: Sequence[WrongIntrinsic]
-) -> tuple[Sensitivity, ...]:
+) -> dict[str, Array]:
     """Return how the corrections of contradicted intrinsics change the parameters, if any are.
 
     *cameras* are at the minimum of the fit, *normal* is the information there. Of intrinsics with
     a prior, the correction is that of its mean.
     """
     if not contradicted:
-        return ()
+        return {}
     problem, linear, place = cameras.problem, cameras.linear, _camera_columns(cameras.problem)
     error = np.sum([one.error for one in contradicted], axis=0)
     of_priors = np.zeros(problem.n_kept + 1)
@@ -60,7 +52,7 @@ def sensitivity_to_cameras(
     }
     steps = response(problem, linear, normal, changes)
     steps += normal.kept_covariance() @ linear.prior_J.T @ pull[:, None]
-    return (Sensitivity(FITTED_CAMERA, kinematic_steps(problem, steps)),)
+    return {FITTED_CAMERA: kinematic_steps(problem, steps)}
 
 
 def _camera_columns(problem: FitProblem) -> IntArray:

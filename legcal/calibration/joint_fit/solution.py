@@ -36,7 +36,6 @@ from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_rea
 from legcal.calibration.joint_fit.scale import sensitivity_to_scale
 from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
-    Sensitivity,
     WrongIntrinsic,
     sensitivity_to_cameras,
 )
@@ -209,7 +208,9 @@ class Solution:
     # T_Rb_board and T_Re_board, by the link that the board is fixed to, where images show one
     T_frame_board: dict[Link, RigidTransform]
     gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
-    sensitivities: tuple[Sensitivity, ...]  # to errors of fixed quantities
+    # (p, c) changes of the parameters [m, rad] by c independent errors of a fixed quantity, by what
+    # it is
+    sensitivities: Mapping[str, Array]
     outlines: Outlines  # the input table, with the rejections of the fit
     start: str  # label of the start
     iterations: int  # of the solver, all rounds
@@ -272,10 +273,8 @@ def assemble_solution(
             if len(corners)
         },
         gammas=gammas,
-        sensitivities=(
-            *sensitivity_to_cameras(cameras, normal, contradicted),
-            *sensitivity_to_scale(problem, state, linear, kept),
-        ),
+        sensitivities=sensitivity_to_cameras(cameras, normal, contradicted)
+        | sensitivity_to_scale(problem, state, linear, kept),
         outlines=_with_rejections(outlines, fit),
         start=label,
         iterations=fit.minimum.iterations,
@@ -473,7 +472,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         radii=dict(sorted(radii.items())),
         estimates=estimates.in_order(tuple(parameters)),
         kinematic=solution.kinematic.in_order(parametrization),
-        sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
+        sensitivities={what: moved[steps] for what, moved in solution.sensitivities.items()},
         outlines=order.restore(solution.outlines),
         edges=None if solution.edges is None else order.restore(solution.edges),
         quality=replace(
