@@ -147,7 +147,6 @@ PUBLIC: dict[str, set[str]] = {
     "report": {
         "calibration",
         "calibration_page",
-        "identify",
         "machine",
         "plan",
         "render",
