@@ -257,25 +257,15 @@ def _earlier(destination: Path) -> dict[str, Any]:
 
 def _own_files(destination: Path) -> list[Path]:
     """Return the files of an earlier detection in a folder, relative to it."""
+    tables = OBSERVATIONS_NAME, CORNERS_NAME, DETECTION_PAGE, DETECTION.marker
     named = _earlier(destination).get("files", [])
     names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
     return [
         Path(name)
         for name in dict.fromkeys(names)
-        if path_problem(destination, name) is None and _is_place(Path(name))
+        if path_problem(destination, name) is None
+        and (name in tables or is_overlay(Path(name)) or is_overlay(Path(name), PHOTOGRAPHS))
     ]
-
-
-def _is_place(name: Path) -> bool:
-    if ".." in name.parts:
-        return False
-    tables = {
-        Path(OBSERVATIONS_NAME),
-        Path(CORNERS_NAME),
-        Path(DETECTION_PAGE),
-        Path(DETECTION.marker),
-    }
-    return name in tables or is_overlay(name) or is_overlay(name, PHOTOGRAPHS)
 
 
 def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:

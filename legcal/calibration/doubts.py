@@ -15,8 +15,9 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
-from legcal.calibration.joint_fit.held_out import CrossValidation, HeldOut, cross_validate
+from legcal.calibration.joint_fit.held_out import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
@@ -114,7 +115,7 @@ def doubts_of(
     dataset: Dataset,
     solution: Solution,
     platform: PlatformAccuracy | None,
-    held_out: HeldOut | None,
+    held_out: Holdout | None,
     diagnosis: Sequence[Diagnosis],
     corners: Corners | None,
     session: SessionTests,
@@ -627,7 +628,7 @@ def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:
     ]
 
 
-def _held_out(held_out: HeldOut | None) -> list[Doubt]:
+def _held_out(held_out: Holdout | None) -> list[Doubt]:
     """Return whether images that were kept aside are predicted worse than expected."""
     if held_out is None or held_out.rms_px is None or held_out.expected_px is None:
         return []

@@ -45,7 +45,7 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import HeldOut, Posterior
+from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
@@ -152,7 +152,7 @@ class Calibration(Summarised):
         Whether to use it.
     notes : tuple of str
         What else a reader should know.
-    held_out : HeldOut or None
+    held_out : Holdout or None
         How well the fit predicts the held-out images; None without any.
     corners : Corners or None
         The corners of the calibration board in all images; None without a board.
@@ -170,7 +170,7 @@ class Calibration(Summarised):
     platform: PlatformAccuracy | None
     verdict: Verdict
     notes: tuple[str, ...]
-    held_out: HeldOut | None = None
+    held_out: Holdout | None = None
     corners: Corners | None = None
     diagnosis: tuple[Diagnosis, ...] = ()
     overlays: Mapping[int, str] = field(default_factory=dict)
@@ -215,7 +215,7 @@ def _result_of(calibration: Calibration) -> Result:
     )
     on_base, on_platform = (_board(calibration, link) for link in LINKS)
     nominal, witness = geometries(machine), single_witness(solution.posterior.problem)
-    turned_from, held_out = nominal_axes(names, nominal), calibration.held_out
+    turned_from = nominal_axes(names, nominal)
     return Result(
         legcal_result=1,
         status="converged",
@@ -256,7 +256,7 @@ def _result_of(calibration: Calibration) -> Result:
         ),
         start=solution.start,
         platform=_platform(calibration),
-        holdout=None if held_out is None else Holdout.model_validate(held_out),
+        holdout=calibration.held_out,
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
         diagnosis=[one.document() for one in calibration.diagnosis] or None,

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import (
     CAMERA,
     TOLERANCE,
@@ -19,7 +20,6 @@ from legcal.calibration.doubts import (
     nominal_lengths,
 )
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
@@ -55,7 +55,7 @@ def judge(
     notes: Sequence[str],
     *,
     corners: Corners | None = None,
-    held_out: HeldOut | None = None,
+    held_out: Holdout | None = None,
     diagnosis: Sequence[Diagnosis] = (),
     group: GroupEstimate | None = None,
 ) -> Calibration:

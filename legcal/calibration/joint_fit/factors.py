@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_le
 from legcal.calibration.joint_fit.variables import FittedLegs, State
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines, polished_parts
+from legcal.data.outlines import Outlines, no_outlines, polished_parts
 from legcal.errors import Code, DatasetError, Problem
 from legcal.estimation.problem import Factor, Residuals, Touch
 from legcal.geometry.covariances import whitener
@@ -280,15 +280,8 @@ class ObservedOutlines:
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor, whitened by the claimed covariances."""
-        touches: tuple[Touch, ...] = (
-            ("legs", self.leg, _SIX),
-            ("camera_pose", self.view, _ALL),
-            ("radii", self.radius, _ONE),
-            ("biases", self.bias_index, _ONE),
-            ("cameras", self.view, _ALL),
-        )
-        if self.on_actuators:
-            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
+        own = ("radii", self.radius, _ONE), ("biases", self.bias_index, _ONE)
+        touches = _touches_of_legs(self, *own)
         whitening = whitener(self.covariance)
 
         def rows(state: State) -> Residuals:
@@ -507,20 +500,20 @@ class ObservedEdges:
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor."""
-        touches: tuple[Touch, ...] = (
-            ("legs", self.leg, _SIX),
-            ("camera_pose", self.view, _ALL),
-            ("leans", self.body, _ALL),
-            ("cameras", self.view, _ALL),
-        )
-        if self.on_actuators:
-            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
+        touches = _touches_of_legs(self, ("leans", self.body, _ALL))
         whitening = 1.0 / self.sigma[:, None, None]
 
         def rows(state: State) -> Residuals:
             return self.rows(keys, state)
 
         return Factor("edges", rows, touches, len(self), 1, self.pose, whitening, robust=True)
+
+
+def _touches_of_legs(seen: ObservedOutlines | ObservedEdges, *own: Touch) -> tuple[Touch, ...]:
+    """Return what measurements of legs in images depend on; *own* stand before the intrinsics."""
+    ends: tuple[Touch, ...] = ("legs", seen.leg, _SIX), ("camera_pose", seen.view, _ALL)
+    touches = (*ends, *own, ("cameras", seen.view, _ALL))
+    return (*touches, ("legs", seen.leg, _OF_ACTUATOR)) if seen.on_actuators else touches
 
 
 def observed_edges(
@@ -536,17 +529,14 @@ def observed_edges(
     DatasetError
         If the covariance of an edge is not positive definite.
     """
-    index = np.zeros(0, dtype=np.intp) if edges is None else np.flatnonzero(edges.used)
-    n, none = len(index), np.zeros(0, dtype=np.intp)
-    row = none if edges is None else edges.row[index]
-    leg = none if edges is None else edges.leg[index]
-    pixels = np.zeros((0, 2, 2)) if edges is None else edges.ends[index]
-    covariance = np.zeros((0, 2, 2)) if edges is None else edges.covariance[index]
+    edges = no_outlines() if edges is None else edges
+    index = np.flatnonzero(edges.used)
+    n, row, leg = len(index), edges.row[index], edges.leg[index]
+    pixels, covariance = edges.ends[index], edges.covariance[index]
     problems = _bad_covariances(covariance, row, leg, measurements, legs)
     if problems:
         raise DatasetError(problems)
-    links = () if edges is None else tuple(edges.part[i] for i in index.tolist())
-    keys = list(zip(leg.tolist(), links, strict=True))
+    keys = [(j, edges.part[i]) for i, j in zip(index.tolist(), leg.tolist(), strict=True)]
     bodies = tuple(sorted(set(keys)))
     body = np.array([bodies.index(key) for key in keys], dtype=np.intp)
     view = measurements.view[row]

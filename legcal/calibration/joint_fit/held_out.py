@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -103,29 +104,12 @@ _MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))  # median norm of two unit Gaussians
 _RANK_TOLERANCE = 1e-18  # relative to the largest eigenvalue of a pose's information
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Held-out images compared with the predictions of a fit.
-
-    Offsets are corrected for the common-mode biases of the fit. Expected errors are one standard
-    deviation, from the noise of outlines and readings and the covariance of the fit.
-    """
-
-    images: int  # held-out images
-    poses: int
-    outlines: int  # in these images
-    wrong: int  # outliers, excluded below
-    rms_px: float | None  # of the offsets [px]; None without outlines
-    expected_px: float | None
-    views: dict[str, float]  # rms by name of the view [px]
-
-
 def compare_held_out(
     posterior: Posterior,
     measurements: Measurements,
     outlines: Outlines,
     T_Rb_Re: Sequence[RigidTransform],
-) -> HeldOut:
+) -> Holdout:
     """Compare held-out images with the predictions of a fit to other images.
 
     Common-mode biases known from the fit are subtracted. Expected errors include the noise of
@@ -162,7 +146,7 @@ def compare_held_out(
     inliers = norm < problem.settings.rejection * scatter
     view = problem.outlines.view[inliers]
     pixels = np.einsum("nij,njk,nik->ni", L, expected, L)
-    return HeldOut(
+    return Holdout(
         images=measurements.n_rows,
         poses=measurements.n_poses,
         outlines=len(problem.outlines),
