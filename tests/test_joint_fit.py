@@ -17,7 +17,6 @@ from fit_sessions import (
     SHIPPED,
     HexapodSession,
     MachineSession,
-    axes_session,
     corners_of,
     disturbed_start,
     gauge_is_kept,
@@ -36,7 +35,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
-from legcal.calibration.joint_fit.fit import bound, refine
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.solution import Solution
@@ -47,9 +46,9 @@ from legcal.calibration.joint_fit.variables import (
     State,
 )
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
+from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array
 from legcal.machine.leg import ARMS, Leg, ParameterId, parameters_of_legs, radius_name
 from legcal.machine.parameters import moved_legs, parametrize
@@ -262,7 +261,9 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
     R = np.asarray(np.linalg.qr(J / unit, mode="r"))
     root = np.linalg.solve(np.swapaxes(R, 0, 1), (values / unit).T)
     expected = root.T @ root
-    return bound(problem, session.truth), expected
+    normal = information(problem, state, linearize(problem, state))
+    undetermined_directions(problem, state, normal)
+    return named_covariance(problem, state, normal.kept_covariance()), expected
 
 
 @pytest.mark.parametrize(
@@ -515,17 +516,6 @@ def scaled(session: MachineSession) -> MachineSession:
 
 def larger(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     return tuple(replace(leg, A=SCALE * leg.A, B=SCALE * leg.B, q0=SCALE * leg.q0) for leg in legs)
-
-
-@pytest.mark.parametrize("coplanar", [True])
-def test_exact_axes_give_the_truth(coplanar: bool) -> None:
-    session, joints = axes_session(coplanar=coplanar), 0.005
-    start = session.start(joints=joints)
-    assert np.abs(session.errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
-    found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
-    assert np.abs(session.errors(found.parameters)).max() < 1e-9
-    assert found.quality.rms_px is None
-    assert found.radii == {}
 
 
 def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:

@@ -8,9 +8,9 @@ import pytest
 from hexapod_example import Run
 
 import legcal
-from legcal.calibration.change_detection import possible_changes
 from legcal.calibration.documents import Kinematic, ParameterRow
-from legcal.calibration.link_joints import joints_in_links
+from legcal.calibration.result import joints_in_links
+from legcal.calibration.verification import possible_changes
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine

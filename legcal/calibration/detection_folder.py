@@ -25,7 +25,6 @@ from legcal.calibration.detection import (
     PHOTOGRAPHS,
     Detection,
     Examination,
-    ViewCondition,
     unique_names,
 )
 from legcal.data.corners import write_corners
@@ -258,25 +257,15 @@ def _earlier(destination: Path) -> dict[str, Any]:
 
 def _own_files(destination: Path) -> list[Path]:
     """Return the files of an earlier detection in a folder, relative to it."""
+    tables = OBSERVATIONS_NAME, CORNERS_NAME, DETECTION_PAGE, DETECTION.marker
     named = _earlier(destination).get("files", [])
     names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
     return [
         Path(name)
         for name in dict.fromkeys(names)
-        if path_problem(destination, name) is None and _is_place(Path(name))
+        if path_problem(destination, name) is None
+        and (name in tables or is_overlay(Path(name)) or is_overlay(Path(name), PHOTOGRAPHS))
     ]
-
-
-def _is_place(name: Path) -> bool:
-    if ".." in name.parts:
-        return False
-    tables = {
-        Path(OBSERVATIONS_NAME),
-        Path(CORNERS_NAME),
-        Path(DETECTION_PAGE),
-        Path(DETECTION.marker),
-    }
-    return name in tables or is_overlay(name) or is_overlay(name, PHOTOGRAPHS)
 
 
 def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:
@@ -311,7 +300,21 @@ def tables_of(examination: Examination) -> list[Table]:
         Table(
             ("view", ">legs", ">outlines used", ">contrast", ">length [px]", ">residual [px]",
              "not used"),
-            [_outline_cells(view) for view in examination.views if view.outlines is not None],
+            [
+                [
+                    view.view,
+                    _share(view.legs_found, view.legs_visible),
+                    _share(view.outlines_used, view.outlines),
+                    number(view.contrast, 1),
+                    number(view.length, 0),
+                    number(view.residual, 3),
+                    "camera not placed" if view.problem else ", ".join(
+                        f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items()
+                    ),
+                ]
+                for view in examination.views
+                if view.outlines is not None
+            ],
         ),
     ]  # fmt: skip
     units = dict.fromkeys(SHOWN_IN[check.unit][1] for check in examination.encoders)
@@ -331,19 +334,6 @@ def tables_of(examination: Examination) -> list[Table]:
     heading = f"encoder [{', '.join(units)}]"
     tables.append(Table((heading, ">least", ">greatest", ">travel", ">used [%]"), rows))
     return [table for table in tables if table.rows]
-
-
-def _outline_cells(view: ViewCondition) -> list[Cell]:
-    rejected = ", ".join(f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items())
-    return [
-        view.view,
-        _share(view.legs_found, view.legs_visible),
-        _share(view.outlines_used, view.outlines),
-        number(view.contrast, 1),
-        number(view.length, 0),
-        number(view.residual, 3),
-        "camera not placed" if view.problem else rejected,
-    ]
 
 
 def _share(part: int | None, whole: int | None) -> Cell:

@@ -1,4 +1,4 @@
-"""The joint fit (bundle adjustment): outlines in pixels or measured axes, readings and corners.
+"""The joint fit (bundle adjustment): outlines, readings and corners of boards.
 
 A first minimum with a wide robust loss, which outliers cannot lead astray; then rounds that
 estimate the noise of outlines, reject outliers, and fit the inliers again.
@@ -49,15 +49,12 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
 )
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize
 from legcal.estimation.solver import Minimum, information, minimise
-from legcal.estimation.uncertainty import named_covariance
-from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
@@ -77,7 +74,6 @@ def refine(
     start: Start | Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
-    axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
     edges: Outlines | None = None,
@@ -99,9 +95,6 @@ def refine(
         Starting values.
     settings : RefinementSettings
         Settings of the fit.
-    axes : LegAxes, optional
-        Measured axes, in addition to outlines or instead of them (pass
-        :func:`legcal.data.outlines.no_outlines`). Their covariances are not re-estimated.
     board : BoardCorners, optional
         Calibration boards fixed to base and platform, and their corners in images.
     choices : Choices
@@ -118,16 +111,15 @@ def refine(
     NotIdentifiable
         If the data do not determine the parameters, from any start.
     DidNotConverge
-        If the solver does not converge from any start, or most outlines or axes are outliers of the
-        fit.
+        If the solver does not converge from any start, or most outlines are outliers of the fit.
     DatasetError
-        If an outline or an axis cannot be used.
+        If an outline cannot be used.
     """
     starts = [start] if isinstance(start, Start) else start
 
     def fitted(used: Outlines) -> Solution:
         problem = build_fit(
-            legs, measurements, used, settings, axes=axes, board=board, choices=choices, edges=edges
+            legs, measurements, used, settings, board=board, choices=choices, edges=edges
         )
         problem.require_determined()
         with explaining_missing_scale(problem):
@@ -222,7 +214,14 @@ def _fit_from_best_start(
             continue
         if solution.left_out or _common_mode_px(solution) > problem.settings.largest_rms_px:
             solution = _retry_from_other_starts(problem, outlines, start, minimum, solution)
-        _refuse_common_mode(solution, problem.settings.largest_rms_px)
+        shifted, most_px = _common_mode_px(solution), problem.settings.largest_rms_px
+        if shifted > most_px:
+            kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
+            raise DidNotConverge(
+                f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
+                f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or "
+                "start from a better nominal model."
+            )
         return dataclasses.replace(
             solution, notes=(*solution.notes, *notes), details=tuple(details)
         )
@@ -274,18 +273,6 @@ def _retry_from_other_starts(
 def _common_mode_px(solution: Solution) -> float:
     """Largest standard deviation of common-mode edge biases [px]."""
     return max(solution.quality.shared_px.values(), default=0.0)
-
-
-def _refuse_common_mode(solution: Solution, most_px: float) -> None:
-    """Raise DidNotConverge if common-mode edge biases are too large for light and blur."""
-    shifted = _common_mode_px(solution)
-    if shifted > most_px:
-        kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
-        raise DidNotConverge(
-            f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
-            f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or start "
-            "from a better nominal model."
-        )
 
 
 def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None) -> Minimum[State]:
@@ -446,33 +433,3 @@ def _refuse_other_radii(problem: FitProblem, state: State) -> None:
     ]
     if problems:
         raise DidNotConverge(problems)
-
-
-def bound(problem: FitProblem, truth: Start, radii: Array | None = None) -> Array:
-    """Return the Cramer-Rao bound: the inverse of the information at the true state.
-
-    Parameters
-    ----------
-    problem : FitProblem
-        Built from data with the true covariances; outlines and axes are the linearisation points,
-        exact ones for the exact bound.
-    truth : Start
-        The true legs, cameras and poses.
-    radii : (n_radii,) array, optional
-        The true radii [m]; nominal by default.
-
-    Returns
-    -------
-    (n, n) array
-        Covariance of ``problem.named`` with all other unknowns marginalised out; includes priors.
-
-    Raises
-    ------
-    NotIdentifiable
-        If an open direction moves the platform.
-    """
-    state = problem.begin(truth)
-    state = state if radii is None else dataclasses.replace(state, radii=radii)
-    normal = information(problem, state, linearize(problem, state))
-    undetermined_directions(problem, state, normal)
-    return named_covariance(problem, state, normal.kept_covariance())
