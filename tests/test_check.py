@@ -33,9 +33,7 @@ from legcal.machine.actuator import Actuator, Line
 from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import (
     geometries,
-    moved_legs,
     parametrization_of,
-    turns_between,
     vector_of,
 )
 
@@ -205,33 +203,9 @@ def test_an_inconsistent_result_is_refused(
         check(images, folder)
 
 
-@pytest.mark.parametrize(
-    ("model", "named"), [("tricept", "with the legs"), ("3-spr", "with the leg leg1")]
-)
-def test_the_result_of_another_machine_is_refused(
-    result: Path, tmp_path: Path, model: str, named: str
-) -> None:
-    with pytest.raises(DatasetError, match=f"the result of another machine, {named}"):
-        check(_simulated(tmp_path / "set", model, poses=2), result)
-
-
-@pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
-def test_turns_between_axes_are_their_derivatives(model: str) -> None:
-    machine = load_mechanism(model)
-    nominal, found = geometries(machine), parametrization_of(machine, twists=True)
-    rng = np.random.default_rng(4)
-    is_angle = np.array(found.units) == "rad"
-    far = np.where(is_angle, rng.uniform(-0.1, 0.1, len(found)), 0.0)
-    calibrated = moved_legs(nominal, found.place, far)
-    start, here = (vector_of(found, calibrated, legs) for legs in (nominal, calibrated))
-    turns = turns_between(found, calibrated, nominal)
-    for i in np.flatnonzero(is_angle):
-        step = np.zeros(len(found))
-        step[i] = 1e-6
-        moved = moved_legs(nominal, found.place, far + step)
-        by_calibrated = (vector_of(found, moved, calibrated) - here) / 1e-6
-        by_nominal = (vector_of(found, moved, nominal) - start) / 1e-6
-        np.testing.assert_allclose(turns @ by_nominal, by_calibrated, atol=1e-4)
+def test_the_result_of_another_machine_is_refused(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="the result of another machine, with the leg leg1"):
+        check(_simulated(tmp_path / "set", "3-spr", poses=2), result)
 
 
 # The test statistic by itself, on linear models.
@@ -321,9 +295,7 @@ def _turned(actuator: Actuator, angle: float) -> Actuator:
     return replace(actuator, arm=replace(actuator.arm, line=line))
 
 
-@pytest.mark.parametrize(
-    ("model", "joint"), [("delta", "arm2"), ("hexaglide", "rail4"), ("round arms", "arm2")]
-)
+@pytest.mark.parametrize(("model", "joint"), [("hexaglide", "rail4"), ("round arms", "arm2")])
 def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
     model: str, joint: str, tmp_path: Path
 ) -> None:

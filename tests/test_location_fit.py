@@ -61,24 +61,6 @@ def test_residuals_are_the_step_that_was_made_and_zero_where_nothing_was_measure
     assert np.all((r[:, 3:] != 0.0).any(axis=1) == oriented)
 
 
-@FEW
-@given(base=motions, tool=motions)
-def test_exact_poses_give_exact_frames_wherever_these_are(
-    base: RigidTransform, tool: RigidTransform
-) -> None:
-    """Measured with and without orientation, and with the roles of base and tool exchanged."""
-    pairs = pairs_at(base, tool)
-    found = fitted(pairs, UNKNOWN).frames
-    assert np.abs(frame_errors(found, base, tool)).max() < 1e-12
-    n = len(pairs)
-    only = replace(pairs, oriented=np.zeros(n, dtype=np.bool_), M=np.tile(np.eye(3), (n, 1, 1)))
-    assert np.abs(frame_errors(search(only, 4).frames[0], base, tool)[:9]).max() < 1e-9
-    R, M = np.swapaxes(pairs.R, 1, 2), np.swapaxes(pairs.M, 1, 2)
-    t, p = (-np.einsum("nij,nj->ni", back, x) for back, x in ((R, pairs.t), (M, pairs.p)))
-    found = search(replace(pairs, R=R, t=t, M=M, p=p), 3).frames[0]
-    assert np.abs(frame_errors(found, tool.inv(), base.inv())).max() < 1e-9
-
-
 def test_the_nearest_rotation_is_never_a_mirror() -> None:
     matrices = np.random.default_rng(1).normal(size=(20, 3, 3))
     found = nearest_rotation(matrices)
