@@ -475,6 +475,7 @@ OTHER_LENS = replace(LENS, K=LENS.K * np.array([[0.6], [1.0], [1.0]]))
     ("true", "stated", "camera", "words"),
     [
         (APRILGRID, replace(APRILGRID, spacing=0.5), LENS, "the numbers of tags and tag_spacing"),
+        (APRILGRID, replace(APRILGRID, columns=2, rows=3), LENS, "the numbers of tags"),
         (CHARUCO, replace(CHARUCO, columns=4, rows=6), LENS, "squares, marker and square"),
         (CHARUCO, CHARUCO, OTHER_LENS, "camera file is of this camera and lens"),
     ],

@@ -16,7 +16,6 @@ from fit_sessions import (
     PINHOLE,
     HexapodSession,
     MachineSession,
-    axes_session,
     corners_of,
     disturbed_start,
     irregular_hexapod,
@@ -34,21 +33,22 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
-from legcal.calibration.joint_fit.fit import bound, refine
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import (
     FittedLegs,
+    RefinementSettings,
     Start,
     State,
 )
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
+from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array
-from legcal.machine.leg import ARMS, ParameterId, parameters_of_legs, radius_name
+from legcal.machine.leg import ARMS, ParameterId, radius_name
 from legcal.machine.parameters import parametrize
 from legcal.simulation.observe import moved_outlines
 
@@ -247,7 +247,9 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
     R = np.asarray(np.linalg.qr(J / unit, mode="r"))
     root = np.linalg.solve(np.swapaxes(R, 0, 1), (values / unit).T)
     expected = root.T @ root
-    return bound(problem, session.truth), expected
+    normal = information(problem, state, linearize(problem, state))
+    undetermined_directions(problem, state, normal)
+    return named_covariance(problem, state, normal.kept_covariance()), expected
 
 
 @pytest.mark.parametrize(
@@ -339,6 +341,27 @@ def vector(found: Solution) -> Array:
     return np.concatenate([p.base_joints.ravel(), p.platform_joints.ravel(), p.offsets])
 
 
+def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
+    small: HexapodSession,
+) -> None:
+    rng = np.random.default_rng(5)
+    noisy = noisy_readings(small, rng), noisy_outlines(small, rng)
+    good = disturbed_start(small)
+    bad = replace(disturbed_start(small, joints=0.1, camera=0.5, angle=2.0), label="staged")
+    settings = RefinementSettings(max_iterations=40)
+    for starts in ([good, bad], [bad, good]):
+        found = refine(small.legs, *noisy, starts, settings)
+        assert found.start == "nominal"
+        said = (*found.notes, *found.details)
+        assert any("the four steps" in note for note in said)
+        start = "Starting from the nominal model, the joint fit reached a cost of"
+        assert any(note.startswith(start) for note in found.details)
+        assert not any(note.startswith(start) for note in found.notes)
+    equal = replace(disturbed_start(small, seed=9), label="staged")
+    assert refine(small.legs, *noisy, [good, equal]).start == "nominal"
+    assert refine(small.legs, *noisy, [equal, good]).start == "staged"
+
+
 def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: HexapodSession) -> None:
     o = small.outlines
     wrong = (o.leg == 0) & (small.measurements.view[o.row] == 1)
@@ -393,16 +416,6 @@ def noisy(name: str) -> MachineSession:
 @cache
 def fitted(session: MachineSession) -> Solution:
     return refine(session.legs, session.measurements, session.outlines, session.start)
-
-
-def test_exact_axes_give_the_truth() -> None:
-    session, joints = axes_session(coplanar=True), 0.005
-    start = session.start(joints=joints)
-    assert np.abs(session.errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
-    found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
-    assert np.abs(session.errors(found.parameters)).max() < 1e-9
-    assert found.quality.rms_px is None
-    assert found.radii == {}
 
 
 def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:

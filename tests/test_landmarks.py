@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 
 from legcal import calibrate
-from legcal.calibration.clicks import click_notes
+from legcal.calibration.doubts import click_notes
 from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.verdict import judge
 from legcal.data.dataset import load_dataset

@@ -4,6 +4,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("only") / "session"
     small = Spread(0.1e-3, Distribution.NORMAL)
     errors = ParameterErrors(base_joints=small, platform_joints=small, lengths=small)
-    drawn = {"errors": errors, "poses": 1, "sampling": "workspace", "seed": 4}
+    drawn: dict[str, Any] = {"errors": errors, "poses": 1, "sampling": "workspace", "seed": 4}
     simulated(folder, "servo-hexapod", views=3, **drawn)
     entry = yaml.safe_load((folder / "dataset.yaml").read_text())
     (folder / "dataset.yaml").write_text(

@@ -19,6 +19,9 @@ from simulated import settings
 
 import legcal
 from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.session_changes import session_tests
+from legcal.data.image_choice import image_sequences
+from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.closing import generic_configurations, solve_poses
@@ -191,6 +194,20 @@ def test_a_wrong_reading_is_named_with_its_amount_and_does_no_harm(tmp_path: Pat
     assert found.quality.redundant_readings.doubts == ()
     values = found.estimates.vector(found.kinematic.parametrization.names)
     np.testing.assert_allclose(values, session.legs.vector(session.truth.legs), atol=1e-6)
+
+
+def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(tmp_path: Path) -> None:
+    slip = 3e-4
+    session = machine_session(str(made("7-ups", tmp_path).yaml_path), n_poses=8)
+    m = session.measurements
+    later = m.pose >= 4
+    slipped = dataclasses.replace(m, q=m.q + slip * np.outer(later, np.arange(7) == 3))
+    found = refine(session.legs, slipped, session.outlines, session.start)
+    first = session_tests(found.posterior, slipped, image_sequences(slipped, {})).findings[0]
+    assert (first.kind, first.subject) == ("encoder", "leg4")
+    assert first.amount == pytest.approx(slip, rel=0.05)
+    names = np.array(row_names(slipped))
+    assert first.between == (names[~later][-1], names[later][0])
 
 
 @pytest.mark.system

@@ -18,10 +18,9 @@ from machines import of_types
 
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.loader import load_mechanism
-from legcal.viewer.motion import Motion
 from legcal.viewer.server import Address
 from legcal.viewer.source import Photographs, Source, open_source
-from legcal.viewer.view_server import ViewServer
+from legcal.viewer.view_server import Motion, ViewServer
 
 MODELS = ["hexapod-rod", "3-rpr", "3-upu", "tricept", "delta"]
 
