@@ -100,7 +100,7 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     found = report("paper", board=True, hand_held=True)
     assert (len(found.views), set(found.images)) == (45, {1})
     assert found.full.rank == 30
-    assert found.conditions_hold
+    assert found.paper.ok
     assert found.board
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
 
@@ -123,7 +123,7 @@ def test_the_document_is_that_of_the_report(
         "name": "eq12", "equations": 9, "unknowns": 12, "ok": False, "needed": False,
     }  # fmt: skip
     assert "needed" not in document["conditions"][1]
-    assert document["paper"] == {"ok": found.conditions_hold}
+    assert document["paper"] == {"ok": found.paper.ok}
     assert document["board"] is True
     assert document["views"] == [list(view) for view in VIEWS["halves"]]
     assert found == report("halves", images=15, board=True)
