@@ -20,10 +20,10 @@ from rich.console import Console
 
 import legcal
 from legcal.calibration.identify.identifiability import (
+    Analysis,
     check_identifiable,
     identifiability_of_dataset,
 )
-from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior

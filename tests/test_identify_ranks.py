@@ -14,7 +14,7 @@ from staged_sessions import exact_session
 
 import legcal
 from legcal import identifiability
-from legcal.calibration.identify.ranks import Analysis, weak_directions
+from legcal.calibration.identify.identifiability import Analysis, weak_directions
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry.rotations import cross_matrices
