@@ -19,8 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import legcal
-from legcal.calibration.identify.identifiability import identifiability
-from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.identifiability import Analysis, identifiability
 from legcal.calibration.identify.session import planned_session
 
 ROOT = Path(__file__).parents[1]

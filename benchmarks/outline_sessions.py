@@ -23,7 +23,6 @@ from legcal.calibration.joint_fit.variables import (
     FittedLegs,
     RefinementSettings,
     Start,
-    cameras_from_hints,
     platform_poses,
     start_from,
 )
@@ -425,7 +424,8 @@ def nominal_start(legs: FittedLegs, m: Measurements, T_base_Rb: RigidTransform) 
     for part in (0.25, 0.5, 0.75):
         readings = first + part * (wanted - first)
         poses = platform_poses(legs.nominal, readings, poses, legs.frame_legs)
-    cameras = cameras_from_hints(m, T_base_Rb)
+    hints = [view.T_base_camera for view in m.views]
+    cameras = [T.inv() * T_base_Rb for T in hints if T is not None]
     return start_from(legs.nominal, m, legs, cameras, poses, "nominal")
 
 

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import legcal
-from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.identifiability import Analysis
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters

@@ -19,13 +19,10 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import (
     Start,
-    cameras_from_hints,
     start_from,
 )
-from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
-from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.leg import point_like_legs
 from legcal.simulation.observe import moved_outlines
 
@@ -165,16 +162,6 @@ def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
     monkeypatch.setattr(fit, "_first_minimum", with_cost)
     found = refine(session.legs, session.measurements, session.outlines, starts)
     assert found.start == "first"
-
-
-def test_views_without_a_rough_pose_are_named(session: HexapodSession) -> None:
-    T = motion_from_xyz_quat([0.1, 0.2, 0.3], [0.0, 0.0, 0.6, 0.8])
-    with pytest.raises(DatasetError, match="c1, c2, c3 have no T_base_camera"):
-        cameras_from_hints(session.measurements, T)
-    views = tuple(View(v.name, v.camera, T) for v in session.measurements.views)
-    hinted = replace(session.measurements, views=views)
-    for T_camera_Rb in cameras_from_hints(hinted, T):
-        np.testing.assert_allclose(T_camera_Rb.as_matrix(), np.eye(4), atol=1e-15)
 
 
 def test_platform_poses_have_the_lengths_of_the_readings(session: HexapodSession) -> None:

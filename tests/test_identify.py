@@ -17,10 +17,10 @@ from rich.console import Console
 
 import legcal
 from legcal.calibration.identify.identifiability import (
+    Analysis,
     check_identifiable,
     identifiability_of_dataset,
 )
-from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
@@ -96,7 +96,7 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     found = report("paper", board=True, hand_held=True)
     assert (len(found.views), set(found.images)) == (45, {1})
     assert found.full.rank == 30
-    assert found.conditions_hold
+    assert found.paper.ok
     assert found.board
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
 
@@ -119,7 +119,7 @@ def test_the_document_is_that_of_the_report(
         "name": "eq12", "equations": 9, "unknowns": 12, "ok": False, "needed": False,
     }  # fmt: skip
     assert "needed" not in document["conditions"][1]
-    assert document["paper"] == {"ok": found.conditions_hold}
+    assert document["paper"] == {"ok": found.paper.ok}
     assert document["board"] is True
     assert document["views"] == [list(view) for view in VIEWS["halves"]]
     assert found == report("halves", images=15, board=True)

@@ -12,7 +12,7 @@ from machines import MACHINES, with_round_arms
 from uncertainty import compared
 
 import legcal
-from legcal.calibration.identify.ranks import Analysis, is_scale_open
+from legcal.calibration.identify.identifiability import Analysis, is_scale_open
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.descriptions.new_model import create_model

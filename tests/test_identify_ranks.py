@@ -14,7 +14,7 @@ from staged_sessions import exact_session
 
 import legcal
 from legcal import identifiability
-from legcal.calibration.identify.ranks import Analysis, weak_directions
+from legcal.calibration.identify.identifiability import Analysis, weak_directions
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry.rotations import cross_matrices
@@ -181,7 +181,7 @@ def test_the_joint_fit_determines_all_where_counts_fail(
     name: str, views: Sequence[Sequence[int]], holds: bool, full: int
 ) -> None:
     found = report(name, views, 6)
-    assert (found.conditions_hold, found.full.rank) == (holds, full)
+    assert (found.paper.ok, found.full.rank) == (holds, full)
     assert found.identifiable
     assert not found.remedies
     sigma = found.platform_sigma
@@ -215,7 +215,7 @@ def test_what_does_not_move_the_platform_is_harmless(
 def test_every_shipped_model_is_identifiable_from_three_places(name: str) -> None:
     found = identifiability(model(name))
     assert found.views == (model(name).leg_names,) * 3
-    assert found.conditions_hold
+    assert found.paper.ok
     assert found.identifiable
     harmless = 6 if name == "3-upu" else 0
     assert found.full.rank == found.full.of - harmless

@@ -120,7 +120,6 @@ PUBLIC: dict[str, set[str]] = {
         "camera_calibration.projection",
         "verification",
         "detection",
-        "detection_folder",
         "doctor",
         "documents",
         "evaluation",

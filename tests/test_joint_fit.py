@@ -30,7 +30,7 @@ from fit_sessions import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.identifiability import Analysis
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.fit import refine

@@ -9,8 +9,7 @@ from actuated_sessions import session
 from staged_sessions import planned
 
 from legcal.calibration.identify import identifiability
-from legcal.calibration.identify.identifiability import check_identifiable
-from legcal.calibration.identify.ranks import Analysis, is_scale_open
+from legcal.calibration.identify.identifiability import Analysis, check_identifiable, is_scale_open
 from legcal.calibration.identify.report import RmsMotion
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior

@@ -20,6 +20,7 @@ import numpy as np
 
 from legcal.calibration.detection import (
     CHECKS,
+    DETECTION,
     SEVERITIES,
     CheckState,
     Detection,
@@ -28,14 +29,11 @@ from legcal.calibration.detection import (
     Finding,
     Severity,
     ViewCondition,
+    check_detection_destination,
     detected,
     require_images,
     unsearched,
     views_to_click,
-)
-from legcal.calibration.detection_folder import (
-    DETECTION,
-    check_detection_destination,
     write_detection,
 )
 from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagnose, notes_beside

@@ -16,8 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.detection import OVERLAYS, Detection, rows_with_image
-from legcal.calibration.detection_folder import draw_images, is_overlay
+from legcal.calibration.detection import (
+    OVERLAYS,
+    Detection,
+    draw_images,
+    is_overlay,
+    rows_with_image,
+)
 from legcal.calibration.documents import (
     ParameterRow,
     Result,

@@ -11,8 +11,7 @@ from typing import Any
 
 from rich.text import Text
 
-from legcal.calibration.detection import Examination
-from legcal.calibration.detection_folder import DETECTION_PAGE, tables_of
+from legcal.calibration.detection import DETECTION_PAGE, Examination, tables_of
 from legcal.data.new_dataset import NewDataset
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN

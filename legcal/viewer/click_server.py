@@ -12,8 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration.detection import Detection, Examination
-from legcal.calibration.detection_folder import DETECTION_PAGE, edges_seen_from, examination_page
+from legcal.calibration.detection import (
+    DETECTION_PAGE,
+    Detection,
+    Examination,
+    edges_seen_from,
+    examination_page,
+)
 from legcal.data.landmarks import (
     LANDMARKS_NAME,
     Landmarks,

@@ -128,11 +128,6 @@ class Identifiability(SparseDocument):
     # what is expected of the parts asked for (--only); left out without
     parts: tuple[PartSigma, ...] | None = None
 
-    @property
-    def conditions_hold(self) -> bool:
-        """Whether all of the paper's conditions hold that are needed."""
-        return self.paper.ok
-
     def document(self) -> dict[str, Any]:
         """Return the report as plain JSON types; see the documentation of the files."""
         return self.model_dump(mode="json", by_alias=True)

@@ -23,7 +23,7 @@ from legcal.calibration.tuning import (
     REJECTION,
 )
 from legcal.data.measurements import Measurements
-from legcal.errors import DatasetError, DidNotConverge
+from legcal.errors import DidNotConverge
 from legcal.estimation.problem import EstimationProblem, Frames, Tangent
 from legcal.geometry.axes import axis_angles_slope
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -589,29 +589,6 @@ def start_from(
     lengthening = legs.sign * measurements.q_of_poses
     poses = platform_poses(geometry, lengthening, T_Rb_Re, legs.frame_legs)
     return Start(tuple(geometry), tuple(T_camera_Rb), poses, label)
-
-
-def cameras_from_hints(
-    measurements: Measurements, T_base_Rb: RigidTransform
-) -> tuple[RigidTransform, ...]:
-    """Return T_camera_Rb of every view from its rough pose in the base link.
-
-    Raises
-    ------
-    DatasetError
-        If a view has no rough pose.
-    """
-    missing = [view.name for view in measurements.views if view.T_base_camera is None]
-    if missing:
-        raise DatasetError(
-            f"The fit could not be started: the views {', '.join(missing)} have no T_base_camera; "
-            "a camera pose good to 2 cm and 2 deg is needed; add it to dataset.yaml."
-        )
-    return tuple(
-        view.T_base_camera.inv() * T_base_Rb
-        for view in measurements.views
-        if view.T_base_camera is not None
-    )
 
 
 def platform_poses(
