@@ -137,6 +137,7 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.variables",
         "location.document",
         "location.locate",
+        "location.tool_poses",
         "ordered_dataset",
         "pipeline",
         "quantities",

@@ -402,8 +402,8 @@ WORDS: dict[str, str] = {
     "tool": "tool tcp werkzeug outil",
     "note": "note notes remark remarks comment comments bemerkung bemerkungen kommentar remarque "
     "remarques commentaire",
-    "view": "view camera cam viewpoint station setup place tripod kamera ansicht stativ standort ort "
-    "platz vue lieu",
+    "view": "view camera cam viewpoint station setup place tripod kamera ansicht stativ standort "
+    "ort platz vue lieu",
     "image": "image img file filename photo photograph picture pic frame shot bild foto datei "
     "dateiname aufnahme cliche fichier",
     "pose": "pose poseid poselabel position pos stellung lage",
