@@ -132,6 +132,7 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.parameter_choices",
         "joint_fit.part_errors",
         "joint_fit.platform",
+        "joint_fit.sensitivity",
         "joint_fit.predicted",
         "joint_fit.problem",
         "joint_fit.variables",

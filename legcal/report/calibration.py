@@ -12,6 +12,8 @@ import numpy as np
 from rich.text import Text
 
 from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.joint_fit.platform import PlatformAccuracy
+from legcal.calibration.joint_fit.sensitivity import INTRINSICS
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 _SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
 _LARGEST = 3  # largest changes of parameters shown
+_WORTH_A_BOARD = 0.9  # predicted error with exact intrinsics, relative to the present one
 _EXPLANATIONS = 3  # alternative explanations shown
 
 
@@ -162,7 +165,24 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step
                 "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
             )
         )
+    elif gain := _gain_of_a_board(calibration.platform):
+        steps.append(Step(gain, "legcal camera BOARDS --board chessboard:9x6:25mm -o FILE"))
     return steps
+
+
+def _gain_of_a_board(platform: PlatformAccuracy | None) -> str:
+    """Return what exact intrinsics would bring, "" if it is little."""
+    if platform is None:
+        return ""
+    error = (platform.workspace or platform.sigma).mean_displacement
+    of_cameras = [e.error.mean_displacement for e in platform.effects if e.what == INTRINSICS]
+    rest = float(np.sqrt(max(error**2 - sum(x**2 for x in of_cameras), 0.0)))
+    if rest > _WORTH_A_BOARD * error:
+        return ""
+    return (
+        f"Calibrate the camera with a board: with exact intrinsics the predicted error would be "
+        f"{1e3 * rest:.2g} mm in place of {1e3 * error:.2g} mm:"
+    )
 
 
 def platform_table(platform: PlatformBlock) -> Table:

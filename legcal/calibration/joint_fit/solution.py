@@ -39,6 +39,7 @@ from legcal.calibration.joint_fit.sensitivity import (
     Sensitivity,
     WrongIntrinsic,
     sensitivity_to_cameras,
+    sensitivity_to_intrinsics,
 )
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
@@ -275,6 +276,7 @@ def assemble_solution(
         sensitivities=(
             *sensitivity_to_cameras(cameras, normal, contradicted),
             *sensitivity_to_scale(problem, state, linear, kept),
+            *sensitivity_to_intrinsics(problem, kept),
         ),
         outlines=_with_rejections(outlines, fit),
         start=label,
