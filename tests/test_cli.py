@@ -250,7 +250,7 @@ def test_a_number_of_processes_beside_a_cluster_is_refused(
 def test_progress_is_shown_unless_somebody_wants_quiet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["simulate", "hexapod", "--level", "outlines", "--poses", "1"]
+    words = ["simulate", "3-rpr", "--level", "outlines", "--poses", "1"]
     assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
     shown = capsys.readouterr()
     assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0

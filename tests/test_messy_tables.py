@@ -139,7 +139,8 @@ def test_what_a_person_reads_at_once_is_read(kind: str, tmp_path: Path) -> None:
 
 def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
-    joints: dict[str, list[tuple[float, float]]] = {"A": [(0, -400), (346.4, 200), (-346.4, 200)],
+    joints: dict[str, list[tuple[float, float]]]
+    joints = {"A": [(0, -400), (346.4, 200), (-346.4, 200)],
               "B": [(100.3, -124.7), (79.2, 116.9), (-139.5, -12.2)]}  # fmt: skip
     rows = [f"{side}{j}{' (home)' * (side == 'B')};{x};{y}" for side, xy in joints.items()
             for j, (x, y) in enumerate(xy, 1)]  # fmt: skip

@@ -255,7 +255,7 @@ def identify(
 ) -> None:
     """Report which parameters are identifiable, and how to make the others so."""
     from legcal.calibration.identify.identifiability import answer
-    from legcal.report.identify import identify_table
+    from legcal.report.machine import identify_table
 
     views = [text.split(",") for text in view or []]
     identified = answer(

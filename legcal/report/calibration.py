@@ -11,13 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.text import Text
 
-from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.documents import (
+    ExplanationBlock,
+    NextStep,
+    PlatformBlock,
+    Result,
+    WorkspaceAccuracy,
+)
 from legcal.calibration.joint_fit.platform import PlatformAccuracy
 from legcal.calibration.joint_fit.sensitivity import INTRINSICS
 from legcal.calibration.pipeline import exact_cameras
-from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
+    DIGITS,
     brief_sentences,
+    joints_of,
+    parameters_of,
     sentences,
     tables,
 )
@@ -29,7 +37,6 @@ from legcal.pages.document import Step, Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
-    from legcal.calibration.change_detection import Explanation
     from legcal.calibration.evaluation import Evaluation
     from legcal.calibration.result import Calibration
     from legcal.calibration.verification import Check
@@ -175,8 +182,10 @@ def _gain_of_a_board(platform: PlatformAccuracy | None) -> str:
     if platform is None:
         return ""
     error = (platform.workspace or platform.sigma).mean_displacement
-    of_cameras = [e.error.mean_displacement for e in platform.effects if e.what == INTRINSICS]
-    rest = float(np.sqrt(max(error**2 - sum(x**2 for x in of_cameras), 0.0)))
+    of_cameras = platform.effects.get(INTRINSICS)
+    if of_cameras is None:
+        return ""
+    rest = float(np.sqrt(max(error**2 - of_cameras.mean_displacement**2, 0.0)))
     if rest > _WORTH_A_BOARD * error:
         return ""
     return (
@@ -232,7 +241,7 @@ def check_summary(check: Check) -> Report:
     ]
     if movement.explanations:
         best, *others = movement.explanations
-        change, amount = best.change.what, _amount(best)
+        change, amount = best.what, _amount(best)
         if best.p_value < movement.significance:
             lines.append(
                 f"No single leg explains it; {change} explains most ({amount}; residual statistic "
@@ -240,17 +249,17 @@ def check_summary(check: Check) -> Report:
             )
         else:
             lines.append(f"It is explained by {change}: {amount}.")
-            named = ", ".join(other.change.what for other in others[:_EXPLANATIONS])
+            named = ", ".join(other.what for other in others[:_EXPLANATIONS])
             lines += [f"These images cannot distinguish that from: {named}."] if named else []
     style = "bold red" if movement.moved else "bold green"
     return report([*lines, Text(check.sentence, style=style)])
 
 
-def _amount(explanation: Explanation) -> str:
+def _amount(change: ExplanationBlock) -> str:
     """Return the amount of a change in words."""
-    change, parts = explanation.change, []
+    parts = []
     components = zip(change.components, change.units, change.links, strict=True)
-    numbers = zip(explanation.values.tolist(), explanation.sigma.tolist(), strict=True)
+    numbers = zip(change.values, change.sigma, strict=True)
     for (name, unit, link), (value, sigma) in zip(components, numbers, strict=True):
         scale, shown = SHOWN_IN[unit]
         digits = DIGITS[shown]
