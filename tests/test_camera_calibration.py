@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from boards import before
 from camera_sessions import (
     CAMERAS,
     NOISE_PX,
@@ -40,6 +41,7 @@ from legcal.calibration.camera_calibration.projection import compare_cameras, pr
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages
+from legcal.perception.board_corners import find_corners
 from legcal.vision.board import board_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 from legcal.vision.camera_file import read_camera
@@ -409,6 +411,34 @@ def test_grids_of_circles_give_the_camera_that_took_them(tmp_path: Path) -> None
     assert found.rms_px < 0.1
     with pytest.raises(UsageError, match="gaps"):
         calibrate_camera(images, spec.rsplit(":", 1)[0] + ":30mm")
+
+
+@pytest.mark.parametrize("spec", ["circles:9x6:30mm:20mm", "asymmetric_circles:4x11:20mm:14mm"])
+def test_each_circle_is_measured_at_the_centroid_of_its_image(tmp_path: Path, spec: str) -> None:
+    board = board_of(spec)
+    (path,) = drawings(tmp_path, PINHOLE, 1, board, 0.46)
+    number, px, _ = find_corners(board, np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+    T = before(board, 0.46, np.array([0.5, 0.0, np.random.default_rng(4).uniform(-0.3, 0.3)]))
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    rim = 0.5 * board.marker * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    centroids = []
+    for point in board.points[number]:
+        x, y = PINHOLE.project(T.inv().apply(point + rim)).T
+        twice = x[:-1] * y[1:] - x[1:] * y[:-1]  # areas of triangles
+        centroids.append([((z[:-1] + z[1:]) @ twice) / (3.0 * twice.sum()) for z in (x, y)])
+    off = px - centroids
+    assert len(number) == board.n_corners
+    assert np.abs(off).max() < 0.15
+    assert np.sqrt((off**2).mean()) < 0.05
+
+
+def test_ten_copies_shifted_by_some_pixels_are_one_image(tmp_path: Path) -> None:
+    (path,) = drawings(tmp_path, PINHOLE, 1)
+    image = np.asarray(cv2.imread(str(path)))
+    for k in range(1, 10):
+        cv2.imwrite(str(tmp_path / f"s{k}.png"), np.roll(image, (k, -k), (0, 1)))
+    with pytest.raises(NotIdentifiable, match=r"found 1 image.*only shifted in the picture"):
+        calibrate_camera(tmp_path, SPEC)
 
 
 def test_the_file_is_a_camera_info_with_the_whole_covariance(

@@ -130,6 +130,7 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.part_errors",
         "workspace_errors",
         "joint_fit.platform",
+        "joint_fit.sensitivity",
         "joint_fit.predicted",
         "joint_fit.variables",
         "location.document",

@@ -17,6 +17,7 @@ from legcal import calibrate, check
 from legcal.calibration.documents import Result
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.sensitivity import INTRINSICS
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.dataset import load_dataset
 from legcal.geometry.types import Array
@@ -67,6 +68,19 @@ def moved(away: Array, covariance: Array | None = COVARIANCE) -> Camera:
     return replace(
         with_intrinsics(LENS, dict(zip(NAMES, values, strict=True))), covariance=covariance
     )
+
+
+def test_the_part_of_the_intrinsics_is_what_exact_ones_would_remove() -> None:
+    rough, exact = (
+        fitted(session(), moved(0.0 * SIGMA, C)) for C in (_covariance(9 * SIGMA), None)
+    )
+    part = rough.sensitivities[INTRINSICS]
+    assert INTRINSICS not in exact.sensitivities
+    C, remains = rough.kinematic.covariance, exact.kinematic.covariance
+    free = np.diagonal(remains) > 0.0
+    assert np.median(np.diagonal(C)[free] / np.diagonal(remains)[free]) > 1.2  # it matters
+    sigma, expected = (np.sqrt(np.diagonal(x)[free]) for x in (C - part @ part.T, remains))
+    np.testing.assert_allclose(sigma, expected, rtol=0.1)
 
 
 def errors(given: MachineSession, found: Solution) -> float:

@@ -18,6 +18,8 @@ from legcal.calibration.documents import (
     Result,
     WorkspaceAccuracy,
 )
+from legcal.calibration.joint_fit.platform import PlatformAccuracy
+from legcal.calibration.joint_fit.sensitivity import INTRINSICS
 from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.summary import (
     DIGITS,
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
 _SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
 _LARGEST = 3  # largest changes of parameters shown
+_WORTH_A_BOARD = 0.9  # predicted error with exact intrinsics, relative to the present one
 _EXPLANATIONS = 3  # alternative explanations shown
 
 
@@ -169,7 +172,26 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step
                 "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
             )
         )
+    elif gain := _gain_of_a_board(calibration.platform):
+        steps.append(Step(gain, "legcal camera BOARDS --board chessboard:9x6:25mm -o FILE"))
     return steps
+
+
+def _gain_of_a_board(platform: PlatformAccuracy | None) -> str:
+    """Return what exact intrinsics would bring, "" if it is little."""
+    if platform is None:
+        return ""
+    error = (platform.workspace or platform.sigma).mean_displacement
+    of_cameras = platform.effects.get(INTRINSICS)
+    if of_cameras is None:
+        return ""
+    rest = float(np.sqrt(max(error**2 - of_cameras.mean_displacement**2, 0.0)))
+    if rest > _WORTH_A_BOARD * error:
+        return ""
+    return (
+        f"Calibrate the camera with a board: with exact intrinsics the predicted error would be "
+        f"{1e3 * rest:.2g} mm in place of {1e3 * error:.2g} mm:"
+    )
 
 
 def platform_table(platform: PlatformBlock) -> Table:

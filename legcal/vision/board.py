@@ -56,7 +56,7 @@ class Board:
     @property
     def has_circles(self) -> bool:
         """Whether its corners are the centres of circles, of the radius ``marker / 2``."""
-        return self.kind in ("circles", "asymmetric_circles")
+        return self.kind in _CIRCLES
 
     @property
     def towards_viewer(self) -> float:
@@ -385,6 +385,7 @@ class KalibrCheckerboard(_ForeignTarget):
 
 
 _SAME_SIDE = 1e-3  # largest relative difference of the sides of squares
+_CIRCLES = ("circles", "asymmetric_circles")
 _KINDS: Mapping[str, type[ChessboardEntry | CharucoEntry | AprilgridEntry]] = {
     "chessboard": ChessboardEntry,
     "charuco": CharucoEntry,
@@ -472,9 +473,12 @@ def _entry(mapping: Any, path: Path) -> ChessboardEntry | CharucoEntry | Aprilgr
     kind = mapping.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
         kind_in_words = "no such key" if "kind" not in mapping else describe(kind)
+        remedy = "name the kind of the board"
+        if isinstance(kind, str) and kind in _CIRCLES:  # cut off or behind a leg, none is found
+            remedy = "put one of these into the scene: circles serve legcal camera alone"
         raise DatasetError(
             f"{path}: board.kind could not be read: found {kind_in_words}, needed "
-            f"{', '.join(_KINDS)}; name the kind of the board."
+            f"{', '.join(_KINDS)}; {remedy}."
         )
     return validate(_KINDS[kind], mapping, path, "board")
 

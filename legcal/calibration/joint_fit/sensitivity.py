@@ -26,6 +26,7 @@ from legcal.vision.camera import shared_cameras
 FITTED_CAMERA = (
     "the camera corrections that the measurements suggest"  # where they contradict their files
 )
+INTRINSICS = "what the fit leaves unknown of the intrinsics, a part of this,"
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
@@ -53,6 +54,20 @@ def sensitivity_to_cameras(
     steps = response(problem, linear, normal, changes)
     steps += normal.kept_covariance() @ linear.prior_J.T @ pull[:, None]
     return {FITTED_CAMERA: kinematic_steps(problem, steps)}
+
+
+def sensitivity_to_intrinsics(problem: FitProblem, covariance: Array) -> dict[str, Array]:
+    """Return the part of the errors of the parameters that goes with those of estimated intrinsics.
+
+    Were these known exactly, the rest of the covariance (n_kept, n_kept) would remain.
+    """
+    along = covariance[:, problem.where("cameras")]
+    values, vectors = np.linalg.eigh(along[problem.where("cameras")])
+    known = values > 0.0
+    if not known.any():
+        return {}
+    steps = along @ (vectors[:, known] / np.sqrt(values[known]))
+    return {INTRINSICS: kinematic_steps(problem, steps)}
 
 
 def _camera_columns(problem: FitProblem) -> IntArray:

@@ -38,6 +38,7 @@ from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
     WrongIntrinsic,
     sensitivity_to_cameras,
+    sensitivity_to_intrinsics,
 )
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
@@ -274,7 +275,8 @@ def assemble_solution(
         },
         gammas=gammas,
         sensitivities=sensitivity_to_cameras(cameras, normal, contradicted)
-        | sensitivity_to_scale(problem, state, linear, kept),
+        | sensitivity_to_scale(problem, state, linear, kept)
+        | sensitivity_to_intrinsics(problem, kept),
         outlines=_with_rejections(outlines, fit),
         start=label,
         iterations=fit.minimum.iterations,
