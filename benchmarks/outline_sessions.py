@@ -24,9 +24,8 @@ from legcal.calibration.joint_fit.variables import (
     RefinementSettings,
     platform_poses,
 )
-from legcal.data.axes import axes_from_outlines
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, axes_from_outlines
 from legcal.descriptions.new_model import create_model
 from legcal.descriptions.table import described_machine
 from legcal.errors import DidNotConverge
@@ -53,7 +52,7 @@ from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.cameras import cameras_around, mild_lens
 from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of
 from legcal.simulation.paper import nominal_start, noncoplanar_hexapod
-from legcal.simulation.poses import draw_poses
+from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import dressed, pose_machine
 from legcal.simulation.visibility import take_images
 from legcal.vision.camera import Camera

@@ -19,9 +19,9 @@ from legcal.machine.leg import Cylinder as Visible
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.simulation.poses import commanded_poses
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.scene import prepare_view
+from legcal.simulation.session import commanded_poses
 from legcal.simulation.settings import ParameterErrors, Sampling, Spread
 from legcal.simulation.solids import (
     Box,

@@ -24,10 +24,9 @@ from legcal.calibration.joint_fit.variables import (
     fitted_legs,
     start_from,
 )
-from legcal.data.axes import LegAxes, axes_of_table
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines, unmeasured
+from legcal.data.outlines import LegAxes, Outlines, axes_of_table, unmeasured
 from legcal.data.reasons import USED
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array

@@ -31,8 +31,7 @@ from legcal.machine.inspection import Inspection
 from legcal.planning.session import PlanDocument
 from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
-from legcal.simulation.paper import PaperDocument
-from legcal.simulation.study import StudyHeading
+from legcal.simulation.paper import PaperDocument, StudyHeading
 from legcal.vision.board import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
 

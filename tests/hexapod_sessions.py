@@ -10,9 +10,8 @@ import numpy as np
 from machines import from_vector
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.axes import LegAxes, axes_from_outlines, axes_of_table
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, axes_of_table
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import point_like_legs
@@ -28,8 +27,7 @@ from legcal.simulation.observe import (
     outlines_of,
 )
 from legcal.simulation.paper import PAPER_VIEWS, paper_cameras
-from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import simulate_session, streams
+from legcal.simulation.session import draw_poses, simulate_session, streams
 from legcal.simulation.settings import (
     Distribution,
     Level,

@@ -42,8 +42,7 @@ from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
 from legcal.calibration.location.tool_poses import PoseNoise
-from legcal.data.axes import axes_from_outlines
-from legcal.data.outlines import no_outlines
+from legcal.data.outlines import axes_from_outlines, no_outlines
 from legcal.errors import DidNotConverge
 from legcal.estimation import solver
 from legcal.estimation.loss import PseudoHuber

@@ -23,9 +23,8 @@ from legcal.calibration.joint_fit.variables import (
     cameras_from_hints,
     start_from,
 )
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import View
-from legcal.data.outlines import Outlines, no_outlines
+from legcal.data.outlines import LegAxes, Outlines, no_outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.leg import point_like_legs

@@ -31,7 +31,7 @@ ROOMS = (
 BESIDE = "simulation"  # it knows the truth
 # The modules of each room that other rooms use; all others are its own affair.
 PUBLIC: dict[str, set[str]] = {
-    "geometry": {"axes", "covariances", "lines", "motions", "rotations", "types"},
+    "geometry": {"covariances", "lines", "motions", "rotations", "types"},
     "files": {"folder", "motions", "published", "quantity", "reading", "schema", "table"},
     "pages": {"document", "svg"},
     "machine": {
@@ -72,7 +72,6 @@ PUBLIC: dict[str, set[str]] = {
         "visibility",
     },
     "data": {
-        "axes",
         "cache",
         "corners",
         "dataset",
@@ -89,7 +88,7 @@ PUBLIC: dict[str, set[str]] = {
         "readings_sheet",
         "reasons",
     },
-    "recordings": {"arrivals", "importing"},
+    "recordings": {"frames", "importing"},
     "estimation": {
         "clusters",
         "loss",
@@ -160,7 +159,7 @@ PUBLIC: dict[str, set[str]] = {
     },
     "viewer": {"click_server", "server", "shooting", "source", "view_server"},
     "cli": set(),
-    "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
+    "simulation": {"dataset", "observe", "paper", "session", "settings"},
 }
 OUTSIDE = {
     "__main__",

@@ -40,7 +40,7 @@ from legcal.machine.tolerance import Tolerance
 from legcal.planning.places import default_setting
 from legcal.planning.poses import surely_reached
 from legcal.simulation.dataset import simulate
-from legcal.simulation.poses import given_poses
+from legcal.simulation.session import given_poses
 
 
 def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:

@@ -24,7 +24,7 @@ from legcal.geometry.types import Array
 from legcal.planning import shooting
 from legcal.planning.shooting import GuidedSession
 from legcal.recordings import arrivals
-from legcal.recordings.arrivals import LiveCamera, WatchedFolder
+from legcal.recordings.frames import LiveCamera, WatchedFolder
 from legcal.viewer import shooting as dialogues
 from legcal.viewer.server import TOKEN_HEADER
 from legcal.viewer.shooting import Dialogue, DialogueServer

@@ -8,7 +8,7 @@ from machines import from_vector
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.axes import LegAxes
+from legcal.data.outlines import LegAxes
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
 from legcal.machine.configurations import JITTER
@@ -24,15 +24,15 @@ from legcal.simulation.paper import (
     SCALARS,
     Means,
     PaperStudy,
+    StudyResult,
     expected_errors,
     expected_norm,
     paper_cameras,
     paper_machine,
     platform_errors,
+    run_study,
 )
-from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import SimulatedSession, streams
-from legcal.simulation.study import StudyResult, run_study
+from legcal.simulation.session import SimulatedSession, draw_poses, streams
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:

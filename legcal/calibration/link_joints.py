@@ -27,8 +27,7 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.quantities import FRAMES
 from legcal.files.motions import Pose
-from legcal.geometry.axes import turned_axis
-from legcal.geometry.lines import normal_basis
+from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LegColumns
 from legcal.machine.model import Machine

@@ -27,8 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
-from legcal.machine.bodies import frame_link, rigid_bodies
-from legcal.machine.chain import ClosedChain
+from legcal.machine.chain import ClosedChain, frame_link, rigid_bodies
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,

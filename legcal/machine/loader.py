@@ -19,8 +19,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
-from legcal.machine.bodies import Bodies, rigid_bodies
-from legcal.machine.chain import ClosedChain, Closure
+from legcal.machine.chain import Bodies, ClosedChain, Closure, rigid_bodies
 from legcal.machine.classification import (
     PERPENDICULAR,
     actuator_of,

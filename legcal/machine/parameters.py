@@ -16,8 +16,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.axes import axis_angles, turned_axis
-from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.lines import axis_angles, cross, normal_basis, turned_axis
 from legcal.geometry.motions import frame_on_points, matrix_applied
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray

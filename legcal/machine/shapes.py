@@ -34,7 +34,7 @@ from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_of, m
 from legcal.geometry.rotations import nearest_rotation, rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator, Arm, Line
-from legcal.machine.bodies import Bodies
+from legcal.machine.chain import Bodies
 from legcal.machine.classification import joint_tolerance
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.meshes import first_hits, mesh_file, mesh_of_file, ray_caster, read_mesh

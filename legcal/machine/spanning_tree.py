@@ -21,8 +21,7 @@ from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.bodies import frame_link
-from legcal.machine.chain import Closure
+from legcal.machine.chain import Closure, frame_link
 from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
 from legcal.machine.urdf import (
     LOOP_TAGS,

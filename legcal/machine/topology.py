@@ -19,8 +19,7 @@ from legcal.errors import OutOfClass, Problem
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
-from legcal.machine.chain import Closure
+from legcal.machine.chain import Bodies, Closure, Connection, frame_link, rigid_bodies
 from legcal.machine.classification import (
     classify_leg,
     is_actuator,

@@ -21,11 +21,10 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
+from legcal.data.outlines import LegAxes
 from legcal.errors import NotIdentifiable
-from legcal.geometry.axes import turned_axis
-from legcal.geometry.lines import cross
+from legcal.geometry.lines import cross, turned_axis
 from legcal.geometry.motions import register_points
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.paper.equations import (

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import turned_axis
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind

@@ -20,9 +20,16 @@ from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.perception.corner_lattice import Print, expected, find_lattice, measured
+from legcal.perception.corner_lattice import (
+    Print,
+    Saddles,
+    expected,
+    find_lattice,
+    fit_saddles,
+    measured,
+    near_saddles,
+)
 from legcal.perception.placement import Load
-from legcal.perception.saddles import Saddles, fit_saddles, near_saddles
 from legcal.progress import Report
 from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, charuco_board, dictionary
 from legcal.vision.image_file import Grey, possible_scale, quiet_opencv, reduced, rescaled

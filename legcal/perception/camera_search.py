@@ -18,10 +18,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
-from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import (
     MAX_WIDTH_SIGMAS,
     CameraPoses,
+    EdgeMaps,
     LegSegments,
     PairMatches,
     Picture,

@@ -44,10 +44,10 @@ from legcal.simulation.observe import (
     edges_of_bodies,
     outlines_of,
 )
-from legcal.simulation.poses import are_extreme
 from legcal.simulation.session import (
     SimulatedSession,
     Streams,
+    are_extreme,
     photographs,
     simulate_session,
     streams,

@@ -20,10 +20,9 @@ import numpy as np
 
 from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_length
 from legcal.calibration.joint_fit.variables import FittedLegs, State
-from legcal.data.axes import LegAxes, join_axes
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines, polished_parts
+from legcal.data.outlines import LegAxes, Outlines, join_axes, polished_parts
 from legcal.errors import Code, DatasetError, Problem
 from legcal.estimation.problem import Factor, Residuals, Touch
 from legcal.geometry.covariances import whitener

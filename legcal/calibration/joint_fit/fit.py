@@ -47,9 +47,8 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
 )
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines, are_of_arms
+from legcal.data.outlines import LegAxes, Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize

@@ -55,9 +55,8 @@ from legcal.calibration.joint_fit.variables import (
     intrinsic_of,
 )
 from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements, row_names
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import LegAxes, Outlines
 from legcal.errors import NotIdentifiable
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import (
