@@ -22,7 +22,7 @@ from legcal.simulation.paper import (
     ESTIMATORS,
     PAPER_VIEWS,
     SCALARS,
-    Means,
+    EstimatorRow,
     PaperStudy,
     StudyResult,
     expected_errors,
@@ -115,11 +115,11 @@ def test_a_session_is_that_of_the_paper(name: str) -> None:
 
 def test_means_have_their_standard_deviations() -> None:
     drawn = np.random.default_rng(0).uniform(1.0, 2.0, (7, len(SCALARS)))
-    means = Means.of("coplanar", "fit", [
+    means = EstimatorRow.of("coplanar", "fit", [
         {**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]}
         for row in drawn
     ])  # fmt: skip
-    row, sigma = means.row().document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
+    row, sigma = means.document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
     assert row["dX_mm"] == pytest.approx(1e3 * drawn[:, 0].mean())
     assert row["dE_deg"] == pytest.approx(np.rad2deg(drawn[:, 1].mean()))
     assert row["parameters_mm"] == pytest.approx([1e3 * drawn[:, 0].mean()])

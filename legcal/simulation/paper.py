@@ -49,7 +49,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
 from legcal.machine.rods import actuator_index, readings_of_rods
-from legcal.pages.svg import Bars, Canvas, log_bars, stacked
+from legcal.pages.svg import Bars, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
@@ -174,9 +174,9 @@ class PaperStudy:
             for name, child in zip(MACHINES, seeds, strict=True)
         }
 
-    def summary(self, records: Iterable[Record]) -> PaperSummary:
+    def summary(self, records: Iterable[Record]) -> PaperDocument:
         """Return the means over all runs."""
-        return PaperSummary.of(records, in_radians=self.noise == TableNoise.in_radians())
+        return PaperDocument.of(records, in_radians=self.noise == TableNoise.in_radians())
 
     def session(
         self, truth: Machine, views: Sequence[Viewpoint], rngs: Streams
@@ -212,8 +212,10 @@ class PaperStudy:
             else:
                 errors_by_estimator[name] = _errors(truth, legs, covariance, checked)
         sigma = np.sqrt(np.diagonal(covariance))
-        expected = expected_errors(truth, covariance, checked)
-        errors_by_estimator[BOUND] = errors_record(expected, 1.0, np.sqrt(2.0 / np.pi) * sigma)
+        errors_by_estimator[BOUND] = asdict(expected_errors(truth, covariance, checked)) | {
+            "of_bound_squared": 1.0,
+            "parameters": (np.sqrt(2.0 / np.pi) * sigma).tolist(),
+        }
         return errors_by_estimator
 
 
@@ -248,15 +250,9 @@ def _errors(
         errors = platform_errors(truth, legs, checked)
     except LegcalError as error:
         return {"failure": failure_of(error)}
-    return errors_record(errors, squared, np.abs(difference))
-
-
-def errors_record(errors: PlatformErrors, of_bound_squared: float, parameters: Array) -> Record:
-    """Return errors as a record [m, rad]."""
-    return {
-        **asdict(errors),
-        "of_bound_squared": of_bound_squared,
-        "parameters": parameters.tolist(),
+    return asdict(errors) | {
+        "of_bound_squared": squared,
+        "parameters": np.abs(difference).tolist(),
     }
 
 
@@ -446,133 +442,10 @@ _DRAWN = {"literal": "steps as printed", "default": "weighted steps", "fit": "jo
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
 
 
-@dataclass(frozen=True, eq=False)
-class Means:
-    """Means of one estimator's errors over the runs without failure."""
-
-    machine: str
-    estimator: str
-    scalars: Array  # (n, 4): dX [m], dE and the angle [rad], and d' inv(C) d / n of each run, with
-    # the errors d of the n parameters, and their covariance C at the Cramer-Rao bound of the run
-    errors: Array  # (n_parameters,) mean absolute error of every parameter [m]
-    failures: dict[str, int]  # the other runs, by kind of error
-
-    @classmethod
-    def of(cls, machine: str, estimator: str, records: Sequence[Record]) -> Means:
-        """Return the means over the records of an estimator on a machine."""
-        good = [record for record in records if "failure" not in record]
-        failures = Counter(r["failure"]["kind"] for r in records if "failure" in r)
-        return cls(
-            machine,
-            estimator,
-            np.array([[record[name] for name in SCALARS] for record in good]).reshape(-1, 4),
-            np.mean([record["parameters"] for record in good], axis=0) if good else np.zeros(0),
-            dict(sorted(failures.items())),
-        )
-
-    def row(self) -> EstimatorRow:
-        """Return a row of ``--json``; null where every run failed.
-
-        ``of_bound`` is the root mean square of the errors of all parameters, each measured by the
-        covariance of the bound of its run: 1 for an estimator that reaches it. Its spread is far
-        smaller than the spread of dX.
-        """
-        n = len(self.scalars)
-        figures = dict[str, Any].fromkeys(_FIGURES)
-        if n:
-            mean = self.scalars.mean(axis=0)
-            sigma = self.scalars.std(axis=0, ddof=min(n - 1, 1)) / np.sqrt(n)
-            ratio = np.sqrt(mean[3])
-            values = [mean[0], mean[1], mean[2], sigma[0], sigma[1], ratio, 0.5 * sigma[3] / ratio]
-            figures = dict(zip(_FIGURES, (_SCALES * values).tolist(), strict=True))
-        return EstimatorRow(
-            estimator=self.estimator,
-            coplanar=self.machine == "coplanar",
-            parameters_mm=(1e3 * self.errors).tolist(),
-            **figures,
-            runs=n,
-            failed=sum(self.failures.values()),
-            failures=self.failures,
-        )
-
-
 _FIGURES = ("dX_mm", "dE_deg", "angle_deg", "dX_mean_sigma_mm", "dE_mean_sigma_deg", "of_bound",
             "of_bound_sigma")  # fmt: skip
 _DEGREES = float(np.degrees(1.0))
 _SCALES = np.array([1e3, _DEGREES, _DEGREES, 1e3, _DEGREES, 1.0, 1.0])
-
-
-@dataclass(frozen=True, eq=False)
-class PaperSummary:
-    """The paper's evaluation: errors before and after calibration, of every estimator."""
-
-    means: tuple[Means, ...]  # by machine, and then: initial, the estimators, the bound
-    in_radians: bool  # whether Table 1 was read in radians
-
-    @classmethod
-    def of(cls, records: Iterable[Record], *, in_radians: bool) -> PaperSummary:
-        """Return the means over records."""
-        by_key: dict[tuple[str, str], list[Record]] = {}
-        for record in records:
-            for machine, errors_by_estimator in record.items():
-                for estimator, errors in errors_by_estimator.items():
-                    by_key.setdefault((machine, estimator), []).append(errors)
-        return cls(tuple(Means.of(*key, some) for key, some in by_key.items()), in_radians)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        first = paper_machine(MACHINES[0])
-        return parametrize(first.leg_names, geometries(first), first.frame_legs).names
-
-    @property
-    def truths(self) -> dict[str, Array]:
-        """True values (n_parameters,) of each machine [m]."""
-        machines = {name: paper_machine(name) for name in MACHINES}
-        return {name: to_vector(m.parameters, m.frame_legs) for name, m in machines.items()}
-
-    def document(self) -> dict[str, Any]:
-        """Return the document of ``--json``."""
-        return PaperDocument(
-            rows=[means.row() for means in self.means if means.estimator != INITIAL],
-            initial=[means.row() for means in self.means if means.estimator == INITIAL],
-            names=list(self.names),
-            true_values_mm={name: (1e3 * xi).tolist() for name, xi in self.truths.items()},
-            as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
-            readings=[IN_RADIANS if self.in_radians else IN_DEGREES, *READINGS],
-        ).document()
-
-    def files(self) -> dict[str, bytes]:
-        """Return figure 4."""
-        return {"fig4.svg": self._figure().markup().encode()}
-
-    def _figure(self) -> Canvas:
-        """Draw figure 4: a row for each estimator, a column for each machine."""
-        means = {(m.machine, m.estimator): m for m in self.means}
-        labels = []
-        for name in self.names:  # A2x for leg2.base.x
-            leg, parameter, *axis = name.split(".")
-            labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
-        charts = []
-        for (estimator, words), machine in product(_DRAWN.items(), self.truths):
-            if (machine, estimator) not in means:
-                continue
-            shown = means[machine, estimator]
-            errors = [
-                Bars(label, (1e3 * means[machine, name].errors).tolist() or [None] * len(labels))
-                for label, name in (
-                    ("initial model", INITIAL),
-                    (words, estimator),
-                    ("expected at the Cramer-Rao bound", BOUND),
-                )
-            ]
-            n_failed = sum(shown.failures.values())
-            failed = f", {n_failed} of {len(shown.scalars) + n_failed} runs failed" * bool(n_failed)
-            title = f"{words}, {JOINTS[machine]} joints{failed}"
-            charts.append(log_bars(title, "mm", labels, *errors))
-        n_runs = len(self.means[0].scalars) + sum(self.means[0].failures.values())
-        title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
-        return stacked(title, charts, len(self.truths))
 
 
 class EstimatorRow(Document):
@@ -592,6 +465,34 @@ class EstimatorRow(Document):
     failed: int
     failures: dict[str, int]  # by kind of error
 
+    @classmethod
+    def of(cls, machine: str, estimator: str, records: Sequence[Record]) -> EstimatorRow:
+        """Return the means over the records of an estimator on a machine.
+
+        ``of_bound`` is the root mean square of the errors d of all n parameters, each measured by
+        the covariance C of the Cramer-Rao bound of its run, d' inv(C) d / n: 1 for an estimator
+        that reaches it. Its spread is far smaller than the spread of dX.
+        """
+        good = [record for record in records if "failure" not in record]
+        failures = Counter(r["failure"]["kind"] for r in records if "failure" in r)
+        n, figures, parameters = len(good), dict[str, Any].fromkeys(_FIGURES), list[float]()
+        if n:
+            scalars = np.array([[record[name] for name in SCALARS] for record in good])
+            mean, sigma = scalars.mean(axis=0), scalars.std(axis=0, ddof=min(n - 1, 1)) / np.sqrt(n)
+            ratio = np.sqrt(mean[3])
+            values = [mean[0], mean[1], mean[2], sigma[0], sigma[1], ratio, 0.5 * sigma[3] / ratio]
+            figures = dict(zip(_FIGURES, (_SCALES * values).tolist(), strict=True))
+            parameters = (1e3 * np.mean([r["parameters"] for r in good], axis=0)).tolist()
+        return cls(
+            estimator=estimator,
+            coplanar=machine == "coplanar",
+            parameters_mm=parameters,
+            **figures,
+            runs=n,
+            failed=failures.total(),
+            failures=dict(sorted(failures.items())),
+        )
+
 
 class PaperDocument(Document):
     """The combined result of the runs of ``legcal study paper``."""
@@ -602,6 +503,58 @@ class PaperDocument(Document):
     true_values_mm: dict[str, list[Number]]  # by machine
     as_printed: dict[str, dict[str, Any] | str]  # in the paper
     readings: list[str]  # interpretations of the paper where its text leaves a choice
+
+    @classmethod
+    def of(cls, records: Iterable[Record], *, in_radians: bool) -> PaperDocument:
+        """Return the means over the records of runs."""
+        by_key: dict[tuple[str, str], list[Record]] = {}
+        for record in records:
+            for machine, errors_by_estimator in record.items():
+                for estimator, errors in errors_by_estimator.items():
+                    by_key.setdefault((machine, estimator), []).append(errors)
+        rows = [EstimatorRow.of(*key, some) for key, some in by_key.items()]
+        machines = {name: paper_machine(name) for name in MACHINES}
+        first = machines[MACHINES[0]]
+        return cls(
+            rows=[row for row in rows if row.estimator != INITIAL],
+            initial=[row for row in rows if row.estimator == INITIAL],
+            names=list(parametrize(first.leg_names, geometries(first), first.frame_legs).names),
+            true_values_mm={
+                name: (1e3 * to_vector(m.parameters, m.frame_legs)).tolist()
+                for name, m in machines.items()
+            },
+            as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
+            readings=[IN_RADIANS if in_radians else IN_DEGREES, *READINGS],
+        )
+
+    def files(self) -> dict[str, bytes]:
+        """Return figure 4: a row for each estimator, a column for each machine."""
+        by_key = {(row.coplanar, row.estimator): row for row in (*self.initial, *self.rows)}
+        labels = []
+        for name in self.names:  # A2x for leg2.base.x
+            leg, parameter, *axis = name.split(".")
+            labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
+        charts = []
+        for (estimator, words), machine in product(_DRAWN.items(), MACHINES):
+            is_coplanar = machine == "coplanar"
+            shown = by_key.get((is_coplanar, estimator))
+            if shown is None:
+                continue
+            errors = [
+                Bars(label, by_key[is_coplanar, name].parameters_mm or [None] * len(labels))
+                for label, name in (
+                    ("initial model", INITIAL),
+                    (words, estimator),
+                    ("expected at the Cramer-Rao bound", BOUND),
+                )
+            ]
+            n_runs = shown.runs + shown.failed
+            failed = f", {shown.failed} of {n_runs} runs failed" * bool(shown.failed)
+            title = f"{words}, {JOINTS[machine]} joints{failed}"
+            charts.append(log_bars(title, "mm", labels, *errors))
+        n_runs = self.rows[0].runs + self.rows[0].failed
+        title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
+        return {"fig4.svg": stacked(title, charts, len(MACHINES)).markup().encode()}
 
 
 # The Monte Carlo runner
