@@ -24,7 +24,7 @@ from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
 from legcal.descriptions.table import TableFile
 from legcal.exports.formats import ExportDocument
-from legcal.files.published import write_schemas
+from legcal.files.folder import write_schemas
 from legcal.files.schema import Document, SparseDocument
 from legcal.machine.files import MechanismFile
 from legcal.machine.inspection import Inspection

@@ -32,7 +32,7 @@ BESIDE = "simulation"  # it knows the truth
 # The modules of each room that other rooms use; all others are its own affair.
 PUBLIC: dict[str, set[str]] = {
     "geometry": {"covariances", "lines", "motions", "rotations", "types"},
-    "files": {"folder", "motions", "published", "quantity", "reading", "schema", "table"},
+    "files": {"folder", "motions", "quantity", "reading", "schema", "table"},
     "pages": {"document", "svg"},
     "machine": {
         "actuator",
