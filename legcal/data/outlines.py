@@ -340,7 +340,15 @@ def read_observations(
         table.text("source"),
         *measured,  # results of detection, which do not apply to edited rows
     )
-    outlines = _order_ends(outlines, measurements)
+    # The end nearer to the base joint comes first. h is the moment u x P, and the ray to the
+    # second end is that to the first plus a piece of u, so that (second x first) . h > 0.
+    xy = _rays(outlines, measurements)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
+    swap = np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0
+    ends = np.where(swap[:, None, None], outlines.ends[:, ::-1], outlines.ends)
+    turned = outlines.covariance[:, ::-1, ::-1]
+    covariance = np.where(swap[:, None, None], turned, outlines.covariance)
+    outlines = replace(outlines, ends=ends, covariance=covariance)
     _refuse_ends_off_line(table, outlines, measurements)
     table.check()
     return outlines
@@ -385,21 +393,6 @@ def _rays(outlines: Outlines, measurements: Measurements) -> Array:
         if np.any(chosen):
             xy[chosen] = measurements.views[v].camera.undistort(outlines.ends[chosen])
     return xy
-
-
-def _order_ends(outlines: Outlines, measurements: Measurements) -> Outlines:
-    """Return outlines with the end nearer to the base joint first.
-
-    h is the moment u x P, and the ray to the second end is that to the first plus a piece of
-    u, so that (second x first) . h > 0.
-    """
-    xy = _rays(outlines, measurements)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
-    swap = np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0
-    ends = np.where(swap[:, None, None], outlines.ends[:, ::-1], outlines.ends)
-    turned = outlines.covariance[:, ::-1, ::-1]
-    covariance = np.where(swap[:, None, None], turned, outlines.covariance)
-    return replace(outlines, ends=ends, covariance=covariance)
 
 
 def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measurements) -> None:
@@ -460,7 +453,14 @@ def axes_from_outlines(
     h = outlines.h[pairs]
     u, M = axis_of_outlines(h[:, 0], h[:, 1], radius)
     view = measurements.view[outlines.row[pairs[:, 0]]]
-    rays, h_of_offset = _end_rays_and_derivatives(outlines, pairs, view, measurements)
+    rays = np.empty((len(pairs), 2, 2, 3))
+    h_of_offset = np.empty((len(pairs), 2, 2, 3))
+    for v in np.unique(view):
+        view_pairs = pairs[view == v]
+        camera = measurements.views[v].camera
+        rays[view == v], h_of_offset[view == v] = outline_derivative(
+            camera, outlines.h[view_pairs], outlines.ends[view_pairs]
+        )
     middle = rays.mean(axis=(1, 2))
     middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
     M = nearest_point_to_line(u, M, middle, np.zeros(3))
@@ -565,21 +565,6 @@ def _pairs(outlines: Outlines) -> IntArray:
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
-def _end_rays_and_derivatives(
-    outlines: Outlines, pairs: IntArray, view: IntArray, measurements: Measurements
-) -> tuple[Array, Array]:
-    """Return the rays (x, y, 1) of the ends (n, 2, 2, 3) and d h / d offsets (n, 2, 2, 3)."""
-    rays = np.empty((len(pairs), 2, 2, 3))
-    derivative = np.empty((len(pairs), 2, 2, 3))
-    for v in np.unique(view):
-        view_pairs = pairs[view == v]
-        camera = measurements.views[v].camera
-        rays[view == v], derivative[view == v] = outline_derivative(
-            camera, outlines.h[view_pairs], outlines.ends[view_pairs]
-        )
-    return rays, derivative
-
-
 def outline_derivative(
     camera: Camera,
     h: Array,  # (..., 3) unit normals of outlines, in its frame
@@ -618,13 +603,8 @@ def axes_of_table(
     u = direction_of_angles(psi, theta)
     M = np.stack([x, np.zeros_like(x), z], axis=-1)
     basis = normal_basis(u)
-    scaled = _table_derivative(basis, psi, theta) * sigmas[:, None, :]
-    return LegAxes(row, leg, u, M, basis, scaled @ np.swapaxes(scaled, -1, -2))
-
-
-def _table_derivative(basis: Array, psi: Array, theta: Array) -> Array:
-    """Return d (alpha, beta) / d (psi, theta, x, z), (n, 4, 4)."""
     derivative = np.zeros((len(basis), 4, 4))
     derivative[:, :2, :2] = basis @ direction_derivative(psi, theta)
     derivative[:, 2:, 2:] = basis[:, :, [0, 2]]
-    return derivative
+    scaled = derivative * sigmas[:, None, :]
+    return LegAxes(row, leg, u, M, basis, scaled @ np.swapaxes(scaled, -1, -2))

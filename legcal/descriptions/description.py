@@ -516,7 +516,20 @@ def home_of_description(described: Description) -> Home:
     joints the one on the positive side of z.
     """
     if described.home is not None:
-        return _project(described, described.home)
+        equations, T = _ClosingEquations(described, mid_travel=False), described.home.motion()
+        if equations.residual(T) < ROUNDING:
+            return described.home
+        if equations.residual(T) < MAX_HOME_RESIDUAL:
+            T = equations.nearest(T)
+        if equations.residual(T) < CLOSED:
+            return _written(T)
+        raise ModelError(
+            [
+                f"{described.source}: home could not be used: found {residual} there, needed a "
+                "pose in which the machine closes; correct home, lengths or axes."
+                for residual in equations.describe(described.home.motion())
+            ]
+        )
     closure = _ClosingEquations(described, mid_travel=True)
     home = _search(closure, turning=False) or _search(closure, turning=True)
     if home is None:
@@ -701,34 +714,12 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         elif not outside[1] and abs(other - chosen) > 1e-9:
             problems.append(
                 f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the right one in home_readings, or limit the "
-                f"travel to one side of the turning point of {_rods_in_words(rods)}."
+                f"{unit}, {needed} and not two; write the right one in home_readings, or limit "
+                "the travel to one side of the turning point of "
+                f"{legs_in_words([leg.name for leg in rods])}."
             )
     _refuse(problems)
     return readings
-
-
-def _rods_in_words(rods: Sequence[Leg]) -> str:
-    """Return rods in words."""
-    return legs_in_words([leg.name for leg in rods])
-
-
-def _project(described: Description, home: Home) -> Home:
-    """Return the closed pose nearest to home."""
-    closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
-    if closure.residual(T) < ROUNDING:
-        return home
-    if closure.residual(T) < MAX_HOME_RESIDUAL:
-        T = closure.nearest(T)
-    if closure.residual(T) < CLOSED:
-        return _written(T)
-    raise ModelError(
-        [
-            f"{described.source}: home could not be used: found {residual} there, needed a pose in "
-            "which the machine closes; correct home, lengths or axes."
-            for residual in closure.describe(home.motion())
-        ]
-    )
 
 
 def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, Problem
 from legcal.geometry.lines import segment_distance
 from legcal.geometry.motions import motion_of
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.closing import LOOSE, free_motions, project, singularities, singularity
 from legcal.machine.kinematics import follow, follow_poses
 from legcal.machine.model import (
@@ -280,11 +280,6 @@ _REMEDIES = {
 }
 
 
-def near_ends(end: IntArray, draws: Array) -> Array:
-    """Return positions in the travel near given ends of it; 0 is the shortest, 1 the longest."""
-    return np.asarray(np.abs(end - JITTER * draws))
-
-
 def motor_travel(machine: Machine) -> tuple[Array, Array]:
     """Return the lowest and the highest reading of the motors, (n_motors,) [m]."""
     lower, upper = np.array([machine.legs[j].travel for j in machine.motors]).reshape(-1, 2).T
@@ -493,7 +488,8 @@ def _followed(
     def drawn(shrink: float) -> Array:
         part = rng.random(len(home))
         if extreme:
-            part = near_ends(rng.integers(0, 2, len(home)), part)
+            # 0 is the shortest, 1 the longest.
+            part = np.asarray(np.abs(rng.integers(0, 2, len(home)) - JITTER * part))
         q = determining_readings(machine, (lower + part * (upper - lower))[None])[0]
         return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
 

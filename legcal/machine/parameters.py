@@ -580,19 +580,14 @@ def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> 
     phrases = []
     for (kind, axes), owners in groups.items():
         noun = (_NOUN | _NOUN_OF_ACTUATOR)[kind][len(owners) > 1]
-        ordered = _labelled(owners, leg_names)
+        labels = leg_labels(leg_names)
+        legs = [labels[name] for name in leg_names if name in owners]
+        ordered = [*legs, *(owner for owner in owners if owner not in leg_names)]
         phrases.append(f"{axes + ' of ' if axes else ''}{noun} {list_in_words(ordered)}")
     if len(phrases) > _MAX_GROUPS:
         more = len(phrases) - _MAX_GROUPS + 1
         phrases = [*phrases[: _MAX_GROUPS - 1], f"{more} more such changes"]
     return list_in_words(phrases)
-
-
-def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
-    """Return the labels of legs, in their order, or of cameras."""
-    labels = leg_labels(leg_names)
-    legs = [labels[name] for name in leg_names if name in owners]
-    return [*legs, *(owner for owner in owners if owner not in leg_names)]
 
 
 def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:

@@ -466,21 +466,17 @@ def _several_bodies(
             str(urdf.path),
         )
     if len(on_base) > 1:
-        return _platform_of_several_bodies(urdf, body, on_platform[0])
+        joint = on_platform[0]
+        return Problem(
+            "this machine is not supported",
+            "a platform of several bodies (as of an H4 or I4), because legs end on "
+            f"link '{body}', which {_name(joint)} connects to the platform",
+            "legs that end on one rigid platform",
+            f"make {_name(joint)} fixed if it does not move, otherwise this machine "
+            "cannot be calibrated with legcal",
+            str(urdf.path),
+        )
     return None
-
-
-def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> Problem:
-    """Return the problem of a platform that carries a body on which legs end."""
-    return Problem(
-        "this machine is not supported",
-        "a platform of several bodies (as of an H4 or I4), because legs end on "
-        f"link '{body}', which {_name(joint)} connects to the platform",
-        "legs that end on one rigid platform",
-        f"make {_name(joint)} fixed if it does not move, otherwise this machine "
-        "cannot be calibrated with legcal",
-        str(urdf.path),
-    )
 
 
 def _reached(

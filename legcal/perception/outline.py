@@ -766,7 +766,15 @@ def verdict(
         reach = math.inf if near_fit else window
         if reach is None or not all(by_width.reasons):
             return by_width
-        return _by_place((first_edge, second_edge), predicted, reach, by_width)
+        measured = (first_edge, second_edge)
+        off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
+        near = int(np.argmin(off))
+        most = min(LONE_OFFSET * reach, LONE_RATIO * off[1 - near])
+        if off[near] > most or not _is_clear_step(measured[near]):
+            return by_width
+        return PartVerdict(
+            (by_width.reasons[0] if near else USED, USED if near else by_width.reasons[1])
+        )
     confirmed = pair.suits(expected)
     stands = [
         isinstance(edge, MeasuredEdge)
@@ -816,21 +824,6 @@ def _by_width(
         return PartVerdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
     return PartVerdict((USED, reason) if better is first else (reason, USED), bias)
-
-
-def _by_place(
-    measured: tuple[MeasuredEdge, MeasuredEdge],
-    predicted: Array,
-    window: float,
-    judged: PartVerdict,
-) -> PartVerdict:
-    """Judge two edges at a wrong distance, one of which is where an outline should be."""
-    off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
-    near = int(np.argmin(off))
-    most = min(LONE_OFFSET * window, LONE_RATIO * off[1 - near])
-    if off[near] > most or not _is_clear_step(measured[near]):
-        return judged
-    return PartVerdict((judged.reasons[0] if near else USED, USED if near else judged.reasons[1]))
 
 
 def _off(edge: MeasuredEdge, predicted: Array) -> float:
@@ -920,7 +913,10 @@ def _of_image(
         error = np.concatenate([error, [arm.error for arm in arms.values()]])
         for leg in predicted:
             joint_error = search.size * error[leg.leg]
-            window[leg.leg] += placement.pixel_error + joint_error * _pixels_per_metre(leg)
+            depths = leg.A_camera[2], leg.B_camera[2]
+            length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
+            nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)
+            window[leg.leg] += placement.pixel_error + joint_error * float(leg.band.scale / nearest)
     known = placement.blur[view] if placement.blur else np.nan
     blur = search.blur.get(row, 0.0) if np.isnan(known) else known
     one = ImageSearch(
@@ -948,11 +944,3 @@ def _longest(search: Search, leg: int) -> str:
     """Return the part of a leg that stands for it where it is not looked for."""
     of_leg = search.cylinders[leg]
     return max(of_leg, key=lambda cylinder: (cylinder.end - cylinder.start, cylinder.link)).link
-
-
-def _pixels_per_metre(leg: PredictedLeg) -> float:
-    """Return the image scale at the nearer joint of a leg [px/m]."""
-    depths = leg.A_camera[2], leg.B_camera[2]
-    length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
-    nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)
-    return float(leg.band.scale / nearest)

@@ -328,7 +328,9 @@ def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pa
     n_pairs = pictures.pairs.shape[1]
     if T == 0 or n_pairs == 0:
         return PairMatches(np.zeros((K, n, T)), np.zeros((K, n, T), dtype=np.intp), visible)
-    reach = _tolerances(pictures, X, tolerance)[..., None].astype(np.float32)
+    depth = np.maximum(0.5 * (X[..., 0, 2] + X[..., 1, 2]), pictures.min_depth)
+    reach = tolerance * pictures.size / depth + TOLERANCE_PIXELS * pictures.pixel[:, None, None]
+    reach = reach[..., None].astype(np.float32)
     xy, width = xy.astype(np.float32), width.astype(np.float32)
     middle, along, normal = (pictures.pairs[..., k : k + 2] for k in (0, 2, 4))
     axes = np.concatenate([along, normal], axis=1)  # (K, 2 n_pairs, 2)
@@ -356,14 +358,6 @@ def _match_block(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pa
     best = np.argmax(value, axis=-1)
     chosen = np.take_along_axis(value, best[..., None], axis=-1)[..., 0]
     return PairMatches(np.where(visible > 0.0, chosen, 0.0).astype(np.float64), best, visible)
-
-
-def _tolerances(pictures: Pictures, X: Array, tolerance: float) -> Array:
-    """Return a tolerance on the sensor plane at segments X (K, n, T, 2, 3), (K, n, T)."""
-    depth = np.maximum(0.5 * (X[..., 0, 2] + X[..., 1, 2]), pictures.min_depth)
-    return np.asarray(
-        tolerance * pictures.size / depth + TOLERANCE_PIXELS * pictures.pixel[:, None, None]
-    )
 
 
 def pair_widths(pairs: CandidatePairs) -> Array:

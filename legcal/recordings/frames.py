@@ -100,15 +100,6 @@ class Recording:
         return None
 
 
-def _reader() -> int:
-    """Return the id of FFmpeg if OpenCV has it.
-
-    Other backends, which OpenCV tries on files that FFmpeg cannot read, print damage to stderr.
-    """
-    has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
-    return cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
-
-
 class Video(Recording):
     """A video file, read with OpenCV."""
 
@@ -119,7 +110,10 @@ class Video(Recording):
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames; a video without any is refused."""
         with quiet_opencv():
-            video = cv2.VideoCapture(str(self.path), _reader())
+            # Other backends, which OpenCV tries if FFmpeg cannot read a file, print to stderr.
+            has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
+            reader = cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
+            video = cv2.VideoCapture(str(self.path), reader)
             video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as in the calibration of its camera
             promised = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
             rate = video.get(cv2.CAP_PROP_FPS) if video.isOpened() else 0
