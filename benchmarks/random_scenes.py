@@ -19,6 +19,7 @@ from legcal.machine.leg import Cylinder as Visible
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
+from legcal.simulation.observe import legs_in_image, shares
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.session import commanded_poses
@@ -34,7 +35,6 @@ from legcal.simulation.solids import (
     pose_machine,
 )
 from legcal.simulation.truth import write_true_model
-from legcal.simulation.visibility import LegView, legs_in_image
 from legcal.vision.camera import Camera
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
@@ -42,7 +42,6 @@ VISIBLE = 0.5  # of a leg's length in one piece, from which on it must be found
 SIZES = ((640, 480),) * 7 + ((1024, 768),) * 3 + ((1600, 1200), (2448, 2048))
 WIDTHS = (12.0, 60.0)  # of the legs [px], for every 640 px of the picture's width the upper one
 TRIES = 60  # of cameras and occluders
-Shown = tuple[tuple[LegView, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +87,8 @@ class Truth:
     A_base, B_base : (n_images, n_legs, 3) array
         Joint centres [m].
     cylinders : tuple, for each leg a tuple of SolidCylinder
-    shown : tuple, for each image a tuple of LegView, one for each leg
-        What can be seen of the legs.
+    share : (n_images, n_legs) array
+        What can be seen of the legs, as part of their lengths.
     width : (n_images, n_legs) array
         Width of the thickest cylinder of each leg, in the middle of the leg [px].
     """
@@ -98,13 +97,13 @@ class Truth:
     A_base: Array
     B_base: Array
     cylinders: tuple[tuple[Visible, ...], ...]
-    shown: tuple[tuple[LegView, ...], ...]
+    share: Array
     width: Array
 
     @property
     def visible(self) -> BoolArray:
         """Which legs must be found, (n_images, n_legs)."""
-        return np.asarray((_shares(self.shown) >= VISIBLE) & (self.width >= WIDTHS[0]))
+        return np.asarray((self.share >= VISIBLE) & (self.width >= WIDTHS[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +232,7 @@ def _lens(rng: np.random.Generator, gamma: float) -> Camera:
 
 def _viewpoint(
     truth: Machine, machines: tuple[PosedMachine, ...], gamma: float, rng: np.random.Generator
-) -> tuple[Camera, RigidTransform, Shown]:
+) -> tuple[Camera, RigidTransform, Array]:
     """Return a camera, a place from which it sees enough legs, and how much of each leg."""
     joints = np.concatenate([np.concatenate([m.A, m.B]) for m in machines])
     centre, size = joints.mean(axis=0), float(np.linalg.norm(np.ptp(joints, axis=0)))
@@ -255,21 +254,17 @@ def _viewpoint(
         if any(m.encloses(T.translation) for m in machines):
             continue
         shown = _shown(truth, machines, camera, T)
-        if (_shares(shown) >= VISIBLE).sum(axis=1).mean() >= least:
+        if (shown >= VISIBLE).sum(axis=1).mean() >= least:
             return camera, T, shown
     raise RuntimeError("no place for a camera was found")
 
 
 def _shown(
     truth: Machine, machines: tuple[PosedMachine, ...], camera: Camera, T: RigidTransform
-) -> Shown:
-    """Return what can be seen of every leg in every image."""
-    return tuple(legs_in_image(truth.legs, m, camera, T) for m in machines)
-
-
-def _shares(shown: Shown) -> Array:
-    """Return the longest visible piece of every leg in every image, as part of its length."""
-    return np.array([[leg.share for leg in image] for image in shown])
+) -> Array:
+    """Return what can be seen of every leg in every image, as part of its length."""
+    seen = [legs_in_image(truth.legs, m, camera, T, least=0.0) for m in machines]
+    return np.array([shares(image, truth.n_legs)[0] for image in seen])
 
 
 def _occluders(
@@ -277,17 +272,17 @@ def _occluders(
     machines: tuple[PosedMachine, ...],
     camera: Camera,
     T: RigidTransform,
-    free: Shown,
+    free: Array,
     rng: np.random.Generator,
-) -> tuple[tuple[PlacedSolid, ...], Shown]:
+) -> tuple[tuple[PlacedSolid, ...], Array]:
     """Return boxes and rods in front that hide up to half of the legs, and what is left to see."""
-    seen = int((_shares(free) >= VISIBLE).sum())
+    seen = int((free >= VISIBLE).sum())
     for _ in range(TRIES):
         solids = tuple(
             _occluder(i, machines[0], camera, T, rng) for i in range(int(rng.integers(1, 4)))
         )
         shown = _shown(truth, tuple(_beside(m, solids) for m in machines), camera, T)
-        left = int((_shares(shown) >= VISIBLE).sum())
+        left = int((shown >= VISIBLE).sum())
         if 0.5 * seen <= left < seen and left >= 1.5 * len(machines):
             return solids, shown
     return (), free

@@ -42,7 +42,7 @@ from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import TWO_POSES, place_views
 from legcal.perception.tuning import JOINT_ERROR
 from legcal.perception.view_fit import refine_views
-from legcal.simulation.visibility import field_of_view
+from legcal.simulation.cameras import field_of_view
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.workers import worker_pool
 

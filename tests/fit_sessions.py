@@ -57,12 +57,12 @@ from legcal.simulation.observe import (
     OutlineNoise,
     Scene,
     TableNoise,
+    Viewpoint,
     axes_in_images,
     moved_outlines,
     outlines_of,
 )
 from legcal.simulation.paper import PAPER_VIEWS
-from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
 

@@ -23,8 +23,8 @@ from legcal.perception.body_edges import bodies_in_view, edges_of_body
 from legcal.perception.photographs import nominal_placement
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import simulate
+from legcal.simulation.observe import Viewpoint
 from legcal.simulation.settings import Level
-from legcal.simulation.visibility import Viewpoint
 
 ROOT = Path(__file__).parents[1]
 BODY = (

@@ -54,7 +54,7 @@ from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
 from legcal.progress import Progress, shown_progress
-from legcal.simulation.observe import TableNoise, axes_in_images
+from legcal.simulation.observe import TableNoise, Viewpoint, axes_in_images
 from legcal.simulation.session import (
     SimulatedSession,
     Streams,
@@ -70,7 +70,6 @@ from legcal.simulation.settings import (
     Spread,
 )
 from legcal.simulation.truth import draw_errors, write_model_with
-from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera, sample_camera
 from legcal.workers import Workers, is_number, processors, worker_pool
 
@@ -679,7 +678,22 @@ def run_study(
             for number, outcome in run(partial(_outcome, study, seed), range(n_runs)):
                 outcomes[number] = outcome
                 report(stage, len(outcomes), n_runs)
-    result = _result(study, seed, [outcomes[number] for number in range(n_runs)])
+    in_order = [outcomes[number] for number in range(n_runs)]
+    failures = [outcome for outcome in in_order if isinstance(outcome, LegcalError)]
+    if len(failures) == n_runs:
+        raise DidNotConverge(
+            f"The study {study.name} found nothing: all of its {n_runs} runs failed, needed "
+            f"one that does not; the first one says: {failures[0]}"
+        )
+    heading = StudyHeading(
+        study=study.name,
+        settings=study.settings,
+        seed=seed,
+        runs=n_runs,
+        failures=dict(Counter(type(failure).__name__ for failure in failures)),
+    )
+    records = (outcome for outcome in in_order if not isinstance(outcome, LegcalError))
+    result = StudyResult(heading, study.summary(records))
     if output is not None:
         document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
         with result_folder(output, _STUDY) as folder:
@@ -696,25 +710,6 @@ def _outcome(study: Study, seed: int, number: int) -> tuple[int, Record | Legcal
         return number, study.one_run(np.random.SeedSequence(seed, spawn_key=(number,)))
     except LegcalError as error:
         return number, error
-
-
-def _result(study: Study, seed: int, outcomes: list[Record | LegcalError]) -> StudyResult:
-    """Combine runs."""
-    failures = [outcome for outcome in outcomes if isinstance(outcome, LegcalError)]
-    if len(failures) == len(outcomes):
-        raise DidNotConverge(
-            f"The study {study.name} found nothing: all of its {len(outcomes)} runs failed, needed "
-            f"one that does not; the first one says: {failures[0]}"
-        )
-    heading = StudyHeading(
-        study=study.name,
-        settings=study.settings,
-        seed=seed,
-        runs=len(outcomes),
-        failures=dict(Counter(type(failure).__name__ for failure in failures)),
-    )
-    records = (outcome for outcome in outcomes if not isinstance(outcome, LegcalError))
-    return StudyResult(heading, study.summary(records))
 
 
 def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:

@@ -56,12 +56,11 @@ from legcal.simulation.cameras import (
     read_lens,
     rough_pose,
 )
-from legcal.simulation.observe import Scene
+from legcal.simulation.observe import Images, Scene, Viewpoint, take_images
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
 from legcal.simulation.settings import Distribution, Level, Sampling, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
-from legcal.simulation.visibility import Images, Viewpoint, take_images
 from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera
 from legcal.workers import Workers, worker_pool
@@ -244,7 +243,15 @@ class _Simulator:
             if self.settings.hand_held:
                 views, groups = self._in_hand(posed)
         if self.settings.level == Level.PHOTOGRAPHS:
-            views = _encoding(views, self.settings.appearance.gamma, self.settings.tell_gamma)
+            cameras = {
+                id(view.camera): replace(
+                    view.camera,
+                    gamma=self.settings.appearance.gamma,
+                    gamma_is_given=self.settings.tell_gamma,
+                )
+                for view in views
+            }
+            views = tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
         return _Setup(poses, posed, boards, views, groups)
 
     def _in_hand(
@@ -298,8 +305,7 @@ class _Simulator:
         """Return the session: readings with their errors, and the truth."""
         settings, rngs, posed = self.settings, self.rngs, setup.posed_machines
         A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
-        arms = {j: np.array([m.arms[j] for m in posed]) for j in posed[0].arms}
-        scene = Scene(A, B, setup.views, images, arms)
+        scene = Scene(A, B, setup.views, images)
         n_poses = len(setup.poses.poses)
         width = max(2, len(str(n_poses)))
         labels = tuple(f"p{k + 1:0{width}d}" for k in range(n_poses))
@@ -330,17 +336,6 @@ def _numbered(
         names.append(name)
     numbered_images = replace(images, view=np.arange(len(images), dtype=np.intp))
     return numbered_images, tuple(left), tuple(names)
-
-
-def _encoding(
-    views: Sequence[Viewpoint], gamma: float, gamma_is_given: bool
-) -> tuple[Viewpoint, ...]:
-    """Return views with a gamma of their cameras, which the dataset states or not."""
-    cameras = {
-        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=gamma_is_given)
-        for view in views
-    }
-    return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
 
 
 def _recorded(
