@@ -195,8 +195,8 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     for v in range(n_views):
         rows = np.flatnonzero(images.view == v)
         length = np.zeros(len(legs))
-        for shown in (images.shown[r] for r in rows):
-            np.add.at(length, shown.leg, np.where(shown.is_arm, 0.0, shown.length_px))
+        for image in (images.shown[r] for r in rows):
+            np.add.at(length, image.leg, np.where(image.is_arm, 0.0, image.length_px))
         longest = np.argsort(-length, kind="stable")
         seen.append(sorted(longest[:most].tolist()))
     shown = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)

@@ -36,6 +36,7 @@ from legcal.simulation.solids import (
 )
 from legcal.simulation.truth import write_true_model
 from legcal.vision.camera import Camera
+from legcal.vision.visibility import Seen
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 VISIBLE = 0.5  # of a leg's length in one piece, from which on it must be found
@@ -87,8 +88,8 @@ class Truth:
     A_base, B_base : (n_images, n_legs, 3) array
         Joint centres [m].
     cylinders : tuple, for each leg a tuple of SolidCylinder
-    share : (n_images, n_legs) array
-        What can be seen of the legs, as part of their lengths.
+    shown : tuple of Seen, for each image
+        What can be seen of the legs.
     width : (n_images, n_legs) array
         Width of the thickest cylinder of each leg, in the middle of the leg [px].
     """
@@ -97,13 +98,15 @@ class Truth:
     A_base: Array
     B_base: Array
     cylinders: tuple[tuple[Visible, ...], ...]
-    share: Array
+    shown: tuple[Seen, ...]
     width: Array
 
     @property
     def visible(self) -> BoolArray:
         """Which legs must be found, (n_images, n_legs)."""
-        return np.asarray((self.share >= VISIBLE) & (self.width >= WIDTHS[0]))
+        return np.asarray(
+            (_shares(self.shown, self.width.shape[1]) >= VISIBLE) & (self.width >= WIDTHS[0])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +235,7 @@ def _lens(rng: np.random.Generator, gamma: float) -> Camera:
 
 def _viewpoint(
     truth: Machine, machines: tuple[PosedMachine, ...], gamma: float, rng: np.random.Generator
-) -> tuple[Camera, RigidTransform, Array]:
+) -> tuple[Camera, RigidTransform, tuple[Seen, ...]]:
     """Return a camera, a place from which it sees enough legs, and how much of each leg."""
     joints = np.concatenate([np.concatenate([m.A, m.B]) for m in machines])
     centre, size = joints.mean(axis=0), float(np.linalg.norm(np.ptp(joints, axis=0)))
@@ -254,17 +257,21 @@ def _viewpoint(
         if any(m.encloses(T.translation) for m in machines):
             continue
         shown = _shown(truth, machines, camera, T)
-        if (shown >= VISIBLE).sum(axis=1).mean() >= least:
+        if (_shares(shown, truth.n_legs) >= VISIBLE).sum(axis=1).mean() >= least:
             return camera, T, shown
     raise RuntimeError("no place for a camera was found")
 
 
 def _shown(
     truth: Machine, machines: tuple[PosedMachine, ...], camera: Camera, T: RigidTransform
-) -> Array:
+) -> tuple[Seen, ...]:
+    """Return what can be seen of the legs in every image."""
+    return tuple(legs_in_image(truth.legs, m, camera, T, least=0.0) for m in machines)
+
+
+def _shares(shown: tuple[Seen, ...], n_legs: int) -> Array:
     """Return what can be seen of every leg in every image, as part of its length."""
-    seen = [legs_in_image(truth.legs, m, camera, T, least=0.0) for m in machines]
-    return np.array([shares(image, truth.n_legs)[0] for image in seen])
+    return np.array([shares(image, n_legs)[0] for image in shown])
 
 
 def _occluders(
@@ -272,17 +279,17 @@ def _occluders(
     machines: tuple[PosedMachine, ...],
     camera: Camera,
     T: RigidTransform,
-    free: Array,
+    free: tuple[Seen, ...],
     rng: np.random.Generator,
-) -> tuple[tuple[PlacedSolid, ...], Array]:
+) -> tuple[tuple[PlacedSolid, ...], tuple[Seen, ...]]:
     """Return boxes and rods in front that hide up to half of the legs, and what is left to see."""
-    seen = int((free >= VISIBLE).sum())
+    seen = int((_shares(free, truth.n_legs) >= VISIBLE).sum())
     for _ in range(TRIES):
         solids = tuple(
             _occluder(i, machines[0], camera, T, rng) for i in range(int(rng.integers(1, 4)))
         )
         shown = _shown(truth, tuple(_beside(m, solids) for m in machines), camera, T)
-        left = int((shown >= VISIBLE).sum())
+        left = int((_shares(shown, truth.n_legs) >= VISIBLE).sum())
         if 0.5 * seen <= left < seen and left >= 1.5 * len(machines):
             return solids, shown
     return (), free

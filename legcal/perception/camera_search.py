@@ -200,8 +200,8 @@ def place_camera(
         score = scores(some, poses, SEARCHING[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         # From far a flat machine looks alike with near and far exchanged.
-        best, ends = poses.take(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
-        poses = CameraPoses.joined([poses, depth_reversed(best, ends) if len(ends) else best])
+        ahead, ends = poses.take(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
+        poses = CameraPoses.joined([poses, depth_reversed(ahead, ends) if len(ends) else ahead])
         poses = refined(some, poses, SEARCHING[3:], JOINT_ERROR)
         score = scores(some, poses, SEARCHING[-1])
         poses = poses.take(_best(score, N_KEPT[3]))

@@ -417,9 +417,9 @@ class _Pool:
             alone = at.log_blur + np.clip(alone, -MAX_STEP[1], MAX_STEP[1])
             shared = _common_blur(alone, apart[:, BLUR, BLUR], self.seen)
         even, known = shared[0], shared[1] ** -2
-        precision = known - PRIOR_BLUR**-2
+        more = known - PRIOR_BLUR**-2
         of_blur = apart[:, :, BLUR]
-        gain = precision / (1.0 + precision * of_blur[:, BLUR])
+        gain = more / (1.0 + more * of_blur[:, BLUR])
         covariance = apart - gain[:, None, None] * of_blur[:, :, None] * of_blur[:, None, :]
         step = solved(covariance, even, known).reshape(target.shape)
         largest = MAX_STEP[0] * np.exp(at.log_blur)[:, None]

@@ -7,6 +7,7 @@ method predicts that from a model, in another way (:mod:`legcal.vision.visibilit
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -115,9 +116,9 @@ class Images:
 
     def seen_in_view(self, view: int, least: float = 0.0) -> list[int]:
         """Return the legs that more than a fraction *least* of the images of a view show."""
-        rows = np.flatnonzero(self.view == view)
-        legs, counts = np.unique([j for row in rows for j in self.seen(row)], return_counts=True)
-        return [int(j) for j in legs[counts > least * len(rows)]]
+        rows = np.flatnonzero(self.view == view).tolist()
+        counts = Counter(j for row in rows for j in self.seen(row))
+        return sorted(j for j, n in counts.items() if n > least * len(rows))
 
     def chosen(self, rows: Sequence[int]) -> Images:
         """Return some of the images."""
