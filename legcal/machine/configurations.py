@@ -414,19 +414,17 @@ class Feasibility:
             return Cause.COLLISION, f"legs '{first}' and '{second}' collide"
         return None
 
-    def led(
-        self, here: Array, readings: Array, parts: Sequence[float], *, on_the_chain: bool = False
-    ) -> Array | Obstacle:
+    def led(self, here: Array, readings: Array, parts: Sequence[float]) -> Array | Obstacle:
         """Return the configuration at readings (n_motors,) after a straight path, or its obstacle.
 
         Feasibility is checked at the fractions *parts* of the path from configuration *here* (the
-        last is 1); *on_the_chain* as in :func:`follow`.
+        last is 1).
         """
         first = here[slider_columns(self._machine, self._machine.motors)[0]]
         for part in parts:
             q = readings if part == 1.0 else first + part * (readings - first)
             try:
-                here = follow(self._machine, here, q, min_step=_SHORTEST, on_the_chain=on_the_chain)
+                here = follow(self._machine, here, q, min_step=_SHORTEST)
             except DidNotConverge:
                 return Cause.LENGTHS, Cause.LENGTHS.value
             obstacle = self.obstacle(here, of_motors=part == 1.0)
@@ -499,7 +497,7 @@ def _followed(
             full = _FULL_EXTREME if extreme else _FULL
             readings = drawn(_NEARER ** max(0, draw + 1 - full))
             start = machine.home_configuration
-            result = feasibility.led(start, readings, _WAY, on_the_chain=True)
+            result = feasibility.led(start, readings, _WAY)
             if not isinstance(result, tuple):
                 last = draw
                 yield result
