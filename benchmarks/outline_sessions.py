@@ -40,6 +40,7 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries, moved_legs, parametrize
 from legcal.machine.rods import (
     actuator_index,
+    ends_at_poses,
     reading_legs,
     readings_of_rods,
 )
@@ -187,8 +188,9 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     at = RigidTransform.concatenate([platform_in_base(machine, T) for T in drawn.poses])
     rotation: Rotation = at.rotation
     R, t = closed_poses(legs, machine.frame_legs, rotation.as_matrix(), at.translation)
-    A, B = (np.array([getattr(m, side) for m in machines]) for side in "AB")
-    scene = Scene(A, B, views, images)
+    _, B = ends_at_poses(legs, R, t)
+    in_base = [np.array([getattr(m, side) for m in machines]) for side in "AB"]
+    scene = Scene(in_base[0], in_base[1], views, images)
     outlines = outlines_of(scene, OutlineNoise(sigma_px, None))
     most = _MOST_LEGS if machine.n_legs >= _MANY_LEGS else machine.n_legs
     seen = []

@@ -573,11 +573,8 @@ def _closed_at(
     It is the one that Newton steps lead to from the start, if they lead to the pose. The platform
     is free only if slightly inexact axes require it.
     """
-    chain, rng, angles = (
-        machine.chain,
-        np.random.default_rng(1965),
-        machine.chain.rotation_columns(),
-    )
+    chain, rng = machine.chain, np.random.default_rng(1965)
+    angles = chain.rotation_columns()
     turns = np.zeros((1 + RANDOM_ANGLES, chain.nv))
     turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, chain.nv))[:, angles]
     tries = [(turns[0], True), *[(turns[0], False)] * is_constrained(machine)]
