@@ -451,7 +451,22 @@ def _several_bodies(
     From the body, without passing base or platform, a loop inside a leg leads to the base by one
     joint, a part of the platform by the joints of several legs.
     """
-    on_base, on_platform = _reached(bodies, body, ends)
+    base, platform = ends
+    reached, new = {body}, [body]
+    on_base, on_platform = list[Connection](), list[Connection]()
+    while new:
+        here = new.pop()
+        for connection in bodies.connections:
+            if here not in connection.bodies:
+                continue
+            there = connection.bodies[1 - connection.bodies.index(here)]
+            if there == base:
+                on_base.append(connection)
+            elif there == platform:
+                on_platform.append(connection)
+            elif there not in reached:
+                reached.add(there)
+                new.append(there)
     if len(on_platform) != 1:
         return None
     if len(on_base) == 1:
@@ -477,29 +492,6 @@ def _several_bodies(
             str(urdf.path),
         )
     return None
-
-
-def _reached(
-    bodies: Bodies, body: str, ends: tuple[str, str]
-) -> tuple[list[Connection], list[Connection]]:
-    """Return the joints on base and on platform that are connected with a body."""
-    base, platform = ends
-    reached, new = {body}, [body]
-    on_base, on_platform = list[Connection](), list[Connection]()
-    while new:
-        here = new.pop()
-        for connection in bodies.connections:
-            if here not in connection.bodies:
-                continue
-            there = connection.bodies[1 - connection.bodies.index(here)]
-            if there == base:
-                on_base.append(connection)
-            elif there == platform:
-                on_platform.append(connection)
-            elif there not in reached:
-                reached.add(there)
-                new.append(there)
-    return on_base, on_platform
 
 
 def _not_a_chain(

@@ -193,28 +193,6 @@ def check_tree(
             continue
         parent_joint[child] = joint.get("name", "")
         children.setdefault(ends["parent"], []).append(child)
-    return _root(links, parent_joint, children, problems)
-
-
-def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
-    """Check that every element has a name of its own."""
-    for element in elements:
-        name = element.get("name", "")
-        if not name.strip():
-            problems.at(element, "has no name", "name it")
-        elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
-            mistake = f"has a name that cannot be used, needed {NAME_NEEDED}"
-            problems.at(element, mistake, "rename it")
-    problems.check_unique(elements)
-
-
-def _root(
-    links: list[etree._Element],
-    parent_joint: dict[str, str],
-    children: dict[str, list[str]],
-    problems: XmlProblems,
-) -> str:
-    """Return the one link without a parent, the root of all others."""
     roots = [e for e in links if e.get("name", "") not in parent_joint]
     if not links:
         problems.add(
@@ -250,6 +228,18 @@ def _root(
             "cut the loop and close it in closed_loop of the mechanism YAML",
         )
     return root
+
+
+def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
+    """Check that every element has a name of its own."""
+    for element in elements:
+        name = element.get("name", "")
+        if not name.strip():
+            problems.at(element, "has no name", "name it")
+        elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
+            mistake = f"has a name that cannot be used, needed {NAME_NEEDED}"
+            problems.at(element, mistake, "rename it")
+    problems.check_unique(elements)
 
 
 def _short(text: str) -> str:
