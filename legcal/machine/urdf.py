@@ -203,10 +203,10 @@ def check_tree(
         )
         return ""
     if len(roots) > 1:
-        names = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
+        named = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
         problems.add(
             "the URDF could not be used",
-            f"{len(roots)} links without a parent ({names})",
+            f"{len(roots)} links without a parent ({named})",
             "one",
             "join them with joints, a platform by a floating one",
         )
@@ -220,9 +220,9 @@ def check_tree(
             pending.extend(children.get(link, ()))
     cyclic = [e.get("name", "") for e in links if e.get("name", "") not in reached]
     if cyclic:
-        names = ", ".join(repr(name) for name in cyclic[:6])
+        named = ", ".join(repr(name) for name in cyclic[:6])
         problems.add(
-            f"the URDF could not be used: the links {names} hang from each other in a cycle",
+            f"the URDF could not be used: the links {named} hang from each other in a cycle",
             "",
             "a tree",
             "cut the loop and close it in closed_loop of the mechanism YAML",
