@@ -22,7 +22,10 @@ from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
     RefinementSettings,
+    Start,
+    cameras_from_hints,
     platform_poses,
+    start_from,
 )
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, axes_from_outlines
@@ -50,7 +53,7 @@ from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.cameras import cameras_around, mild_lens
 from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of, take_images
-from legcal.simulation.paper import nominal_start, noncoplanar_hexapod
+from legcal.simulation.paper import noncoplanar_hexapod
 from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import dressed, pose_machine
 from legcal.vision.camera import Camera
@@ -396,6 +399,25 @@ def _direction(rng: np.random.Generator, n: int) -> Array:
 
 
 # Estimators
+
+
+def nominal_start(legs: FittedLegs, m: Measurements, T_base_Rb: RigidTransform) -> Start:
+    """Return nominal legs, moved from home to the readings, and the rough cameras."""
+    assert legs.home is not None
+    R, t = legs.home.rotation.as_matrix(), legs.home.translation
+    B = legs.home.apply([leg.B for leg in legs.nominal])
+    first = np.linalg.norm(B - [leg.A for leg in legs.nominal], axis=1)
+    first -= np.array([leg.q0 for leg in legs.nominal])
+    for j, a in enumerate(actuator_index(legs.nominal)):
+        if a >= 0:
+            first[j] = readings_of_rods(legs.nominal, R[None], t[None])[0, a]
+    wanted = legs.sign * m.q_of_poses
+    poses: Sequence[RigidTransform] = (legs.home,) * m.n_poses
+    for part in (0.25, 0.5, 0.75):
+        readings = first + part * (wanted - first)
+        poses = platform_poses(legs.nominal, readings, poses, legs.frame_legs)
+    cameras = cameras_from_hints(m, T_base_Rb)
+    return start_from(legs.nominal, m, legs, cameras, poses, "nominal")
 
 
 def one_fit(session: OutlineSession, radius_sigma: float) -> Solution:

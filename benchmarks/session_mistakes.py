@@ -235,9 +235,9 @@ def session(
         "off_mm": 1e3 * float(after.displacement.mean()),
         "stated_mm": 1e3 * calibration.platform.sigma.mean_displacement,
         "scale_mm": [
-            1e3 * effect.error.mean_displacement
-            for effect in calibration.platform.effects
-            if effect.what == ALL_READINGS
+            1e3 * effect.mean_displacement
+            for what, effect in calibration.platform.effects.items()
+            if what == ALL_READINGS
         ],
         "trusted": calibration.verdict.trustworthy,
         "doubts": [doubt.code for doubt in calibration.doubts],

@@ -1,7 +1,7 @@
 """Simulated sessions in memory for the tests of the fit: exact, noisy, and started from far away.
 
 Outlines of any shipped machine, of a hexapod whose joints lie in no plane, corners of a board
-beside them, and axes of the hexapod of section 4.3.
+beside them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from hexapod_sessions import disturbed_hexapod, paper_session, plain_scene
+from hexapod_sessions import plain_scene
 from machines import from_vector
 from outline_sessions import closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -20,13 +20,12 @@ from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.variables import (
     FittedLegs,
     Start,
-    cameras_from_hints,
     fitted_legs,
     start_from,
 )
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import LegAxes, Outlines, axes_of_table, unmeasured
+from legcal.data.outlines import Outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
@@ -35,7 +34,6 @@ from legcal.machine.leg import (
     KinematicParameters,
     Leg,
     LegKind,
-    parameters_of_legs,
     point_like_legs,
 )
 from legcal.machine.model import Machine
@@ -55,14 +53,10 @@ from legcal.machine.rods import (
 from legcal.simulation import observe
 from legcal.simulation.observe import (
     OutlineNoise,
-    Scene,
-    TableNoise,
     Viewpoint,
-    axes_in_images,
     moved_outlines,
     outlines_of,
 )
-from legcal.simulation.paper import PAPER_VIEWS
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
 
@@ -519,74 +513,6 @@ def with_boards(
 
 
 # Axes of the hexapod of section 4.3
-
-
-@dataclass(frozen=True, eq=False)
-class AxesSession:
-    """Exact axes, the readings and the truth behind them."""
-
-    legs: FittedLegs
-    measurements: Measurements
-    axes: LegAxes
-    scene: Scene
-    truth: Start
-    T_base_Rb: RigidTransform
-
-    @property
-    def parameters(self) -> KinematicParameters:
-        """The true parameters [m]."""
-        return parameters_of_legs(self.truth.legs)
-
-    def noisy(self, seed: int) -> tuple[Measurements, LegAxes]:
-        """Return readings and axes with the errors that they claim."""
-        rng, m = np.random.default_rng(seed), self.measurements
-        error = rng.normal(scale=m.sigma_q, size=(m.n_poses, len(self.legs.names)))
-        axes = axes_of_table(*axes_in_images(self.scene, TableNoise(), rng))
-        return replace(m, q=m.q + error[m.pose]), axes
-
-    def start(self, seed: int = 7, joints: float = 0.002) -> Start:
-        """Return a start that is wrong by so much in every parameter [m]; cameras by 1 degree."""
-        rng = np.random.default_rng(seed)
-        xi = to_vector(self.parameters, self.legs.frame_legs)
-        xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
-        cameras = cameras_from_hints(self.measurements, self.T_base_Rb)
-        return start_from(
-            point_like_legs(from_vector(xi, self.legs.n_legs, self.legs.frame_legs)),
-            self.measurements,
-            self.legs,
-            cameras,
-            self.truth.T_Rb_Re,
-            "nominal",
-        )
-
-    def errors(self, parameters: KinematicParameters) -> Array:
-        """Return the errors of the free parameters [m]."""
-        frame_legs = self.legs.frame_legs
-        return to_vector(parameters, frame_legs) - to_vector(self.parameters, frame_legs)
-
-
-@cache
-def axes_session(
-    n_poses: int = 8,
-    n_images: int = 1,
-    *,
-    coplanar: bool = False,
-    legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
-) -> AxesSession:
-    """Return a session of a hexapod 2 mm off its drawing, seen with the noise of Table 1."""
-    machine = disturbed_hexapod(3, coplanar=coplanar)
-    session = paper_session(
-        machine, TableNoise(), seed=3, legs=legs, n_poses=n_poses, n_images=n_images
-    )
-    legs_true = point_like_legs(machine.parameters)
-    return AxesSession(
-        FittedLegs(machine.leg_names, legs_true, machine.frame_legs, {}),
-        session.measurements,
-        session.axes,
-        session.scene,
-        Start(legs_true, session.T_camera_Rb, tuple(session.T_Rb_Re), "truth"),
-        machine.T_base_Rb,
-    )
 
 
 def with_camera(

@@ -48,11 +48,6 @@ from legcal.workers import in_turn
 PATH = Path("dataset.yaml")
 SIGMA = 0.05
 FISHEYE = replace(LENS, distortion=np.array([0.02, -0.01, 0.0, 0.0]), model="equidistant")
-RATIONAL = replace(
-    LENS,
-    distortion=np.array([0.3, 0.1, 1e-4, -1e-4, 0.01, 0.4, 0.08, 0.01]),
-    model="rational_polynomial",
-)
 
 
 # What a board is, and how files describe it.
@@ -404,7 +399,7 @@ def _turn(one: RigidTransform | None, other: RigidTransform) -> float:
 
 @pytest.mark.parametrize(
     ("board", "camera"),
-    [*((board, LENS) for board in BOARDS), (CHARUCO, FISHEYE), (CHARUCO, RATIONAL)],
+    [(APRILGRID, LENS), (CHARUCO, FISHEYE)],
     ids=lambda x: x.kind if isinstance(x, Board) else x.model,
 )
 def test_without_noise_the_pose_is_exact(board: Board, camera: Camera) -> None:
@@ -460,9 +455,8 @@ def test_two_poses_that_explain_a_board_alike_are_refused_or_told_apart_by_more_
     assert _turn(pose, T) < np.deg2rad(2.0)
 
 
-@pytest.mark.parametrize("shift", [0.001])
-def test_a_board_that_moved_in_an_image_is_named_with_how_far(shift: float) -> None:
-    T = before(CHARUCO, 0.6)
+def test_a_board_that_moved_in_an_image_is_named_with_how_far() -> None:
+    T, shift = before(CHARUCO, 0.6), 0.001
     moved = RigidTransform.from_translation([shift, 0.0, 0.0]) * T
     with pytest.raises(DatasetError, match=r"view c1: .* in 2.png than in \d.png, by up") as caught:
         camera_poses_by_board(_corners(CHARUCO, [T, T, moved, T]), CHARUCO, _measurements((4,)))
@@ -481,7 +475,6 @@ OTHER_LENS = replace(LENS, K=LENS.K * np.array([[0.6], [1.0], [1.0]]))
     ("true", "stated", "camera", "words"),
     [
         (APRILGRID, replace(APRILGRID, spacing=0.5), LENS, "the numbers of tags and tag_spacing"),
-        (APRILGRID, replace(APRILGRID, columns=2, rows=3), LENS, "the numbers of tags"),
         (CHARUCO, replace(CHARUCO, columns=4, rows=6), LENS, "squares, marker and square"),
         (CHARUCO, CHARUCO, OTHER_LENS, "camera file is of this camera and lens"),
     ],

@@ -226,10 +226,10 @@ def test_a_file_that_cannot_be_read_matches_nothing(folder: Folder, content: byt
     assert _plan(folder).detect.tolist() == list(ALL)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk")])
 @pytest.mark.parametrize("n_written", [0, 1, 2])
 @pytest.mark.parametrize(
-    ("before", "searched"), [("nothing", ALL), ("stale", ALL), ("given", (1, 2, 3))]
+    ("before", "searched", "error"),
+    [("stale", ALL, OSError("disk")), ("given", (1, 2, 3), KeyboardInterrupt())],
 )
 def test_writing_that_stops_anywhere_leaves_what_is_searched_again(
     before: str,

@@ -14,10 +14,10 @@ from machines import with_round_arms
 from simulated import files_of, simulated
 
 from legcal import calibrate, check
-from legcal.calibration.change_detection import (
+from legcal.calibration.verification import (
     Change,
-    LikelihoodRatio,
     Movement,
+    determined_parts,
     difference,
     judge_movement,
     noise_dof,
@@ -33,9 +33,7 @@ from legcal.machine.actuator import Actuator, Line
 from legcal.machine.loader import load_mechanism
 from legcal.machine.parameters import (
     geometries,
-    moved_legs,
     parametrization_of,
-    turns_between,
     vector_of,
 )
 
@@ -101,7 +99,7 @@ def test_an_encoder_that_slipped_is_found_with_its_size(
     found = check(_edited(images, tmp_path / "slipped", "measurements.csv", slip), result)
     assert found.movement.moved
     best = found.movement.explanations[0]
-    assert best.change.what == "offset of leg2"
+    assert best.what == "offset of leg2"
     assert best.values[0] == pytest.approx(3e-4, abs=4.0 * best.sigma[0])
     assert 0.0 < best.sigma[0] < 1e-4
     assert found.at_platform.dX_m > found.at_platform.sigma_dX_m
@@ -123,7 +121,7 @@ def test_few_images_of_a_hexapod_show_an_encoder_that_slipped_and_else_raise_no_
         slipped = replace(images, measurements=replace(images.measurements, q=q))
         found = check(slipped, tmp_path / "out")
         assert found.movement.moved
-        assert "offset of leg2" in [e.change.what for e in found.movement.explanations]
+        assert "offset of leg2" in [e.what for e in found.movement.explanations]
 
 
 @pytest.mark.system
@@ -205,33 +203,9 @@ def test_an_inconsistent_result_is_refused(
         check(images, folder)
 
 
-@pytest.mark.parametrize(
-    ("model", "named"), [("tricept", "with the legs"), ("3-spr", "with the leg leg1")]
-)
-def test_the_result_of_another_machine_is_refused(
-    result: Path, tmp_path: Path, model: str, named: str
-) -> None:
-    with pytest.raises(DatasetError, match=f"the result of another machine, {named}"):
-        check(_simulated(tmp_path / "set", model, poses=2), result)
-
-
-@pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
-def test_turns_between_axes_are_their_derivatives(model: str) -> None:
-    machine = load_mechanism(model)
-    nominal, found = geometries(machine), parametrization_of(machine, twists=True)
-    rng = np.random.default_rng(4)
-    is_angle = np.array(found.units) == "rad"
-    far = np.where(is_angle, rng.uniform(-0.1, 0.1, len(found)), 0.0)
-    calibrated = moved_legs(nominal, found.place, far)
-    start, here = (vector_of(found, calibrated, legs) for legs in (nominal, calibrated))
-    turns = turns_between(found, calibrated, nominal)
-    for i in np.flatnonzero(is_angle):
-        step = np.zeros(len(found))
-        step[i] = 1e-6
-        moved = moved_legs(nominal, found.place, far + step)
-        by_calibrated = (vector_of(found, moved, calibrated) - here) / 1e-6
-        by_nominal = (vector_of(found, moved, nominal) - start) / 1e-6
-        np.testing.assert_allclose(turns @ by_nominal, by_calibrated, atol=1e-4)
+def test_the_result_of_another_machine_is_refused(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="the result of another machine, with the leg leg1"):
+        check(_simulated(tmp_path / "set", "3-spr", poses=2), result)
 
 
 # The test statistic by itself, on linear models.
@@ -263,12 +237,12 @@ def _compare(seed: int, moved: Array, dof: int = 200, significance: float = 0.05
     found = difference(values, covariance, PRIOR, old, old_covariance)
     away = values - old
     saved = float(away @ np.linalg.solve(covariance + old_covariance, away))
-    ratio = LikelihoodRatio.of(saved, covariance, PRIOR)
+    parts = determined_parts(covariance, PRIOR)
     single = tuple(
         Change("", f"c{i}", (f"c{i}",), ("m",), ("",), np.eye(N)[:, i : i + 1]) for i in range(N)
     )
     pair = (Change("", "both", ("c0", "c1"), ("m", "m"), ("", ""), np.eye(N)[:, :2]),)
-    return judge_movement(found, ratio, dof, (single, pair), significance)
+    return judge_movement(found, saved, parts, dof, (single, pair), significance)
 
 
 def test_alarms_are_as_rare_as_stated_where_nothing_moved() -> None:
@@ -288,9 +262,9 @@ def test_the_simplest_change_that_suffices_is_named_with_its_size(
     result = _compare(2, moved)
     assert result.moved
     best = result.explanations[0]
-    assert best.change.what == named
+    assert best.what == named
     assert best.p_value > result.significance
-    assert np.all(np.abs(best.values - moved[columns]) < 4.0 * best.sigma)
+    assert np.all(np.abs(best.values - moved[columns]) < 4.0 * np.array(best.sigma))
     assert best.sigma[0] < 0.1 * abs(moved[columns[0]])
 
 
@@ -321,9 +295,7 @@ def _turned(actuator: Actuator, angle: float) -> Actuator:
     return replace(actuator, arm=replace(actuator.arm, line=line))
 
 
-@pytest.mark.parametrize(
-    ("model", "joint"), [("delta", "arm2"), ("hexaglide", "rail4"), ("round arms", "arm2")]
-)
+@pytest.mark.parametrize(("model", "joint"), [("hexaglide", "rail4"), ("round arms", "arm2")])
 def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
     model: str, joint: str, tmp_path: Path
 ) -> None:
@@ -365,10 +337,10 @@ def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named(
     ]
     step = vector_of(found, there, legs) - vector_of(found, legs, legs)
     n = len(found)
-    ratio = LikelihoodRatio(1e14 * float(step @ step), np.ones(n))
-    movement = judge_movement((np.eye(n), step, 1e-14 * np.eye(n)), ratio, 500, changes, 1e-3)
+    found_step, saved = (np.eye(n), step, 1e-14 * np.eye(n)), 1e14 * float(step @ step)
+    movement = judge_movement(found_step, saved, np.ones(n), 500, changes, 1e-3)
     best = movement.explanations[0]
-    assert best.change.what == f"zero of {joint}"
+    assert best.what == f"zero of {joint}"
     assert best.values[0] == pytest.approx(1e-4, rel=1e-3)
     assert len(movement.explanations) == 1
     assert {c.what for c in single} >= {f"length of {name}" for name in machine.leg_names}

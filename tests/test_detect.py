@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor, load_dataset
 from legcal.calibration.detection import Detection, Examination
-from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
+from legcal.data.outlines import QUALITY, Outlines, join_outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
@@ -352,5 +352,8 @@ def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_
     h = predicted(cam)[0].outlines[0]
     for mark, line in zip(part.marks, h, strict=True):
         assert np.abs(cam.line_offset(line, cam.undistort(mark.points))).max() < 1e-6
+    of_body = replace(one, part=("leg1_tube",) * 2, edge=np.array([3, 4]))
+    _, body = marks_of_image(cam, join_outlines([one, of_body]), predicted(cam), NAMES)
+    assert [mark.kind for mark in body.marks] == ["body", "rejected"]
     gone = replace(lost, reason=(Rejection(Reason.OUTSIDE),) * 2)
     assert marks_of_image(cam, gone, predicted(cam), NAMES) == []

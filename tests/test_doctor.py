@@ -150,12 +150,12 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
 def test_datasets_without_photographs_are_judged_by_what_they_have(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    simulated(tmp_path / "outlines", "hexapod", views=3, poses=6)
+    simulated(tmp_path / "outlines", "3-rpr", views=3, poses=6)
     assert run(monkeypatch, "doctor", tmp_path / "outlines") == 0
     shown = capsys.readouterr().out
     assert "Ready to calibrate" in shown
     assert "legcal calibrate" in shown
-    simulated(tmp_path / "few", "hexapod", views=1)
+    simulated(tmp_path / "few", "3-rpr", views=1)
     assert [one.name for one in doctor(tmp_path / "few").checks][-1] == "mistakes"
     (tmp_path / "outlines" / "measurements.csv").unlink()
     assert run(monkeypatch, "doctor", tmp_path / "outlines", "--json") == 2

@@ -34,7 +34,7 @@ from legcal.calibration import doubts, verdict
 from legcal.calibration.doubts import Doubt, model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.scale import ALL_READINGS
-from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, FocalLength
+from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
 from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
@@ -210,7 +210,7 @@ def test_an_error_of_all_travel_is_stated_beside_sigma_as_large_as_it_may_be(
     assert "travel of the motors alone; an error of 0.20% of the" in healthy.verdict.sentence
     assert "an error of 0.10% of the travel (1 sigma) moves" in stated.verdict.sentence
     by_default, halved = (
-        next(effect.error for effect in found.platform.effects if effect.what == ALL_READINGS)
+        found.platform.effects[ALL_READINGS]
         for found in (healthy, stated)
         if found.platform is not None
     )
@@ -239,22 +239,22 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
 
 def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
     solution = healthy.solution
-    (shared,) = solution.sensitivities
-    focal = replace(shared, what=FITTED_CAMERA, steps=0.01 * shared.steps)
+    ((what, shared),) = solution.sensitivities.items()
+    focal = 0.01 * shared
     fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
-    wrong = FocalLength("c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
+    wrong = WrongIntrinsic("focal_length", "c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
         "camera_doubts": (wrong,),
-        "sensitivities": (shared, focal),
+        "sensitivities": {what: shared, FITTED_CAMERA: focal},
     }
     found = _judged(healthy, **changes)
     (doubt,) = found.doubts
     assert found.platform is not None
-    effect = found.platform.effects[-1].error
+    effect = found.platform.effects[FITTED_CAMERA]
     assert (doubt.code, doubt.sigma_dX_m) == ("camera", effect.mean_displacement)
     assert model_error(found.doubts) == (effect.mean_displacement, effect.mean_rotation)
-    large = replace(focal, steps=1e4 * focal.steps)
-    found = _judged(healthy, **changes | {"sensitivities": (large,)})
+    large = {FITTED_CAMERA: 1e4 * focal}
+    found = _judged(healthy, **changes | {"sensitivities": large})
     assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
     assert found.verdict.is_to_be_refused
 
@@ -284,9 +284,9 @@ def _documented() -> dict[str, set[str]]:
 
 
 def test_every_doubt_is_documented_with_its_light() -> None:
-    tree = ast.parse(Path(doubts.__file__).read_text())
+    files = (Path(module.__file__ or "") for module in (doubts, verdict))
     made = dict[str, set[str]]()
-    for call in ast.walk(tree):
+    for call in (node for file in files for node in ast.walk(ast.parse(file.read_text()))):
         if not (isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Doubt"):
             continue
         code = call.args[0]

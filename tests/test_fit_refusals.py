@@ -9,7 +9,6 @@ from fit_sessions import (
     PINHOLE,
     TRUTH,
     HexapodSession,
-    axes_session,
     disturbed_start,
     irregular_hexapod,
     noisy_outlines,
@@ -24,7 +23,7 @@ from legcal.calibration.joint_fit.variables import (
     start_from,
 )
 from legcal.data.measurements import View
-from legcal.data.outlines import LegAxes, Outlines, no_outlines
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.machine.leg import point_like_legs
@@ -140,37 +139,6 @@ def test_images_that_do_not_determine_the_parameters_are_refused(
         shown = replace(shown, used=shown.leg == 0)
     with pytest.raises(NotIdentifiable, match=found):
         refine(few.legs, few.measurements, shown, at_truth(few))
-
-
-def in_degrees(axes: LegAxes) -> LegAxes:
-    tilt = 0.3 * np.random.default_rng(0).normal(size=(len(axes), 2))
-    u = axes.u + np.einsum("ni,nia->na", tilt, axes.basis)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=1, keepdims=True)
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    return replace(axes, u=u, basis=np.stack([e1, np.cross(u, e1)], axis=1))
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "found"),
-    [
-        (
-            lambda a: replace(a, covariance=a.covariance * (a.row != 0)[:, None, None]),
-            DatasetError,
-            "leg1 in row 1 could not be used: found a covariance",
-        ),
-        (in_degrees, LegcalError, r"errors of \d+ of \d+ axes.*units \(rad, m\)"),
-        (lambda a: a.choose(np.arange(8)), NotIdentifiable, "24 images with 8 axes and 144 read"),
-    ],
-    ids=["covariance", "degrees", "few"],
-)
-def test_axes_that_cannot_be_fitted_are_refused(
-    change: Callable[[LegAxes], LegAxes], error: type[LegcalError], found: str
-) -> None:
-    session = axes_session()
-    measurements, axes = session.noisy(0)
-    with pytest.raises(error, match=found):
-        refine(session.legs, measurements, no_outlines(), session.start(), axes=change(axes))
 
 
 def test_a_start_far_away_is_refused(session: HexapodSession) -> None:

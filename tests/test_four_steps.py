@@ -137,12 +137,11 @@ def test_weights_improve_the_model_where_weights_of_one_make_it_worse(
     assert low < before / after < high
 
 
-@pytest.mark.parametrize("name", ["hexapod", "3-rps"])
-def test_covariances_of_joints_in_cameras_are_true(name: str) -> None:
+def test_covariances_of_joints_in_cameras_are_true() -> None:
     """Normalised squared errors of A by view and leg: 1 by rights; outlier weights cost a bit."""
     squares = []
     for seed in range(2):
-        observed = shipped(name, n_poses=10, noise=0.2, seed=seed)
+        observed = shipped("hexapod", n_poses=10, noise=0.2, seed=seed)
         joints = locate_joints_in_cameras(
             observed.nominal, observed.axes, observed.measurements, weighted=True
         )
@@ -272,11 +271,10 @@ def test_what_images_do_not_show_is_refused_by_leg(
     assert words in str(refusal.value)
 
 
-@pytest.mark.parametrize("criteria", CRITERIA)
-def test_offsets_and_axes_that_no_image_shows_together_are_refused(criteria: Criteria) -> None:
+def test_offsets_and_axes_that_no_image_shows_together_are_refused() -> None:
     observed = shipped("3-spr")
     m = observed.measurements
-    base = run_base_steps(observed.nominal, observed.axes, m, criteria=criteria)
+    base = run_base_steps(observed.nominal, observed.axes, m)
     axes = base.in_cameras.axes
     first = [np.flatnonzero(m.view == v)[0] for v in range(3)]
     for kept, words in (
@@ -286,4 +284,4 @@ def test_offsets_and_axes_that_no_image_shows_together_are_refused(criteria: Cri
     ):
         some = replace(base.in_cameras, axes=axes.choose(np.flatnonzero(kept)))
         with pytest.raises(NotIdentifiable, match=words):
-            run_platform_steps(replace(base, in_cameras=some), m, criteria=criteria)
+            run_platform_steps(replace(base, in_cameras=some), m)

@@ -16,9 +16,9 @@ from fit_sessions import (
 from outline_sessions import Noise, StartErrors, design_of, draw_session
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.held_out import (
-    HeldOut,
     Posterior,
     compare_held_out,
 )
@@ -66,7 +66,7 @@ def _truth(name: str) -> Truth:
     return Truth(session.measurements, session.outlines, posterior, poses)
 
 
-def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> HeldOut:
+def _compared(truth: Truth, posterior: Posterior, outlines: Outlines) -> Holdout:
     return compare_held_out(posterior, truth.measurements, outlines, truth.poses)
 
 
@@ -106,7 +106,7 @@ def session() -> HexapodSession:
     return irregular_hexapod(12, legs_seen=5, sigma_px=0.05)
 
 
-def _held_out(session: HexapodSession, level: float, seed: int) -> HeldOut:
+def _held_out(session: HexapodSession, level: float, seed: int) -> Holdout:
     """Return what a fourth of the images say of a fit of the others.
 
     Each edge of each leg errs alike in all images of a view, by *level* [px].

@@ -33,7 +33,7 @@ from legcal.data.image_choice import dataset_at
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
-from legcal.report.identify import identify_table
+from legcal.report.machine import identify_table
 from legcal.vision.board import Board, FixedBoard
 
 pytestmark = pytest.mark.usefixtures("without_remedies")  # test_identify_ranks.py has them

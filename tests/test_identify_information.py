@@ -104,7 +104,7 @@ def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None
 
 @pytest.mark.parametrize(
     "name",
-    ["3-RPR", "6-UPS", "Tricept", "hexapod with a strut"],
+    ["3-RPR", "hexapod with a strut"],
 )
 def test_planned_poses_close_every_leg_inside_its_travel(
     name: str, tmp_path_factory: pytest.TempPathFactory

@@ -141,6 +141,8 @@ MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
      [(f"{v}/{i}.png", k) for v in "ab" for k, i in enumerate((3, 1, 2))]),
     (SAME, {"camera": "abba", "name": "1122"}, 4,
      [("a/1.png", 0), ("a/2.png", 3), ("b/1.png", 1), ("b/2.png", 2)]),
+    (TWO[:2] + TWO[3:5], {"Ansicht": "bbaa", "Bild Nr.": ("1", "02", "1", "02")}, 4,
+     [(TWO[3], 0), (TWO[4], 1), (TWO[0], 2), (TWO[1], 3)]),
     (FLAT, {"time": ("10:02:00", "10:00", "10:01")}, 3,
      [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
     # clocks an hour apart

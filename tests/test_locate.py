@@ -123,13 +123,12 @@ def test_exact_poses_give_exact_frames_where_the_open_part_is_fixed_at_its_truth
     assert error[kept] @ np.linalg.solve(found.covariance[np.ix_(kept, kept)], error[kept]) < 33.0
 
 
-@pytest.mark.parametrize("stated", [{}, KNOWN])
-def test_outliers_are_named_and_left_out(stated: dict[str, Any]) -> None:
+def test_outliers_are_named_and_left_out() -> None:
     hexapod = made("hexapod", 20)
     position = hexapod.poses.position.copy()
     position[6] += 1e-3
     position[[2, 11]] = position[[11, 2]]
-    found = locate(hexapod.machine, replace(hexapod.poses, position=position), **stated)
+    found = locate(hexapod.machine, replace(hexapod.poses, position=position))
     assert [row.row for row in found.rows if not row.used] == [3, 7, 12]
     assert found.trustworthy
     assert "3, 7, 12" in found.sentence
@@ -216,7 +215,6 @@ def _loose() -> Located:
     [
         (lambda: near_home("hexapod", 10, 0.02, (0, 0, 1)), {}, NotIdentifiable,
          ("tool in the platform along (0, 0, 1)", "another axis")),
-        (lambda: near_home("hexapod", 10, 0.02, (0, 0, 0)), {}, NotIdentifiable, ("another axis",)),
         (lambda: near_home("hexapod", 10, 0.0, (0, 0, 1)), {}, NotIdentifiable,
          ("these 10 poses",)),
         (_along_a_line, {}, NotIdentifiable, ("displaced in another direction",)),
@@ -228,7 +226,6 @@ def _loose() -> Located:
         (lambda: _position(_displaced, 4), {}, NotIdentifiable, ("measure them better",)),
         (lambda: _position(lambda p: 1e3 * p), {}, DatasetError, ("millimetres", "1000")),
         (_w_first, {}, DatasetError, ("order w, x, y, z",)),
-        (lambda: _w_first(20), {}, DatasetError, ("order w, x, y, z",)),
         (_mirrored, {}, DatasetError, ("left-handed axes", "mirror")),
         (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
         (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
@@ -317,11 +314,11 @@ def test_other_files_are_kept(found: Location, tmp_path: Path) -> None:
     assert path.read_text() == "other: 1\n"
 
 
-@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept"])
 def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(
-    name: str, found: Location, tmp_path: Path
+    found: Location, tmp_path: Path
 ) -> None:
     """Against Pinocchio; frames of an earlier location are replaced, all else stays."""
+    name = "tricept"
     first, second = (replace(found, T_world_base=B, T_platform_tool=T) for B, T in (
         (BASE * TOOL, TOOL.inv()), (BASE, TOOL)))  # fmt: skip
     earlier, _ = write_located_model(shipped(name), first, tmp_path / "first")

@@ -9,8 +9,8 @@ import pytest
 from legcal import load_mechanism
 from legcal.calibration.location.tool_poses import read_tool_poses
 from legcal.data.readings_sheet import ReadingsSheet
-from legcal.descriptions.description import Description
-from legcal.descriptions.new_model import Dimensions, description_of
+from legcal.descriptions.description import Description, assemble
+from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.descriptions.table import read_columns
 from legcal.errors import ModelError
 from legcal.machine.kinematics import forward_kinematics_many
@@ -74,6 +74,10 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
              "380 mm", "500 mm", "16 mm", "28 mm", leg="{}", mark=" mm"), (14, 8)),
     "groups": (
         wide(";Boden;;;Plattform;;\nBein;X;Y;Z;X;Y;Z\n;mm;mm;mm;mm;mm;mm", leg="{}"), ()),
+    "groups beside columns of their own": (
+        "Stand Mai;;;;;;;;;;\n;Boden;;;Plattform;;;Länge min;Länge max;Ø Rohr;Ø Stange\n"
+        + wide("Bein;X;Y;Z;X;Y;Z;;;;", "380", "500", "28", "16", leg="{}")
+        .replace("\n", "\n;mm;mm;mm;mm;mm;mm;mm;mm;mm;mm\n", 1), (14, 8)),
     "title of two cells": (
         wide("Projekt: Hexapod;;;Datum: 3.2.2026;;;\n" + SIX.format("B", "P")), ()),
     "line below": (wide(SIX.format("b", "p")) + "gemessen mit Messschieber;;;;;\n", ()),
@@ -131,6 +135,49 @@ def test_what_a_person_reads_at_once_is_read(kind: str, tmp_path: Path) -> None:
     text, radii = TABLES[kind]
     (tmp_path / "own.csv").write_text(text)
     check(described(tmp_path / "own.csv", text, radii), radii)
+
+
+def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    joints: dict[str, list[tuple[float, float]]]
+    joints = {"A": [(0, -400), (346.4, 200), (-346.4, 200)],
+              "B": [(100.3, -124.7), (79.2, 116.9), (-139.5, -12.2)]}  # fmt: skip
+    rows = [f"{side}{j}{' (home)' * (side == 'B')};{x};{y}" for side, xy in joints.items()
+            for j, (x, y) in enumerate(xy, 1)]  # fmt: skip
+    path.write_text("\n".join(["Gelenk;X (mm);Y (mm)", *rows]))
+    given = Dimensions(type="RPR", min_length=230.0, max_length=370.0, leg_radius=12.0)
+    made = assemble(description_of(path, given))
+    assert made.planar
+    at_home = [made.home.motion().apply(leg.B_platform)[:2] for leg in made.legs]
+    np.testing.assert_allclose(at_home, 1e-3 * np.array(joints["B"]), atol=1e-9)
+    rows[3:] = ["B1;0;-140", "B2;121.2;70", "B3;-121.2;70"]  # in the platform link
+    path.write_text("\n".join(["Gelenk;X (mm);Y (mm)", *rows]))
+    (note,) = [note for note in assemble(description_of(path, given)).notes if "Two poses" in note]
+    assert "B1 (home)" in note
+
+
+def test_rods_on_upright_rails_are_named_by_their_towers(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    lines = [
+        "Rod,Tower,Carriage X (mm),Carriage Y (mm),Carriage Z (mm),Effector X (mm),"
+        "Effector Y (mm),Effector Z (mm),Rod length (mm),Rod diameter (mm),Travel (mm)"
+    ]
+    for j in range(6):
+        turn = np.exp(2j * np.pi * (j // 2) / 3)
+        A, B = (250 + 30j * (-1) ** j) * turn, (60 + 30j * (-1) ** j) * turn
+        cells = [j + 1, "ABC"[j // 2], A.real, A.imag, 402, B.real, B.imag, 0, 400, 10, 200]
+        lines.append(",".join(map(str, cells)))
+    path.write_text("\n".join(lines))
+    made = assemble(description_of(path, Dimensions(type="PSS", height=150.0)))
+    motors = [leg.actuator for leg in made.legs]
+    assert [motor and motor.joint for motor in motors] == list("AABBCC")
+    assert {motor and motor.travel for motor in motors} == {(0.0, 0.2)}
+    assert {(leg.name, leg.rod) for leg in made.legs} == {(f"leg{j}", 0.005) for j in range(1, 7)}
+    assert any("slide along z" in note for note in made.notes)
+    created = create_model(description_of(path, Dimensions(type="PSS", height=150.0)), tmp_path)
+    path.write_text("Photo,Tower B (mm),Turm A (mm),C (mm)\np1.jpg,20,10,30\np2.jpg,25,15,35\n")
+    q = ReadingsSheet(path, created.machine, "photograph").readings().q
+    np.testing.assert_allclose(q, [[0.01, 0.02, 0.03], [0.015, 0.025, 0.035]])
 
 
 def test_the_sheet_of_a_workbook_that_has_a_table_is_read(tmp_path: Path) -> None:
@@ -198,4 +245,8 @@ def test_poses_of_a_tracker_beside_whole_lengths_in_mm_are_read(tmp_path: Path) 
     found = read_tool_poses(path, machine)
     np.testing.assert_allclose(found.q, q, atol=6e-8)
     np.testing.assert_allclose(found.position, poses, atol=6e-8)
-    assert "readings are in mm, as the heading says, whole lengths" in found.notes[-1]
+    assert found.unit.startswith("mm, as the heading says, whole lengths")
+    assert {found.columns["Zylinder 1 [mm]"], found.columns["X [mm]"]} == {
+        machine.legs[0].prismatic,
+        "x",
+    }

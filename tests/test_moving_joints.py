@@ -18,7 +18,7 @@ from legcal.errors import NotIdentifiable
 from legcal.machine.leg import Cylinder
 from legcal.machine.parameters import parametrize
 from legcal.paper.conditions import count_conditions
-from legcal.report.identify import _verdict
+from legcal.report.machine import _verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
 TURNING = ("6-rss", "delta")

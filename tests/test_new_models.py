@@ -221,9 +221,7 @@ def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("family", "dimensions", "legs"),
     [
-        ("hexapod", {}, ["UPS"] * 6),
         ("hexapod", {"type": "SPU", "base_radius": 250.0}, ["SPU"] * 6),
-        ("delta", {}, ["RSS"] * 6),
         ("Delta", {"arm_length": 160.0, "rod_length": 380.0, "height": -350.0}, ["RSS"] * 6),
     ],
 )

@@ -150,8 +150,7 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
         assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
 
 
-@pytest.mark.parametrize("name", ["before it", "before half of it", "behind it", "along it",
-                                  "along it, far away", "at an angle"])  # fmt: skip
+@pytest.mark.parametrize("name", ["before half of it", "behind it", "along it", "at an angle"])
 def test_a_solid_hides_and_its_edges_are_not_taken_for_outlines(name: str) -> None:
     cam, rod = camera(), bar(-0.09, 0.03, 170.0)
     behind, bars = SCENES["bright on dark"][0], [rod]
@@ -159,15 +158,12 @@ def test_a_solid_hides_and_its_edges_are_not_taken_for_outlines(name: str) -> No
     turn = Rotation.align_vectors([rod.B - rod.A], [[0.0, 0.0, 1.0]])[0].as_matrix()
     middle, half = 0.5 * (rod.A + rod.B), np.array([0.02, 0.02, 0.25])
     aside = np.array([0.037, 0.0, 0.02])  # one edge is less than 5 px from an outline
-    if name.startswith("before"):
-        half, middle = np.array([0.05, 0.02, 0.3]), middle - [0.0, 0.0, 0.2]
-        if name == "before half of it":
-            half[2], middle = 0.08, middle - 0.08 * turn[:, 2]
+    if name == "before half of it":
+        half, middle = np.array([0.05, 0.02, 0.08]), middle - [0.0, 0.0, 0.2]
+        middle = middle - 0.08 * turn[:, 2]
     elif name == "behind it":
         middle = middle + np.array([0.0, 0.0, 0.2])
         half[0] = 0.2
-    elif name == "along it, far away":
-        middle = middle + 3.0 * aside
     else:
         middle = middle + aside
         if name == "at an angle":
@@ -175,7 +171,7 @@ def test_a_solid_hides_and_its_edges_are_not_taken_for_outlines(name: str) -> No
     corners = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3) * half
     solid = Occluder("box", Carrier(), corners @ turn.T + middle)
     found = detect(cam, bars, image.astype(np.uint8), solids=(solid,))
-    if name in ("before it", "along it"):
+    if name == "along it":
         assert set(found.reason) == {Rejection(Reason.HIDDEN, "box")}
         return
     assert np.all(found.used), found.reason

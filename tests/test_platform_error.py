@@ -15,7 +15,6 @@ from legcal.calibration.joint_fit.platform import (
     platform_accuracy,
     platform_by_parameters,
 )
-from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine import configurations
@@ -74,7 +73,7 @@ def test_a_pose_that_readings_do_not_determine_is_refused() -> None:
 
 
 def _accuracy(
-    nominal: Machine, calibrated: Machine, q: Array, root: Array, *effects: Sensitivity
+    nominal: Machine, calibrated: Machine, q: Array, root: Array, **effects: Array
 ) -> PlatformAccuracy:
     """Return the accuracy of a calibration that ended at a given model."""
     accuracy = platform_accuracy(
@@ -133,13 +132,10 @@ def test_wrong_assumptions_count_over_the_workspace_or_at_the_readings(
         monkeypatch.setattr(platform, "workspace", configurations.workspace.__wrapped__)
         monkeypatch.setattr(configurations, "WORKSPACE_SEED", 1)  # drawn anew, with no share
         monkeypatch.setattr(configurations, "SHARES", np.zeros(0))
-    accuracy = _accuracy(
-        nominal, nominal, q, np.zeros((30, 1)), Sensitivity("legs 1 mm longer", longer[:, None])
-    )
-    (effect,) = accuracy.effects
-    assert effect.what == "legs 1 mm longer"
-    assert len(effect.error.displacement) == (100 if workspace else 2)
+    accuracy = _accuracy(nominal, nominal, q, np.zeros((30, 1)), longer=longer[:, None])
+    effect = accuracy.effects["longer"]
+    assert len(effect.displacement) == (100 if workspace else 2)
     assert (accuracy.workspace is None) == (not workspace)
-    assert 0.9e-3 < effect.error.mean_displacement < 2e-3
+    assert 0.9e-3 < effect.mean_displacement < 2e-3
     assert accuracy.sigma.max_displacement == 0.0
     assert accuracy.change.max_displacement < 1e-9

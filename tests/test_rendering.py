@@ -108,7 +108,7 @@ def clean(placed: list[PlacedSolid], **changes: Any) -> Array:
 
 @pytest.mark.parametrize(
     ("lens", "radius"),
-    [("pinhole", 0.02), ("barrel", 0.02), ("fisheye", 0.12)],
+    [("barrel", 0.02), ("fisheye", 0.12)],
 )
 def test_outlines_are_where_the_tangent_planes_are(lens: str, radius: float) -> None:
     camera = LENSES[lens]
@@ -162,13 +162,12 @@ def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
     assert np.mean(np.abs(lit[0] - lit[1]) > 2e-3) < 0.01  # at creases alone
 
 
-@pytest.mark.parametrize("size", [0.3])
-def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: float) -> None:
+def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft() -> None:
     wall = solid(Box((3.0, 3.0, 0.02)), RigidTransform.from_translation([0.0, 0.0, 1.51]))
     ball = solid(Sphere(0.08), RigidTransform.from_translation([-0.1, 0.0, 1.0]))
     scene = (wall, ball)
     looks = Appearance.clean(
-        lights=(Light((-0.5, 0.0, -1.0), distance=3.0, radius=size),), ambient=0.0, shadows=True
+        lights=(Light((-0.5, 0.0, -1.0), distance=3.0, radius=0.3),), ambient=0.0, shadows=True
     )
     rng = np.random.default_rng(0)
     prepared = prepare_view(scene, LENSES["pinhole"], IDENTITY, looks, rng)
@@ -180,7 +179,7 @@ def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: floa
     assert image[v, u] < 0.02
     across = image[v, u : u + 70] / image[v, u + 70]
     half_shadow = np.count_nonzero((across > 0.05) & (across < 0.95))
-    assert half_shadow <= 6 if size == 0.0 else half_shadow > 12
+    assert half_shadow > 12
 
 
 def test_light_on_a_wall_falls_with_the_square_of_the_distance_of_its_lamp() -> None:
@@ -370,9 +369,8 @@ def outward_errors(levels: Array) -> Array:
     return np.asarray((covered.sum(axis=1) - 0.5) * STEP - REACH)
 
 
-@pytest.mark.parametrize("name", ["tricept"])
-def test_clean_photographs_show_the_true_outlines_on_both_sides(name: str, tmp_path: Path) -> None:
-    dataset = photographs(name, tmp_path, (640, 480), Appearance.clean())
+def test_clean_photographs_show_the_true_outlines_on_both_sides(tmp_path: Path) -> None:
+    dataset = photographs("tricept", tmp_path, (640, 480), Appearance.clean())
     truth, (view,) = true_outlines(dataset), dataset.measurements.views
     image = picture(dataset)
     medians: dict[int, list[float]] = {1: [], 2: []}

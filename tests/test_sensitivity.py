@@ -94,11 +94,11 @@ def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
     assert note.startswith(start)
     assert words in note
     assert [wrong.view for wrong in solution.camera_doubts] == ["c1"]
-    (effect,) = (s for s in solution.sensitivities if s.what == FITTED_CAMERA)
+    steps = solution.sensitivities[FITTED_CAMERA]
     right = fitted_rightly(camera)
     assert not [note for note in right.notes if "does not agree" in note]
     assert right.camera_doubts == ()
     names = right.kinematic.parametrization.names
     off = solution.estimates.vector(names) - right.estimates.vector(names)
-    moved = effect.steps[:, 0]
+    moved = steps[:, 0]
     assert np.linalg.norm(off + moved) < 0.5 * np.linalg.norm(off)  # it says where the truth is

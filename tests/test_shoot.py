@@ -97,6 +97,8 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
         assert read_rows(session / "measurements.csv") == commanded
         (watched / "1.jpg").write_bytes(half)
         heard(dialogue, "1.jpg is c1 c1_k01")
+        (watched / "list.jpg").write_text("c1_k02 as planned")
+        assert "none of these" in heard(dialogue, "list.jpg was not taken")
         grey = np.asarray(cv2.imread(str(HEXAPOD / "images" / "c1_k02.jpg"), cv2.IMREAD_GRAYSCALE))
         cv2.imwrite(str(watched / "soft.jpg"), cv2.GaussianBlur(grey, (0, 0), 5.0))
         assert "blurred by" in heard(dialogue, "soft.jpg was not taken")
@@ -121,7 +123,7 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
     assert rows == commanded[:2]
     loaded = load_dataset(session)  # with the photographs checked
     assert loaded.measurements.image == ("images/c1_k01.jpg", "images/c1_k02.jpg")
-    assert len(list(watched.iterdir())) == 8  # copied, not moved
+    assert len(list(watched.iterdir())) == 9  # copied, not moved
 
 
 def test_a_session_that_is_killed_between_its_files_goes_on(

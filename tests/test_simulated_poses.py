@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from machines import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
-from thinned import thinned
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry.types import Array
@@ -39,11 +38,7 @@ def _parts(machine: Machine, poses: Configurations) -> Array:
     return np.asarray((poses.readings[:, motors] - lower) / (upper - lower))
 
 
-USUAL = ("3-rpr", "tricept", "delta")
-OF_EACH_CLASS = ("hexapod", "hexapod-rod", "3-rps", "3-upu", "3-prs", "hexaglide")
-
-
-@pytest.mark.parametrize("name", thinned([*USUAL, *OF_EACH_CLASS], USUAL))
+@pytest.mark.parametrize("name", ["3-rpr", "tricept", "delta"])
 def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> None:
     machine = load_mechanism(name)
     poses = _drawn(machine, 4)
@@ -61,13 +56,11 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
         assert is_on_same_side(at_home, dimensionless(machine, T.as_matrix()[None])[0])
     part = _parts(machine, poses)
     assert np.ptp(part, axis=0).max() > 0.4
-    if name != LONG_TRAVEL:
-        assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
+    assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
 
 
-@pytest.mark.parametrize("name", ["hexapod", "tricept"])
-def test_without_enough_motors_the_machine_wanders(name: str) -> None:
-    machine = load_mechanism(name)
+def test_without_enough_motors_the_machine_wanders() -> None:
+    machine = load_mechanism("tricept")
     passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
     free = replace(machine, legs=(machine.legs[0], passive, *machine.legs[2:]))
     poses = _drawn(free, 8)
@@ -201,9 +194,8 @@ def _csv(folder: Path, machine: Machine, rows: Array, names: list[str] | None = 
     return path
 
 
-@pytest.mark.parametrize("name", ["hexapod", "tricept", "3-rpr"])
-def test_given_readings_are_reached_in_their_order(name: str, tmp_path: Path) -> None:
-    machine = load_mechanism(name)
+def test_given_readings_are_reached_in_their_order(tmp_path: Path) -> None:
+    machine = load_mechanism("tricept")
     motors = list(machine.motors)
     drawn = _drawn(machine, 4)
     path = _csv(tmp_path, machine, drawn.readings[:, motors])
@@ -267,8 +259,8 @@ def test_the_nominal_model_reaches_every_pose_at_its_readings(
 ) -> None:
     nominal, truth = pair
     home = singularity(nominal, nominal.home)
-    poses = commanded_poses(truth, nominal, 12, np.random.default_rng(0), Sampling.EXTREME)
-    assert len(poses.configurations) == len(poses.poses) == len(poses.readings) == 12
+    poses = commanded_poses(truth, nominal, 5, np.random.default_rng(0), Sampling.EXTREME)
+    assert len(poses.configurations) == len(poses.poses) == len(poses.readings) == 5
     for T, q in zip(poses.poses, poses.readings, strict=True):
         near = forward_kinematics(nominal, q)
         assert singularity(nominal, near) >= 0.05 * home

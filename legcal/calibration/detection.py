@@ -58,7 +58,6 @@ from legcal.perception.photographs import (
 from legcal.perception.placement import (
     NotPlaced,
     PlacedArm,
-    Placement,
     placed_arms,
     predict_legs_and_arms,
 )
@@ -194,7 +193,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
     scene, board = rough_placement(data)
     outlines, cylinders = given_outlines(photographs), photographs.cylinders
     unplaced = dict[str, NotPlaced]()
-    image_notes, notes = list[str](), list[str]()
+    notes_on_images, notes = list[str](), list[str]()
     if len(photographs.detect):
         T_board_camera = None if board is None else board.T_board_camera
         measured = place_and_measure(photographs, scene, data.progress, T_board_camera)
@@ -206,7 +205,22 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         arms = _nominal_arms(data)
         if arms:
             outlines = join_outlines([outlines, _of_arms(data, measured, arms)])
-        image_notes, notes = _image_notes(data, measured.placement), _gamma_notes(data)
+        of_views = data.measurements.views
+        hints = hint_notes(
+            [view.name for view in of_views],
+            [view.T_base_camera for view in of_views],
+            cameras,
+            BEFORE_FIT,
+            by_landmarks=data.measurements.clicked_views,
+        )
+        barely = image_notes(data.measurements, measured.placement.barely)
+        notes_on_images = [*hints, *measured.placement.notes, *barely]
+        if without_gamma := [v.name for v in of_views if not v.camera.gamma_is_given]:
+            notes.append(
+                f"The gamma of {few_views(without_gamma)} is not given and was taken as 1: "
+                "outlines of a camera that encodes light lie off by up to half of the blur; write "
+                "gamma of the views in dataset.yaml, or let legcal calibrate estimate it."
+            )
         if wrong_arms := arms_of_other_widths(outlines, are_of_arms(outlines, data.machine.legs)):
             description = wrong_arms_in_words(wrong_arms, data.machine.legs)
             notes.append(f"Arms do not look as the model draws them: {description}")
@@ -215,7 +229,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
             T if T is not None else rough
             for T, rough in zip(cameras, scene.T_base_camera, strict=True)
         )
-        scene = replace(measured.placement, T_base_camera=drawn, arms=_nominal_arms(data))
+        scene = replace(measured.placement, T_base_camera=drawn, arms=arms)
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
     names = dataset.machine.leg_names
     return Detection(
@@ -231,7 +245,7 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
         unplaced=unplaced,
-        image_notes=tuple(image_notes),
+        image_notes=tuple(notes_on_images),
         leg_notes=(*notes, *data.unreached_notes()),
         corners=None if board is None else order.restore(board.corners),
     )
@@ -304,31 +318,6 @@ def _of_arms(
     )
     of_arms = outlines.choose(are_of_arms(outlines, data.machine.legs))
     return merge_edited(of_arms, photographs.keep)
-
-
-def _image_notes(data: OrderedDataset, placement: Placement) -> list[str]:
-    views = data.measurements.views
-    hints = [view.T_base_camera for view in views]
-    notes = hint_notes(
-        [view.name for view in views],
-        hints,
-        placement.T_base_camera,
-        BEFORE_FIT,
-        by_landmarks=data.measurements.clicked_views,
-    )
-    return [*notes, *placement.notes, *image_notes(data.measurements, placement.barely)]
-
-
-def _gamma_notes(data: OrderedDataset) -> list[str]:
-    views = data.measurements.views
-    without_gamma = [view.name for view in views if not view.camera.gamma_is_given]
-    if not without_gamma:
-        return []
-    return [
-        f"The gamma of {few_views(without_gamma)} is not given and was taken as 1: outlines of a "
-        "camera that encodes light lie off by up to half of the blur; write gamma of the views in "
-        "dataset.yaml, or let legcal calibrate estimate it."
-    ]
 
 
 # The examination

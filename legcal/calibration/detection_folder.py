@@ -25,14 +25,13 @@ from legcal.calibration.detection import (
     PHOTOGRAPHS,
     Detection,
     Examination,
-    ViewCondition,
     unique_names,
 )
 from legcal.data.corners import write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, ImageReader
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
 from legcal.data.measurements import row_names
-from legcal.data.outlines import format_observations, write_observations
+from legcal.data.outlines import are_of_bodies, format_observations, write_observations
 from legcal.data.reasons import WORDS_BY_CODE, Reason, reason_in_words
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
@@ -238,7 +237,7 @@ def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
 def _caption(detection: Detection, row: int) -> str:
     view, outlines = detection.view_of(row), detection.outlines
     measurements = detection.dataset.measurements
-    used = outlines.used[outlines.row == row]
+    used = outlines.used[(outlines.row == row) & ~are_of_bodies(outlines)]
     state = f"{np.count_nonzero(used)} of {len(used)} outlines used"
     if view in detection.unplaced:
         state = "the camera could not be placed: edge pairs that were found"
@@ -258,25 +257,15 @@ def _earlier(destination: Path) -> dict[str, Any]:
 
 def _own_files(destination: Path) -> list[Path]:
     """Return the files of an earlier detection in a folder, relative to it."""
+    tables = OBSERVATIONS_NAME, CORNERS_NAME, DETECTION_PAGE, DETECTION.marker
     named = _earlier(destination).get("files", [])
     names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
     return [
         Path(name)
         for name in dict.fromkeys(names)
-        if path_problem(destination, name) is None and _is_place(Path(name))
+        if path_problem(destination, name) is None
+        and (name in tables or is_overlay(Path(name)) or is_overlay(Path(name), PHOTOGRAPHS))
     ]
-
-
-def _is_place(name: Path) -> bool:
-    if ".." in name.parts:
-        return False
-    tables = {
-        Path(OBSERVATIONS_NAME),
-        Path(CORNERS_NAME),
-        Path(DETECTION_PAGE),
-        Path(DETECTION.marker),
-    }
-    return name in tables or is_overlay(name) or is_overlay(name, PHOTOGRAPHS)
 
 
 def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:
@@ -311,7 +300,21 @@ def tables_of(examination: Examination) -> list[Table]:
         Table(
             ("view", ">legs", ">outlines used", ">contrast", ">length [px]", ">residual [px]",
              "not used"),
-            [_outline_cells(view) for view in examination.views if view.outlines is not None],
+            [
+                [
+                    view.view,
+                    _share(view.legs_found, view.legs_visible),
+                    _share(view.outlines_used, view.outlines),
+                    number(view.contrast, 1),
+                    number(view.length, 0),
+                    number(view.residual, 3),
+                    "camera not placed" if view.problem else ", ".join(
+                        f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items()
+                    ),
+                ]
+                for view in examination.views
+                if view.outlines is not None
+            ],
         ),
     ]  # fmt: skip
     units = dict.fromkeys(SHOWN_IN[check.unit][1] for check in examination.encoders)
@@ -331,19 +334,6 @@ def tables_of(examination: Examination) -> list[Table]:
     heading = f"encoder [{', '.join(units)}]"
     tables.append(Table((heading, ">least", ">greatest", ">travel", ">used [%]"), rows))
     return [table for table in tables if table.rows]
-
-
-def _outline_cells(view: ViewCondition) -> list[Cell]:
-    rejected = ", ".join(f"{n} {reason_in_words(reason)}" for reason, n in view.rejected.items())
-    return [
-        view.view,
-        _share(view.legs_found, view.legs_visible),
-        _share(view.outlines_used, view.outlines),
-        number(view.contrast, 1),
-        number(view.length, 0),
-        number(view.residual, 3),
-        "camera not placed" if view.problem else rejected,
-    ]
 
 
 def _share(part: int | None, whole: int | None) -> Cell:

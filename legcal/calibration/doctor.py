@@ -111,7 +111,8 @@ def doctor(
         detection.
     """
     if output is not None:
-        folder = source.folder if isinstance(source, Dataset) else _folder(Path(source))
+        folder = source.folder if isinstance(source, Dataset) else Path(source)
+        folder = folder if folder.is_dir() else folder.parent
         check_detection_destination(output_path(output, DETECTION), folder)
     writes = output is not None
     dataset = source if isinstance(source, Dataset) else load_dataset(source, check_images=writes)
@@ -141,7 +142,16 @@ def doctor(
                 for name in CHECKS
                 if name in checklist.checks
             ),
-            findings=tuple(sorted(checklist.findings, key=_by_severity)),
+            findings=tuple(
+                sorted(  # files and mistakes first
+                    checklist.findings,
+                    key=lambda one: (
+                        SEVERITIES.index(one.severity),
+                        one.check != "files",
+                        one.check != "mistakes",
+                    ),
+                )
+            ),
             encoders=tuple(checklist.encoders),
             views=tuple(views),
             diagnosis=checklist.diagnosis,
@@ -191,10 +201,6 @@ def detect(
         return detected(order_dataset(dataset, pool, report), images)
 
 
-def _folder(path: Path) -> Path:
-    return path if path.is_dir() else path.parent
-
-
 @dataclass
 class _Checklist:
     dataset: Dataset
@@ -214,11 +220,6 @@ class _Checklist:
         """Return the severity of the worst finding of a check."""
         severities = {finding.severity for finding in self.findings if finding.check == check}
         return next((finding for finding in SEVERITIES if finding in severities), "ok")
-
-
-def _by_severity(finding: Finding) -> tuple[int, bool, bool]:
-    """Return the sorting key of findings: by severity, then files and mistakes first."""
-    return SEVERITIES.index(finding.severity), finding.check != "files", finding.check != "mistakes"
 
 
 def _look_at_files(checklist: _Checklist, problems: Sequence[tuple[int, Problem]]) -> list[int]:
@@ -397,10 +398,11 @@ def _look_at_photographs(
         rows_of_digest for rows_of_digest in pixels.values() if len(rows_of_digest) > 1
     ):
         several = len({int(m.pose[row]) for row in duplicates}) > 1
+        same = images_in_words(m, duplicates)
         checklist.add(
             "files",
             "error" if several else "warning",
-            f"{_sentence(images_in_words(m, duplicates))} are the same photograph, "
+            f"{same[0].upper()}{same[1:]} are the same photograph, "
             + (
                 "with different readings: only one of them can be right"
                 if several
@@ -624,7 +626,3 @@ def _median(values: Sequence[float] | Array) -> float | None:
 def _range(values: Sequence[float]) -> str:
     least, greatest = (f"{float(f'{end(values):.2g}'):g}" for end in (min, max))
     return least if least == greatest else f"{least} to {greatest}"
-
-
-def _sentence(words: str) -> str:
-    return words[0].upper() + words[1:]

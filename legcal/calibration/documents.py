@@ -347,15 +347,19 @@ class PlatformBlock(Document):
 
 
 class Holdout(Document):
-    """How well the fit predicts the held-out images."""
+    """Held-out images compared with the predictions of a fit.
 
-    images: int
+    Offsets are corrected for the common-mode biases of the fit. Expected errors are one standard
+    deviation, from the noise of outlines and readings and the covariance of the fit.
+    """
+
+    images: int  # held-out images
     poses: int
-    outlines: int
-    wrong: int
-    rms_px: Number | None
+    outlines: int  # in these images
+    wrong: int  # outliers, excluded below
+    rms_px: Number | None  # of the offsets; None without outlines
     expected_px: Number | None
-    views: dict[str, Number]
+    views: dict[str, Number]  # rms by name of the view [px]
 
 
 class DiagnosisBlock(Document):

@@ -7,17 +7,17 @@ true, where that can be computed.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from legcal.calibration.clicks import click_distances
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
-from legcal.calibration.joint_fit.held_out import CrossValidation, HeldOut, cross_validate
+from legcal.calibration.joint_fit.held_out import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
@@ -43,14 +43,17 @@ from legcal.calibration.session_changes import OF_MOTORS, OF_SCATTER, Finding, S
 from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
-from legcal.data.measurements import few, few_views
+from legcal.data.landmarks import Landmarks, joint_name
+from legcal.data.measurements import few, few_views, row_names
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.parameters import geometries, vector_of
+from legcal.machine.rods import ends_at_poses
 from legcal.perception.diagnostics import far_from_hints, images_left_out, is_measurable
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
@@ -97,11 +100,6 @@ class Doubt:
         return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
 
 
-def worst_first(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
-    """Return doubts with grave ones first, then those of known effects, the largest first."""
-    return tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
-
-
 def model_error(doubts: Sequence[Doubt]) -> tuple[float, float]:
     """Return the displacement [m] and rotation [rad] of the platform by all doubts together."""
     displacement = float(np.hypot.reduce([one.sigma_dX_m or 0.0 for one in doubts] or [0.0]))
@@ -117,7 +115,7 @@ def doubts_of(
     dataset: Dataset,
     solution: Solution,
     platform: PlatformAccuracy | None,
-    held_out: HeldOut | None,
+    held_out: Holdout | None,
     diagnosis: Sequence[Diagnosis],
     corners: Corners | None,
     session: SessionTests,
@@ -174,12 +172,6 @@ def doubts_of(
         *causes,
         *symptoms,
     )
-
-
-def no_improvement(remedy: str) -> Doubt:
-    """Return the doubt in a result whose predicted improvement is below two sigma."""
-    what = "a predicted improvement below two sigma is no improvement"
-    return Doubt("no_improvement", what, remedy, is_grave=True)
 
 
 def _legs_left_out(solution: Solution, explained: Collection[str]) -> list[Doubt]:
@@ -408,14 +400,13 @@ class _Evidence:
         views = list(dict.fromkeys(wrong.view for wrong in self.solution.camera_doubts))
         if not views:
             return []
-        effects = () if self.platform is None else self.platform.effects
-        errors = [effect.error for effect in effects if effect.what == FITTED_CAMERA]
+        error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
         what = f"the measurements contradict the camera of {few_views(views)}"
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "
             "zoomed, scaled or cropped"
         )
-        return [Doubt(CAMERA, what, remedy, *_mean(errors[0] if errors else None))]
+        return [Doubt(CAMERA, what, remedy, *_mean(error))]
 
     def left_out(self) -> list[Doubt]:
         """Return whether images without a part in the fit are predicted as well as it claims."""
@@ -637,7 +628,7 @@ def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:
     ]
 
 
-def _held_out(held_out: HeldOut | None) -> list[Doubt]:
+def _held_out(held_out: Holdout | None) -> list[Doubt]:
     """Return whether images that were kept aside are predicted worse than expected."""
     if held_out is None or held_out.rms_px is None or held_out.expected_px is None:
         return []
@@ -649,3 +640,71 @@ def _held_out(held_out: HeldOut | None) -> list[Doubt]:
     )
     remedy = "look at the worst outlines, and for play, bending or a camera that moved"
     return [Doubt("held_out", what, remedy)]
+
+
+# Clicks on joints (``landmarks.csv``) against a fit
+
+
+# Of half the clicks of a view from where a fit has their joints: hands are steadier
+MAX_CLICK_SIGMAS = 4.0
+
+
+def click_distances(dataset: Dataset, solution: Solution) -> dict[str, tuple[float, float]]:
+    """Return how far clicks are from where a fit has their joints, and may be, by view [px].
+
+    Both are medians: a click in two may be on another joint. Of a view without an outline in the
+    fit nothing is said: its camera is not one of the fit.
+    """
+    if dataset.landmarks is None:
+        return {}
+    clicks, m = dataset.landmarks, dataset.measurements
+    view, off = m.view[clicks.row], _off_clicks(dataset.landmarks, dataset, solution)
+    own, most = off[np.arange(len(clicks)), clicks.leg, clicks.end], MAX_CLICK_SIGMAS
+    outlines = solution.outlines
+    fitted = np.unique(m.view[outlines.row[outlines.used]])
+    return {
+        m.views[v].name: (
+            float(np.median(own[view == v])),
+            most * float(np.median(clicks.sigma_px[view == v])),
+        )
+        for v in np.intersect1d(view, fitted).tolist()
+    }
+
+
+def _off_clicks(clicks: Landmarks, dataset: Dataset, solution: Solution) -> Array:
+    """Return how far each click is from all joints as a fit has them, (n, n_legs, 2) [px]."""
+    m = dataset.measurements
+    joints = np.stack(ends_at_poses(solution.legs, *components(solution.T_Rb_Re)), axis=2)
+    off = np.full((len(clicks), *joints.shape[1:3]), np.inf)
+    for of_click, row, px in zip(off, clicks.row.tolist(), clicks.px, strict=True):
+        v = int(m.view[row])
+        P = solution.T_camera_Rb[v].apply(joints[m.pose[row]].reshape(-1, 3))
+        P = P.reshape(*of_click.shape, 3)
+        ahead = P[..., 2] > 0.0
+        of_click[ahead] = np.linalg.norm(solution.cameras[v].project(P[ahead]) - px, axis=-1)
+    return off
+
+
+def click_notes(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return a note on each click that a fit contradicts, in views whose other clicks agree."""
+    if dataset.landmarks is None:
+        return []
+    clicks, m, legs = dataset.landmarks, dataset.measurements, dataset.machine.leg_names
+    agree = [name for name, (px, most) in click_distances(dataset, solution).items() if px <= most]
+    names, notes = row_names(m), list[str]()
+    every = zip(clicks.row_keys(), clicks.sigma_px.tolist(), strict=True)
+    for ((row, leg, end), sigma), off in zip(
+        every, _off_clicks(clicks, dataset, solution), strict=True
+    ):
+        own, most, view = float(off[leg, end]), MAX_CLICK_SIGMAS * sigma, m.views[m.view[row]].name
+        if own <= most or view not in agree:
+            continue
+        near_leg, near_end = np.unravel_index(int(np.argmin(off)), off.shape)
+        near = joint_name(legs[int(near_leg)], int(near_end))
+        perhaps = f"perhaps it shows {near}; " if off.min() <= most else ""
+        notes.append(
+            f"The click on {joint_name(legs[leg], end)} in {names[row]} (view {view}) is {own:.0f} "
+            f"px from where the fit has this joint, needed at most {most:.0f} px; {perhaps}correct "
+            "or remove it."
+        )
+    return notes

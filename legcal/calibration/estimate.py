@@ -157,8 +157,13 @@ def fit_outlines(
     fitted_outlines = reject_unused_legs(
         fitted_outlines, fitted.measurements, fitted.machine.leg_names
     )
-    if options.every_leg:
-        _refuse_unseen_legs(fitted, fitted_outlines)
+    unseen = unseen_legs(fitted.machine, fitted.measurements, fitted_outlines)
+    if options.every_leg and unseen:
+        raise NotVisible(
+            f"{fitted.dataset.folder}: the machine could not be calibrated: no image has a usable "
+            f"outline of {', '.join(unseen)}; add images that show it, or list the visible legs of "
+            "each view in dataset.yaml, so that it relies on readings."
+        )
     if steps is None:
         steps = four_steps(fitted, fitted_outlines, board, options)
     fitted_edges = None if edges is None else edges.at(fitted.rows)
@@ -182,17 +187,6 @@ def fit_outlines(
     fitted.progress("Joint fit", 1, 1)
     corners = None if board is None else board.reject_outliers(solution, fitted)
     return Estimate(fitted, outlines, steps, solution, corners, edges=edges)
-
-
-def _refuse_unseen_legs(fitted: OrderedDataset, outlines: Outlines) -> None:
-    """Raise NotVisible if no image shows a leg that its view should show."""
-    unseen = unseen_legs(fitted.machine, fitted.measurements, outlines)
-    if unseen:
-        raise NotVisible(
-            f"{fitted.dataset.folder}: the machine could not be calibrated: no image has a usable "
-            f"outline of {', '.join(unseen)}; add images that show it, or list the visible legs of "
-            "each view in dataset.yaml, so that it relies on readings."
-        )
 
 
 def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines) -> list[str]:

@@ -229,9 +229,7 @@ def estimate_group(
             C,
             by_fit,
         ),
-        sensitivities=tuple(
-            replace(one, steps=by_fit @ one.steps) for one in solution.sensitivities
-        ),
+        sensitivities={what: by_fit @ one for what, one in solution.sensitivities.items()},
     )
     return GroupEstimate(group, machine, turned, near, value, sigma, value - left, reported, moved)
 

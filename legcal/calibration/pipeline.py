@@ -31,6 +31,7 @@ from legcal.calibration.diagnosis.diagnosis import (
     diagnose,
     notes_beside,
 )
+from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import (
     TRIAL,
@@ -42,7 +43,7 @@ from legcal.calibration.estimate import (
 )
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.factors import known_gammas
-from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
+from legcal.calibration.joint_fit.held_out import compare_held_out
 from legcal.calibration.joint_fit.parameter_choices import (
     Choices,
     Group,
@@ -526,7 +527,7 @@ def _fitted_and_held_out(
     return split_images(dataset, holdout)
 
 
-def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> HeldOut:
+def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> Holdout:
     held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
     outlines = estimate.outlines.at(held_out.rows)
     outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)

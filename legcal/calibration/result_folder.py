@@ -417,9 +417,14 @@ def draw_overlays(calibration: Calibration, folder: Path, run: Run, progress: Re
 
     Raises DatasetError if a photograph cannot be read, and OutOfResources if one cannot be drawn.
     """
-    detection = _as_detection(calibration.dataset, calibration.solution)
-    rows = np.array(list(calibration.overlays), dtype=np.intp)
-    draw_images(replace(detection, rows=rows, corners=calibration.corners), folder, run, progress)
+    solution = calibration.solution
+    detection = replace(
+        _as_detection(calibration.dataset, solution),
+        outlines=with_body_edges(solution.outlines, solution.edges),
+        rows=np.array(list(calibration.overlays), dtype=np.intp),
+        corners=calibration.corners,
+    )
+    draw_images(detection, folder, run, progress)
 
 
 def check_overlays(dataset: Dataset, destination: Path | None) -> None:

@@ -236,12 +236,12 @@ class _Hypothesis:
 
 
 class _Test(NamedTuple):
-    """A hypothesis with the blocks of images in which it holds."""
+    """A hypothesis, by its place among all, with the blocks of images in which it holds."""
 
-    hypothesis: int
+    place: int
+    of: _Hypothesis
     holds: BoolArray  # (n_blocks,)
     between: tuple[str, str] | None  # the images, or views, before and after a change
-    has_levels: bool  # all numbers but the first are levels that may be anything
 
 
 @dataclass(frozen=True)
@@ -281,116 +281,70 @@ def session_tests(
     """
     if not len(posterior.problem.outlines):
         return SessionTests()
-    posterior = replace(posterior, problem=_with_rejected(posterior))
-    problem, state = posterior.problem, posterior.state
     has_order = len(sequences) > 0
-    course = _Course.of(
+    fit = _Fit.of(
         posterior, measurements, sequences if has_order else [np.arange(measurements.n_rows)]
     )
-    linear = linearize(problem, state)
-    normal = normal_equations(problem, state, linear)
-    hypotheses = [*_of_motors(problem, course), *_of_views(problem, state, linear, course)]
+    hypotheses = [*fit.of_motors(), *fit.of_views()]
     hypotheses = [h for h in hypotheses if any(c.any() for c in h.columns.values())]
-    tests = [
-        test
-        for i, hypothesis in enumerate(hypotheses)
-        if has_order or hypothesis.kind in _WITHOUT_ORDER
-        for test in course.tests(i, hypothesis)
-    ]
     if not hypotheses:
         return SessionTests()
-    scores = _Scores.of(problem, linear, normal, hypotheses)
+    tests = [
+        test
+        for place, hypothesis in enumerate(hypotheses)
+        if has_order or hypothesis.kind in _WITHOUT_ORDER
+        for test in fit.course.tests(place, hypothesis)
+    ]
+    scores = fit.scores(hypotheses)
     least = math.sqrt(chdtri(1.0, DOUBT_BY_CHANCE / max(len(tests), 1)))
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
-    for test, number in zip(tests, solved, strict=True):
-        hypothesis = hypotheses[test.hypothesis]
-        if hypothesis.kind == "encoder" and number.rank:
+    for number in solved:
+        if number.test.of.kind == "encoder" and number.rank:
             sigma = math.sqrt(number.covariance[0, 0])
-            slips.setdefault(hypothesis.subject, []).append(least * sigma)
-    lacking, left = _forward_selection(scores, tests, solved, len(tests))
+            slips.setdefault(number.test.of.subject, []).append(least * sigma)
+    lacking, left = _forward_selection(scores, solved, len(tests))
     noise = _scatter(hypotheses, left)
     if lacking or noise:
-        least = max((solved.explains for _, solved in lacking), default=0.0)
+        least = max((number.explains for number in lacking), default=0.0)
         by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
-        better = _better(problem, state, linear, normal, course, least, by_scatter)
+        better = fit.better(least, by_scatter)
         if better is not None:
-            hypotheses, noise, lacking = [better[0]], None, [better[1]]
+            noise, lacking = None, [better]
     if noise is not None:
-        scores, tests_left = scores.with_noise(noise), [test for test, _ in lacking]
-        lacking, _ = _forward_selection(
-            scores, tests_left, [scores.solved(test) for test in tests_left], len(tests)
-        )
-    findings = [
-        Finding(
-            hypotheses[test.hypothesis].kind,
-            hypotheses[test.hypothesis].subject,
-            *_size(hypotheses[test.hypothesis], number),
-            test.between,
-            number.p_value * len(tests),
-            _effect(
-                problem,
-                linear,
-                normal,
-                hypotheses[test.hypothesis],
-                test.holds.astype(np.float64)[:, None],
-                number.amount[:, None],
-            ),
-            _side(measurements, course, hypotheses[test.hypothesis], test),
-        )
-        for test, number in lacking
-    ]
+        scores = scores.with_noise(noise)
+        solved = [scores.solved(number.test) for number in lacking]
+        lacking, _ = _forward_selection(scores, solved, len(tests))
+    findings = [fit.finding(number, measurements, len(tests)) for number in lacking]
     if noise is not None:
-        steps = [
-            _effect(
-                problem,
-                linear,
-                normal,
-                hypotheses[i],
-                np.diag(noise.further * sigma),
-                np.eye(len(scores.column[i]))[:, [row]] * np.ones(len(sigma)),
-            )
-            for (i, row), sigma in zip(noise.group, noise.sigma, strict=True)
-        ]
-        findings.append(
-            Finding(
-                noise.kind,
-                noise.subject,
-                "rad" if noise.kind == "vibration" else hypotheses[noise.group[0][0]].unit,
-                noise.ratio * noise.stated,
-                noise.sigma_of_ratio * noise.stated,
-                None,
-                noise.p_value,
-                np.hstack(steps),
-                stated=noise.stated,
-            )
-        )
+        findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
-    periods = course.periods(problem.outlines) if has_order else {}
+    periods = fit.course.periods(fit.problem.outlines) if has_order else {}
     return SessionTests(tuple(findings), least_slips, periods)
 
 
 def _forward_selection(
-    scores: _Scores, tests: Sequence[_Test], solved: Sequence[_Solved], n_tests: int
-) -> tuple[list[tuple[_Test, _Solved]], _Scores]:
+    scores: _Scores, solved: Sequence[_Solved], n_tests: int
+) -> tuple[list[_Solved], _Scores]:
     """Return the numbers that the fit lacks, the most certain first, and the scores given them."""
-    lacking = list[tuple[_Test, _Solved]]()
-    while tests and len(lacking) < MAX_FINDINGS:
-        best = min(range(len(tests)), key=lambda i: (solved[i].p_value, -solved[i].square))
-        if solved[best].p_value * n_tests > DOUBT_BY_CHANCE:
+    lacking = list[_Solved]()
+    while solved and len(lacking) < MAX_FINDINGS:
+        best = min(solved, key=lambda number: (number.p_value, -number.square))
+        if best.p_value * n_tests > DOUBT_BY_CHANCE:
             break
-        lacking.append((tests[best], solved[best]))
-        scores = scores.given(solved[best])
-        tests = [test for test in tests if test.hypothesis != tests[best].hypothesis]
-        solved = [scores.solved(test) for test in tests]
+        lacking.append(best)
+        scores = replace(scores, scores=scores.scores.given(best.estimated))
+        left = [number.test for number in solved if number.test.place != best.test.place]
+        solved = [scores.solved(test) for test in left]
     return lacking, scores
 
 
-def _side(measurements: Measurements, course: _Course, hypothesis: _Hypothesis, test: _Test) -> str:
+def _side(measurements: Measurements, course: _Course, test: _Test) -> str:
     """Return the images before a change of an encoder; beside that of a camera, the fewer ones.
 
     Images of a pose share its readings, and so the side of an encoder. Those in which nothing can
     be seen of a change are on the side of the ones before them.
     """
+    hypothesis = test.of
     if not hypothesis.changes:
         return ""
     if hypothesis.kind == "encoder":
@@ -451,12 +405,12 @@ def _with_rejected(posterior: Posterior) -> FitProblem:
     return problem.with_factors(replace(factor, whitening=root[:, None, None]))
 
 
-def _size(hypothesis: _Hypothesis, number: _Solved) -> tuple[str, float, float]:
+def _size(number: _Solved) -> tuple[str, float, float]:
     """Return the unit, the amount and its standard deviation.
 
     Of a camera, which moves by a rotation vector and a displacement: those of the surer one.
     """
-    amount, covariance = number.amount, number.covariance
+    hypothesis, amount, covariance = number.test.of, number.amount, number.covariance
     parts = {"rad": slice(0, 3), "m": slice(3, 6)}
     if hypothesis.kind != "camera":
         if len(amount) == 1 or hypothesis.kind == "drift":
@@ -550,14 +504,14 @@ class _Course:
         """Yield the tests of a hypothesis, by its number."""
         if hypothesis.changes:
             for holds, between in self.changes(np.asarray(_blocks_of(hypothesis).any(axis=0))):
-                yield _Test(number, holds, between, has_levels=False)
+                yield _Test(number, hypothesis, holds, between)
             return
         drifts, whole = hypothesis.kind == "drift", len(self.sequences) == 1
         span = (
             ("the first image", "the last") if whole else ("the first image of a view", "its last")
         )
         n_blocks = next(iter(hypothesis.share.values())).shape[1]
-        yield _Test(number, np.ones(n_blocks, dtype=np.bool_), span if drifts else None, drifts)
+        yield _Test(number, hypothesis, np.ones(n_blocks, dtype=np.bool_), span if drifts else None)
 
     def changes(self, among: BoolArray) -> Iterator[tuple[BoolArray, tuple[str, str]]]:
         """Yield the blocks after each possible change, among some blocks, and what is beside it.
@@ -650,176 +604,149 @@ def _subsets(sequences: Sequence[int], few: Sequence[tuple[int, ...]]) -> Sequen
     return list(chain.from_iterable(combinations(sequences, n) for n in sizes))
 
 
-def _of_motors(problem: FitProblem, course: _Course) -> Iterator[_Hypothesis]:
-    """Yield what may be wrong with the readings of motors."""
-    readings, reading = problem.readings, problem.readings.reading
-    row = course.row_of_pose[readings.pose]
-    whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
-    share = {"readings": course.of_poses(readings.pose)}
-    last_move = _last_moves(reading, readings.leg, row, course.before)
-
-    def wrong_by(kind: Kind, subject: str, unit: str, by: Array) -> _Hypothesis:
-        """Return the hypothesis that readings are wrong by multiples of *by* (n, d)."""
-        columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
-        return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
-
-    for j in np.unique(readings.leg).tolist():
-        leg, of_motor = problem.legs.nominal[j], (readings.leg == j)[:, None]
-        unit, subject = leg.reading_unit, leg.motor_label
-        yield wrong_by("encoder", subject, unit, 1.0 * of_motor)
-        yield wrong_by("drift", subject, unit, of_motor * course.drift(row))
-        yield wrong_by("gain", subject, "1", of_motor * reading[:, None])
-        yield wrong_by("backlash", subject, unit, of_motor * 0.5 * np.sign(last_move)[:, None])
-        turned = math.tau if leg.reads_angle else math.inf
-        if np.ptp(reading[of_motor[:, 0]]) > _GOOD_PART * turned:
-            once_a_turn = np.column_stack([np.cos(reading), np.sin(reading)])
-            yield wrong_by("eccentricity", subject, unit, of_motor * once_a_turn)
-    yield wrong_by("lag", "", "1", last_move[:, None])
-    yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
-
-
-def _better(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    normal: NormalEquations,
-    course: _Course,
-    least: float,
-    by_scatter: float,
-) -> tuple[_Hypothesis, tuple[_Test, _Solved]] | None:
-    """Return a joint that moved or an error once a turn that explains more than what was found.
-
-    In squares: *least* in units of the scatter that a number leaves behind, *by_scatter* in those
-    of the covariances of outlines.
-    """
-    best: tuple[_Hypothesis, tuple[_Test, _Solved]] | None = None
-    groups = [*_of_joints(problem, state, linear, course), *_of_screws(problem, course)]
-    asked = 0
-    for hypotheses in groups:
-        scores = _Scores.of(problem, linear, normal, hypotheses)
-        for i, hypothesis in enumerate(hypotheses):
-            for test in course.tests(0, hypothesis):
-                solved = scores.solved(test._replace(hypothesis=i))
-                asked += 1
-                if solved.explains > least and solved.explains * solved.scatter > by_scatter:
-                    least, best = solved.explains, (hypothesis, (test, solved))
-    return best if best and best[1][1].p_value * asked <= DOUBT_BY_CHANCE else None
-
-
-def _of_joints(
-    problem: FitProblem, state: State, linear: Linearization, course: _Course
-) -> Iterator[list[_Hypothesis]]:
-    """Yield joints that may have moved, by leg."""
-    constraints, legs = LegConstraints(problem.parameters), problem.legs
-    readings, outlines = problem.readings, problem.outlines
-    share = {
-        "readings": course.of_poses(readings.pose),
-        "outlines": course.of_images(outlines.view, outlines.pose),
-    }
-    for j, name in enumerate(legs.names):
-        joints = []
-        for side, columns in (("base", LegColumns.A), ("platform", LegColumns.B)):
-            moved = []
-            for column in range(columns.start, columns.stop):
-                error = np.zeros((len(legs.names), LegColumns.COUNT))
-                error[j, column] = 1.0
-                change = residual_changes(problem, linear, "legs", error)
-                motion = constraints.following(state, j, column)
-                moved.append(
-                    {
-                        of: change[of]
-                        + np.einsum(
-                            "nqk,nk->nq",
-                            linear[of].J_element,
-                            motion[problem.factor(of).element],
-                        )
-                        for of in share
-                    }
-                )
-            by = {of: np.stack([one[of] for one in moved], axis=-1) for of in share}
-            joints.append(_Hypothesis("joint", f"{name}.{side}", "m", by, share, True))
-        yield joints
-
-
-def _of_screws(problem: FitProblem, course: _Course) -> Iterator[list[_Hypothesis]]:
-    """Yield errors once a turn of the screws of each motor that slides, of usual leads."""
-    readings, reading = problem.readings, problem.readings.reading
-    whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
-    group = np.arange(course.n_blocks) * min(_COARSE, course.n_blocks) // max(course.n_blocks, 1)
-    coarse = np.equal(group[:, None], np.unique(group)).astype(np.float64)
-    share = {"readings": course.of_poses(readings.pose) @ coarse}
-    for j in np.unique(readings.leg).tolist():
-        leg = problem.legs.nominal[j]
-        if leg.reads_angle:
-            continue
-        by_error = -readings.sign * whitening * (readings.leg == j)
-        turns = [math.tau * reading / (1e-3 * lead) for lead in _LEADS]
-        yield [
-            _Hypothesis("eccentricity", leg.motor_label, "m",
-                        {"readings": by_error[:, None, None]
-                         * np.column_stack([np.cos(turn), np.sin(turn)])[:, None]}, share, False)
-            for turn in turns
-        ]  # fmt: skip
-
-
-def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
-    """Return how far readings are from those of the pose before, zero for first poses."""
-    keys = zip(leg.tolist(), row.tolist(), strict=True)
-    reading = dict(zip(keys, q.tolist(), strict=True))
-    previous = np.where(row >= 0, before[row], -1).tolist()
-    return np.array(
-        [
-            x - reading.get((j, last), x) if last >= 0 else 0.0
-            for x, j, last in zip(q.tolist(), leg.tolist(), previous, strict=True)
-        ]
-    )
-
-
-def _of_views(
-    problem: FitProblem, state: State, linear: Linearization, course: _Course
-) -> Iterator[_Hypothesis]:
-    """Yield what may have changed about the camera of each view.
-
-    Corners of a board on the base are means over the images of a view, changed by the share of
-    those after a change.
-    """
-    boards = {corners.name: corners for corners in problem.boards if len(corners)}
-    shares = {
-        name: course.of_images(table.view, table.pose)
-        for name, table in ({"outlines": problem.outlines} | boards).items()
-    }
-    residuals = CameraResiduals(problem, state, linear)
-    for v, view in enumerate(problem.outlines.views):
-        if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
-            continue
-        moved = []
-        for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
-            error = np.zeros((len(problem.outlines.views), 6))
-            error[v] = np.append(turn, np.cross(turn, state.camera_pose.t[v]) - shift)
-            moved.append(residual_changes(problem, linear, "camera_pose", error))
-        camera = {name: np.stack([change[name] for change in moved], axis=-1) for name in shares}
-        yield _Hypothesis("camera", view, "", camera, shares, True)
-        zoom = residuals.zoomed(v)
-        focal = {name: -zoom[name][..., None] for name in shares}
-        yield _Hypothesis("focal_length", view, "1", focal, shares, True)
-
-
 @dataclass(frozen=True, eq=False)
-class _Scores:
-    """Rao's scores of all hypotheses in each block of images."""
+class _Fit:
+    """A fit at its minimum, and the course of its images: what it may lack, with the scores."""
 
-    scores: Scores
-    column: Sequence[IntArray]  # (d, n_blocks) columns of each hypothesis, -1 without any
+    problem: FitProblem
+    state: State
+    linear: Linearization
+    normal: NormalEquations
+    course: _Course
 
     @classmethod
     def of(
-        cls,
-        problem: FitProblem,
-        linear: Linearization,
-        normal: NormalEquations,
-        hypotheses: Sequence[_Hypothesis],
-    ) -> _Scores:
-        """Compute the scores."""
+        cls, posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
+    ) -> _Fit:
+        """Linearise a fit, with what it rejected."""
+        posterior = replace(posterior, problem=_with_rejected(posterior))
+        problem, state = posterior.problem, posterior.state
+        linear = linearize(problem, state)
+        normal = normal_equations(problem, state, linear)
+        course = _Course.of(posterior, measurements, sequences)
+        return cls(problem, state, linear, normal, course)
+
+    def of_motors(self) -> Iterator[_Hypothesis]:
+        """Yield what may be wrong with the readings of motors."""
+        problem, course = self.problem, self.course
+        readings, reading = problem.readings, problem.readings.reading
+        row = course.row_of_pose[readings.pose]
+        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
+        share = {"readings": course.of_poses(readings.pose)}
+        last_move = _last_moves(reading, readings.leg, row, course.before)
+
+        def wrong_by(kind: Kind, subject: str, unit: str, by: Array) -> _Hypothesis:
+            """Return the hypothesis that readings are wrong by multiples of *by* (n, d)."""
+            columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
+            return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
+
+        for j in np.unique(readings.leg).tolist():
+            leg, of_motor = problem.legs.nominal[j], (readings.leg == j)[:, None]
+            unit, subject = leg.reading_unit, leg.motor_label
+            yield wrong_by("encoder", subject, unit, 1.0 * of_motor)
+            yield wrong_by("drift", subject, unit, of_motor * course.drift(row))
+            yield wrong_by("gain", subject, "1", of_motor * reading[:, None])
+            yield wrong_by("backlash", subject, unit, of_motor * 0.5 * np.sign(last_move)[:, None])
+            turned = math.tau if leg.reads_angle else math.inf
+            if np.ptp(reading[of_motor[:, 0]]) > _GOOD_PART * turned:
+                once_a_turn = np.column_stack([np.cos(reading), np.sin(reading)])
+                yield wrong_by("eccentricity", subject, unit, of_motor * once_a_turn)
+        yield wrong_by("lag", "", "1", last_move[:, None])
+        yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
+
+    def of_views(self) -> Iterator[_Hypothesis]:
+        """Yield what may have changed about the camera of each view.
+
+        Corners of a board on the base are means over the images of a view, changed by the share of
+        those after a change.
+        """
+        problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        boards = {corners.name: corners for corners in problem.boards if len(corners)}
+        shares = {
+            name: course.of_images(table.view, table.pose)
+            for name, table in ({"outlines": problem.outlines} | boards).items()
+        }
+        residuals = CameraResiduals(problem, state, linear)
+        for v, view in enumerate(problem.outlines.views):
+            if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
+                continue
+            moved = []
+            for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
+                error = np.zeros((len(problem.outlines.views), 6))
+                error[v] = np.append(turn, np.cross(turn, state.camera_pose.t[v]) - shift)
+                moved.append(residual_changes(problem, linear, "camera_pose", error))
+            camera = {
+                name: np.stack([change[name] for change in moved], axis=-1) for name in shares
+            }
+            yield _Hypothesis("camera", view, "", camera, shares, True)
+            zoom = residuals.zoomed(v)
+            focal = {name: -zoom[name][..., None] for name in shares}
+            yield _Hypothesis("focal_length", view, "1", focal, shares, True)
+
+    def of_joints(self) -> Iterator[list[_Hypothesis]]:
+        """Yield joints that may have moved, by leg."""
+        problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        constraints, legs = LegConstraints(problem.parameters), problem.legs
+        readings, outlines = problem.readings, problem.outlines
+        share = {
+            "readings": course.of_poses(readings.pose),
+            "outlines": course.of_images(outlines.view, outlines.pose),
+        }
+        for j, name in enumerate(legs.names):
+            joints = []
+            for side, columns in (("base", LegColumns.A), ("platform", LegColumns.B)):
+                moved = []
+                for column in range(columns.start, columns.stop):
+                    error = np.zeros((len(legs.names), LegColumns.COUNT))
+                    error[j, column] = 1.0
+                    change = residual_changes(problem, linear, "legs", error)
+                    motion = constraints.following(state, j, column)
+                    moved.append(
+                        {
+                            of: change[of]
+                            + np.einsum(
+                                "nqk,nk->nq",
+                                linear[of].J_element,
+                                motion[problem.factor(of).element],
+                            )
+                            for of in share
+                        }
+                    )
+                by = {of: np.stack([one[of] for one in moved], axis=-1) for of in share}
+                joints.append(_Hypothesis("joint", f"{name}.{side}", "m", by, share, True))
+            yield joints
+
+    def of_screws(self) -> Iterator[list[_Hypothesis]]:
+        """Yield errors once a turn of the screws of each motor that slides, of usual leads."""
+        problem, course = self.problem, self.course
+        readings, reading = problem.readings, problem.readings.reading
+        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
+        group = (
+            np.arange(course.n_blocks) * min(_COARSE, course.n_blocks) // max(course.n_blocks, 1)
+        )
+        coarse = np.equal(group[:, None], np.unique(group)).astype(np.float64)
+        share = {"readings": course.of_poses(readings.pose) @ coarse}
+        for j in np.unique(readings.leg).tolist():
+            leg = problem.legs.nominal[j]
+            if leg.reads_angle:
+                continue
+            by_error = -readings.sign * whitening * (readings.leg == j)
+            turns = [math.tau * reading / (1e-3 * lead) for lead in _LEADS]
+            once_a_turn = (np.column_stack([np.cos(turn), np.sin(turn)]) for turn in turns)
+            yield [
+                _Hypothesis(
+                    "eccentricity",
+                    leg.motor_label,
+                    "m",
+                    {"readings": by_error[:, None, None] * by[:, None]},
+                    share,
+                    False,
+                )
+                for by in once_a_turn
+            ]
+
+    def scores(self, hypotheses: Sequence[_Hypothesis]) -> _Scores:
+        """Compute the scores of hypotheses."""
         columns, c = list[IntArray](), 0
         for hypothesis in hypotheses:
             seen = _blocks_of(hypothesis)
@@ -836,11 +763,96 @@ class _Scores:
                     of_factor[:, :, column[k][blocks]] = (
                         values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
                     )
-        return cls(Scores.of(problem, linear, normal, stacked), columns)
+        return _Scores(Scores.of(self.problem, self.linear, self.normal, stacked), columns)
 
-    def given(self, number: _Solved) -> _Scores:
-        """Return the scores given a number that the fit lacks."""
-        return replace(self, scores=self.scores.given(number.estimated))
+    def better(self, least: float, by_scatter: float) -> _Solved | None:
+        """Return a joint that moved or an error once a turn that explains more than what was found.
+
+        In squares: *least* in units of the scatter that a number leaves behind, *by_scatter* in
+        those of the covariances of outlines.
+        """
+        best, asked = None, 0
+        for hypotheses in (*self.of_joints(), *self.of_screws()):
+            scores = self.scores(hypotheses)
+            for place, hypothesis in enumerate(hypotheses):
+                for test in self.course.tests(place, hypothesis):
+                    solved = scores.solved(test)
+                    asked += 1
+                    if solved.explains > least and solved.explains * solved.scatter > by_scatter:
+                        least, best = solved.explains, solved
+        return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
+
+    def finding(self, number: _Solved, measurements: Measurements, n_tests: int) -> Finding:
+        """Return a number that the fit lacks."""
+        test, hypothesis = number.test, number.test.of
+        holds = test.holds.astype(np.float64)[:, None]
+        return Finding(
+            hypothesis.kind,
+            hypothesis.subject,
+            *_size(number),
+            test.between,
+            number.p_value * n_tests,
+            self._effect(hypothesis, holds, number.amount[:, None]),
+            _side(measurements, self.course, test),
+        )
+
+    def scattering(self, noise: _Scatter, hypotheses: Sequence[_Hypothesis]) -> Finding:
+        """Return how much readings or a camera scatter."""
+        unit = "rad" if noise.kind == "vibration" else hypotheses[noise.group[0][0]].unit
+        steps = [
+            self._effect(
+                hypotheses[i],
+                np.diag(noise.further * sigma),
+                np.eye(next(iter(hypotheses[i].columns.values())).shape[2])[:, [row]]
+                * np.ones(len(sigma)),
+            )
+            for (i, row), sigma in zip(noise.group, noise.sigma, strict=True)
+        ]
+        sigma_of_ratio = 0.5 * noise.spread * noise.further**2 / noise.ratio
+        return Finding(
+            noise.kind,
+            noise.subject,
+            unit,
+            noise.ratio * noise.stated,
+            sigma_of_ratio * noise.stated,
+            None,
+            noise.p_value,
+            np.hstack(steps),
+            stated=noise.stated,
+        )
+
+    def _effect(self, hypothesis: _Hypothesis, holds: Array, amount: Array) -> Array:
+        """Return errors of the kinematic parameters (p, c) by numbers (d, c) that the fit lacks.
+
+        *holds* (n_blocks, c) has the part of each number in the blocks of images.
+        """
+        changes = {
+            name: (values @ amount) * (hypothesis.share[name] @ holds)[:, None]
+            for name, values in hypothesis.columns.items()
+        }
+        steps = response(self.problem, self.linear, self.normal, changes)
+        return kinematic_steps(self.problem, steps)
+
+
+def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
+    """Return how far readings are from those of the pose before, zero for first poses."""
+    keys = zip(leg.tolist(), row.tolist(), strict=True)
+    reading = dict(zip(keys, q.tolist(), strict=True))
+    previous = np.where(row >= 0, before[row], -1).tolist()
+    return np.array(
+        [
+            x - reading.get((j, last), x) if last >= 0 else 0.0
+            for x, j, last in zip(q.tolist(), leg.tolist(), previous, strict=True)
+        ]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Rao's scores of all hypotheses in each block of images."""
+
+    scores: Scores
+    column: Sequence[IntArray]  # (d, n_blocks) columns of each hypothesis, -1 without any
 
     def of_single(
         self, group: Sequence[tuple[int, int]], sigma: Sequence[Array]
@@ -862,7 +874,7 @@ class _Scores:
 
     def solved(self, test: _Test) -> _Solved:
         """Estimate the number of a test."""
-        column = self.column[test.hypothesis]
+        column = self.column[test.place]
         used = column >= 0
         number, block = np.nonzero(used)
         chosen = (number[:, None] == np.arange(len(column))) & test.holds[block][:, None]
@@ -874,17 +886,18 @@ class _Scores:
         ratio = left.score[tested] ** 2 / variance[tested]
         scatter = max(float(ratio.mean()), 1.0) if len(ratio) else 1.0
         rank, square = found.rank, found.square / scatter
-        if test.has_levels:
+        if test.of.kind == "drift":  # all numbers but the first are levels that may be anything
             variance_of_first = max(
                 float(found.covariance[0, 0]) * scatter, np.finfo(np.float64).tiny
             )
             rank, square = min(rank, 1), float(found.amount[0]) ** 2 / variance_of_first
-        return _Solved(found._replace(columns=column[used]), rank, square, scatter)
+        return _Solved(test, found._replace(columns=column[used]), rank, square, scatter)
 
 
 class _Solved(NamedTuple):
     """The number of a test by its score."""
 
+    test: _Test
     estimated: Estimated
     rank: int  # directions of the number that are tested
     square: float  # of the score, in units of its scatter
@@ -961,11 +974,6 @@ class _Scatter:
         """Standard deviation of readings over the stated one."""
         return math.hypot(1.0, self.further)
 
-    @property
-    def sigma_of_ratio(self) -> float:
-        """Standard deviation of the ratio."""
-        return 0.5 * self.spread * self.further**2 / self.ratio
-
     @classmethod
     def of(
         cls,
@@ -1020,22 +1028,3 @@ class _Scatter:
             sigmas,
             float(np.median(stated)),
         )
-
-
-def _effect(
-    problem: FitProblem,
-    linear: Linearization,
-    normal: NormalEquations,
-    hypothesis: _Hypothesis,
-    holds: Array,
-    amount: Array,
-) -> Array:
-    """Return errors of the kinematic parameters (p, c) by numbers (d, c) that the fit lacks.
-
-    *holds* (n_blocks, c) has the part of each number in the blocks of images.
-    """
-    changes = {
-        name: (values @ amount) * (hypothesis.share[name] @ holds)[:, None]
-        for name, values in hypothesis.columns.items()
-    }
-    return kinematic_steps(problem, response(problem, linear, normal, changes))

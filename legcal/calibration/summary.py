@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ import numpy as np
 
 from legcal.calibration.documents import (
     BoardBlock,
+    FrameMark,
     Holdout,
     NoSteps,
     Observations,
@@ -19,20 +21,108 @@ from legcal.calibration.documents import (
     Result,
     WorkspaceAccuracy,
 )
-from legcal.calibration.link_joints import joints_title, mark_in_words
-from legcal.calibration.quantities import (
-    FRAMES,
-    Quantity,
-    joints_of,
-    mm_deg,
-    parameters_of,
-    turns_of,
-)
 from legcal.data.reasons import reason_in_words
+from legcal.files.quantity import SHOWN_IN
+from legcal.machine.leg import ParameterId
 from legcal.machine.parameters import list_in_words
+from legcal.machine.rods import AT_ZERO
 from legcal.pages.document import Number, Table
 from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
 from legcal.vision.board import Link
+
+FRAMES: dict[str, str] = {"base": "R_b", "platform": "R_e"}
+DIGITS = {"mm": 4, "deg": 4, "px": 3, "": 6}  # decimals by unit
+
+
+def mm_deg(dX_m: float, dE_rad: float) -> str:
+    """Return an error of the platform in words."""
+    return f"{1e3 * dX_m:.3f} mm / {math.degrees(dE_rad):.4f} deg"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number of a machine, and how well it is known."""
+
+    name: str  # as in result.json; ``leg1.base.x`` may be along x of the link or of R_b
+    frame: str  # a link, R_b or R_e; "" if independent of a frame
+    unit: str  # mm, deg, px or nothing
+    value: float
+    nominal: float | None = None  # None without a result
+    sigma: float | None = None  # None if not estimated
+    # estimated, fixed, weak, frame (zero by definition of it), derived (from estimated quantities),
+    # or model (without a result)
+    status: str = "model"
+    defines: FrameMark | None = None  # the part of its frame that the joint defines
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        frame: str,
+        unit: str,
+        numbers: tuple[float, float | None, float | None],
+        status: str = "model",
+        defines: FrameMark | None = None,
+    ) -> Quantity:
+        """Return a quantity from its value, nominal value and sigma in metres or radians."""
+        scale, shown = SHOWN_IN[unit]
+        value, *others = numbers
+        nominal, sigma = (None if x is None else scale * x for x in others)
+        return cls(name, frame, shown, scale * value, nominal, sigma, status, defines)
+
+    @property
+    def parameter(self) -> ParameterId:
+        """The parsed name."""
+        return ParameterId.parse(self.name)
+
+    @property
+    def change(self) -> float | None:
+        """Value minus nominal."""
+        return None if self.nominal is None else self.value - self.nominal
+
+    @property
+    def digits(self) -> int:
+        """The number of decimals that people are shown."""
+        return DIGITS[self.unit]
+
+
+def parameters_of(result: Result) -> list[Quantity]:
+    """Return the parameters of a result that tables have, joints and axes in R_b and R_e."""
+    return [
+        Quantity.of(
+            row.name, frame_of(row.name), row.unit, (row.value, row.nominal, row.sigma), row.status
+        )
+        for row in result.parameters
+        if row.is_shown
+    ]
+
+
+def frame_of(name: str) -> str:
+    """Return the frame of a parameter; "" if it has none."""
+    parameter = ParameterId.parse(name)
+    side = parameter.kind.removesuffix("_axis")
+    return FRAMES[side] if parameter.component and side in FRAMES else ""
+
+
+def joints_of(result: Result, *sides: Link) -> Iterator[Quantity]:
+    """Yield the coordinates of the joints in the links of the model."""
+    for side, block in result.links.items():
+        for joint in block.joints if side in (sides or FRAMES) else ():
+            for k, axis in enumerate("xyz"):
+                numbers = joint.xyz[k], joint.nominal[k], joint.sigma[k]
+                name = f"{joint.leg}.{side}.{axis}"
+                yield Quantity.of(name, block.link, "m", numbers, joint.status[k], joint.defines)
+
+
+def turns_of(result: Result) -> Iterator[Quantity]:
+    """Yield the turns of the axes of joints from the nominal ones, about the axes of the links."""
+    for side, block in result.links.items():
+        for turned in block.axes:
+            status = "fixed" if turned.sigma is None else "estimated"
+            for k, axis in enumerate("xyz"):
+                sigma = None if turned.sigma is None else turned.sigma[k]
+                name = f"{turned.leg}.{side}_axis.{axis}"
+                yield Quantity.of(name, block.link, "rad", (turned.turn[k], 0.0, sigma), status)
 
 
 @dataclass(frozen=True)
@@ -166,6 +256,15 @@ def _cell(column: str, x: Any, digits: int) -> str:
     return f"{x:{'+' if column == 'change' else ''}{'' if column == 'sigma' else 'z'}.{digits}f}"
 
 
+def mark_in_words(side: str, status: str, defines: FrameMark | None) -> str:
+    """Return the remark on a coordinate that is not simply estimated: ``defines R_b``."""
+    if status == "frame":
+        return f"defines {FRAMES[side]}"
+    if status == "estimated":
+        return "" if defines is None else f"{defines} of {FRAMES[side]}"
+    return status
+
+
 def tables(result: Result) -> list[tuple[str, ParameterTable]]:
     """Return what a result says of its parameters, each table with its title.
 
@@ -175,9 +274,10 @@ def tables(result: Result) -> list[tuple[str, ParameterTable]]:
     for side, block in result.links.items():
         joints = ParameterTable.of_joints(result, side).without("joint", "link", "unit")
         columns = tuple(f"in {FRAMES[side]}" if c == "in_frame" else c for c in joints.columns)
+        at_zero = AT_ZERO * (result.actuators is not None and side == "base")
         found.append(
             (
-                joints_title(side, block.link, result.actuators is not None),
+                f"Joints of the {side} in the link {block.link}{at_zero} [mm]",
                 replace(joints, columns=columns),
             )
         )
@@ -201,7 +301,8 @@ def fit_lines(result: Result, *, verbose: bool) -> list[str]:
     return [
         *(result.details if verbose else ()),
         *_observation_lines(result),
-        *_board_lines(result),
+        *_of_board("base", result.board),
+        *_of_board("platform", result.platform_board),
         *_steps_lines(result),
         _fit_line(result),
         *_direction_lines(result),
@@ -310,10 +411,6 @@ def _left_out_lines(seen: Observations) -> list[str]:
 
 _MAX_REASONS = 4
 _NONE = 5e-4  # [px, mm] and a tenth of it [deg]: would be shown as zero
-
-
-def _board_lines(result: Result) -> list[str]:
-    return [*_of_board("base", result.board), *_of_board("platform", result.platform_board)]
 
 
 def _of_board(link: Link, board: BoardBlock | None) -> list[str]:

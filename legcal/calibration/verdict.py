@@ -8,29 +8,27 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from legcal.calibration.clicks import click_notes
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import (
     CAMERA,
     TOLERANCE,
     Doubt,
+    click_notes,
     doubts_of,
     model_error,
-    no_improvement,
     nominal_lengths,
-    worst_first,
 )
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import HeldOut
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.only import GroupEstimate
-from legcal.calibration.quantities import mm_deg
 from legcal.calibration.result import REFUSED, Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
+from legcal.calibration.summary import mm_deg
 from legcal.data.corners import Corners
 from legcal.data.dataset import POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
@@ -57,7 +55,7 @@ def judge(
     notes: Sequence[str],
     *,
     corners: Corners | None = None,
-    held_out: HeldOut | None = None,
+    held_out: Holdout | None = None,
     diagnosis: Sequence[Diagnosis] = (),
     group: GroupEstimate | None = None,
 ) -> Calibration:
@@ -116,8 +114,12 @@ def judge(
         found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"
     of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
     if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
-        doubts = (*doubts, no_improvement(remedy or "take more images or better ones"))
-    verdict = _verdict(worst_first(doubts), found, remedy)
+        what = "a predicted improvement below two sigma is no improvement"
+        more = remedy or "take more images or better ones"
+        doubts = (*doubts, Doubt("no_improvement", what, more, is_grave=True))
+    # Grave ones first, then those of known effects, the largest first
+    doubts = tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
+    verdict = _verdict(doubts, found, remedy)
     causes = {finding.what for finding in session.findings}
     if any(doubt.what in causes or doubt.code in ("scale", "mistake") for doubt in doubts):
         # What a named cause does to cameras and readings accuses neither
@@ -239,11 +241,12 @@ def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
 def _share_of_scale(platform: PlatformAccuracy) -> str:
     """Return a clause on the scale where it is the largest part of the predicted error, or ""."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
-    parts = [e.error.mean_displacement for e in platform.effects if e.what == SCALE]
-    if not parts or 2.0 * parts[0] ** 2 < predicted**2:
+    scale = platform.effects.get(SCALE)
+    if scale is None or 2.0 * scale.mean_displacement**2 < predicted**2:
         return ""
     return (
-        f"the largest part of that is the scale of the machine ({1e3 * parts[0]:.3f} of "
+        "the largest part of that is the scale of the machine "
+        f"({1e3 * scale.mean_displacement:.3f} of "
         f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
     )
 
@@ -251,8 +254,8 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
 def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance) -> str:
     """Return a clause on what an error of all travel does, "" where that is negligible."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
-    parts = [effect.error for effect in platform.effects if effect.what == ALL_READINGS]
-    if not parts or parts[0].mean_displacement <= NEGLIGIBLE * predicted:
+    moved = platform.effects.get(ALL_READINGS)
+    if moved is None or moved.mean_displacement <= NEGLIGIBLE * predicted:
         return ""
     problem = solution.posterior.problem
     witnesses = scale_witnesses(problem)
@@ -262,7 +265,7 @@ def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: 
         f"the scale rests on {rests}an error of {problem.legs.sigma_travel:.2%} of the travel "
         f"(1 sigma{assumed}) "
         + ("" if len(witnesses) == 1 else "what these leave ")
-        + f"moves the platform by {mm_deg(parts[0].mean_displacement, parts[0].mean_rotation)}"
+        + f"moves the platform by {mm_deg(moved.mean_displacement, moved.mean_rotation)}"
     )
 
 

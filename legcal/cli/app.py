@@ -11,9 +11,10 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from legcal.cli.calibrate import calibrate
 from legcal.cli.machines import (
@@ -37,11 +38,49 @@ from legcal.version import __version__
 ISSUES = "the issue tracker of legcal"
 NO_COMMAND = "No command given: choose one of those above."
 
+
+class _PlainHelp:
+    """Help by panels in plain text, which loads neither rich nor pydantic."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters; flags that are not given are false."""
+        parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for parameter in parameters:
+            if getattr(parameter, "is_flag", False) and parameter.default is None:
+                parameter.default = False  # pydantic would be loaded to convert None
+        return parameters
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write options, and the commands of a group, by panel."""
+        panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            panel = "Arguments" if isinstance(parameter, TyperArgument) else "Options"
+            if (record := parameter.get_help_record(ctx)) is not None:
+                panels.setdefault(parameter.rich_help_panel or panel, []).append(record)
+        for name, command in getattr(self, "commands", {}).items():
+            text = command.get_short_help_str(1000)
+            panels.setdefault(command.rich_help_panel or "Commands", []).append((name, text))
+        for panel, rows in panels.items():
+            if rows:
+                with formatter.section(panel):
+                    formatter.write_dl(rows)
+
+
+class _Command(_PlainHelp, TyperCommand):
+    pass
+
+
+class _Group(_PlainHelp, TyperGroup):
+    pass
+
+
 app = typer.Typer(
     name="legcal",
     help="Calibrate parallel robots from photographs of their legs.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    cls=_Group,
+    rich_markup_mode=None,
 )
 
 
@@ -73,8 +112,8 @@ PANELS: dict[str, Sequence[Callable[..., None]]] = {
 }
 for panel, commands in PANELS.items():
     for command in commands:
-        app.command(command.__name__.rstrip("_"), rich_help_panel=panel)(command)
-app.add_typer(study, name="study", rich_help_panel="For programs")
+        app.command(command.__name__.rstrip("_"), cls=_Command, rich_help_panel=panel)(command)
+app.add_typer(study, name="study", cls=_Group, rich_help_panel="For programs")
 
 
 def _refuse_empty(words: Sequence[str]) -> None:
@@ -107,10 +146,11 @@ def _refuse_replaced(words: Sequence[str]) -> None:
 
 
 def _with_remedy(error: Exception) -> str:
-    """Return the message of typer on options and arguments, with a remedy; "" if there is none."""
+    """Return the message of typer on options and arguments, with a remedy."""
     message = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
-    if not message:
-        return ""
+    if message.startswith("Usage:"):  # the help of a group without a command
+        print(message, file=sys.stderr)
+        return NO_COMMAND
     context = getattr(error, "ctx", None)
     command = " ".join(["legcal", *context.command_path.split()[1:]]) if context else "legcal"
     return (
@@ -152,7 +192,7 @@ def run(*, as_json: bool) -> int:
             )
             return error.exit_code
         if isinstance(error, usage_error):
-            print_failure("UsageError", _with_remedy(error) or NO_COMMAND, as_json=as_json)
+            print_failure("UsageError", _with_remedy(error), as_json=as_json)
             return 2
         print(*map(printable, traceback.format_exc().split("\n")), sep="\n", file=sys.stderr)
         print_failure(

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,6 +25,9 @@ from legcal.cli.options import (
     show,
 )
 from legcal.errors import UsageError, printable
+
+if TYPE_CHECKING:
+    from legcal.machine.model import Machine
 
 _FAMILY = "Dimensions of --family"
 
@@ -129,10 +132,15 @@ def new(
             lambda: as_lines(lines),
         )
         return
-    model = description_of(table, dimensions)
-    created = create_model(model, output, force=force)
-    description = machine_document(created.machine)
-    description["diagnostics"] = [*model.notes, *description["diagnostics"]]
+    description: dict[str, Any] = {}
+
+    def shown(machine: Machine, notes: tuple[str, ...]) -> None:
+        description.update(machine_document(machine))
+        description["diagnostics"] = [*notes, *description["diagnostics"]]
+        if not as_json:
+            print_table(inspect_table(description))
+
+    created = create_model(description_of(table, dimensions), output, force=force, before=shown)
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     lines = (
         f"written: {paths['yaml']} {paths['urdf']}",
@@ -143,9 +151,7 @@ def new(
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report(
-            inspect_table(description), [Text(printable(line), overflow="ignore") for line in lines]
-        ),
+        lambda: report([Text(printable(line), overflow="ignore") for line in ("", *lines)]),
     )
 
 
@@ -249,7 +255,7 @@ def identify(
 ) -> None:
     """Report which parameters are identifiable, and how to make the others so."""
     from legcal.calibration.identify.identifiability import answer
-    from legcal.report.identify import identify_table
+    from legcal.report.machine import identify_table
 
     views = [text.split(",") for text in view or []]
     identified = answer(
@@ -329,18 +335,22 @@ def locate(
         write_located_model,
         write_location,
     )
+    from legcal.calibration.location.tool_poses import read_tool_poses
     from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
     from legcal.machine.loader import load_mechanism
-    from legcal.report.machine import location_table
+    from legcal.report.machine import location_table, poses_table
 
     def quantity(text: str | None, units: Mapping[str, float], option: str) -> float | None:
         return None if text is None else parse_quantity(text, units, option)
 
     LOCATION_FILE.check_place(output)
     machine = load_mechanism(model)
+    measured = read_tool_poses(poses, machine)
+    if not as_json:
+        print_table(poses_table(measured))
     location = locate.locate(
         machine,
-        poses,
+        measured,
         position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
         angle_sigma=quantity(angle_sigma, ANGLE, "--angle-sigma"),
         tool_position=None if tool_position is None else _point(tool_position),

@@ -170,14 +170,15 @@ def in_order(name: str) -> tuple[object, ...]:
 def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
     """Match photographs to rows: by name, else by time, else in order.
 
-    *photographs* are in the order of their names; *table* is for messages.
+    *photographs* are in the order of their names; *table* is for messages. A column that counts
+    the photographs of each view tells their order.
 
     Raises
     ------
     DatasetError
         If rows have no photograph, or more than one in a view.
     """
-    if any(row.image for row in rows):
+    if any(row.image for row in rows) and not _are_counted(rows, photographs):
         matching = _by_name(rows, photographs, table)
     elif any(row.time for row in rows):
         matching = _by_time(rows, photographs, table)
@@ -199,6 +200,19 @@ def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) ->
             f"no row and {'is' if is_single else 'are'} left out: {few(spare)}.",
         )
     return Matching(matching.pairs, matching.how, notes)
+
+
+def _are_counted(rows: Sequence[Row], photographs: Sequence[Photograph]) -> bool:
+    """Return whether images are counted, 1, 2, 3 in each view, and files not named by that."""
+    counts: dict[str, list[str]] = {}
+    for row in rows:
+        counts.setdefault(row.view, []).append(row.image.lstrip("0"))
+    if any(of_view != [str(k + 1) for k in range(len(of_view))] for of_view in counts.values()):
+        return False
+    if len(counts) > 1 and not any(_in_folder(p, view) for p in photographs for view in counts):
+        return True  # a number stands for several files
+    numbers = {image for of_view in counts.values() for image in of_view}
+    return 2 * len(numbers & {_number(p.name) for p in photographs}) <= len(numbers)
 
 
 def _path(text: str) -> str:

@@ -235,7 +235,7 @@ class ReadingsSheet:
         joint_of_column: dict[int, str] = {}
         for joint, leg in zip(self._joints, self.motors, strict=True):
             words = {split_heading(joint)[0], split_heading(leg.name)[0]}
-            columns_of_leg = [i for i in free if split[i][0] in words]
+            columns_of_leg = [i for i in free if any(_names(split[i][0], word) for word in words)]
             if len(columns_of_leg) > 1:
                 raise DatasetError(
                     f"{self.path}, header: the readings of leg '{leg.name}' could not be decided: "
@@ -313,6 +313,12 @@ class ReadingsSheet:
                 "The table could not be read: found --lengths and motors that move joints at A, "
                 "needed readings of these; leave out --lengths."
             )
+
+
+def _names(key: str, word: str) -> bool:
+    """Return whether a heading names a leg or its motor by a word, alone or as in tower A."""
+    before = key.removesuffix(word)
+    return key == word or (before != key and concepts(before) in (("leg",), ("rail",)))
 
 
 def _means(heading: str) -> str:

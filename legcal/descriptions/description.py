@@ -16,7 +16,7 @@ from legcal.errors import ModelError, Problems
 from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross, distance_to_line
-from legcal.geometry.motions import frame_on_points, motion_of
+from legcal.geometry.motions import frame_on_points, motion_of, pose_distance
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
@@ -340,6 +340,8 @@ def wrong_axes(
 
 
 TRIALS = 40
+APART = 0.1  # least distance of two poses that are not the same [sizes of the machine, rad]
+LIKELY = 1.2  # turn of a pose that is as likely as home, relative to that of home
 CLOSED = 1e-10  # largest residual of a closed pose, relative to the size of the machine
 ROUNDING = 1e-13
 MAX_HOME_RESIDUAL = 0.01  # of a stated home, relative to the size; rounded digits give less
@@ -382,7 +384,7 @@ class Assembled(Description):
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
     _refuse(wrong_sizes(described))
-    home = home_of_description(described)
+    home, notes = home_of_description(described)
     T = home.motion()
     readings = _readings_at_home(described, T)
     A = np.array([_at(leg, readings) for leg in described.legs])
@@ -406,6 +408,7 @@ def assemble(described: Description) -> Assembled:
     frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
     at_home = {name: readings[name] for name in described.home_readings}
     numbers = {"legs": tuple(legs), "home": home, "base_frame": frame, "home_readings": at_home}
+    numbers["notes"] = (*described.notes, *notes)
     return Assembled(**(vars(described) | numbers), planar=planar)
 
 
@@ -508,37 +511,35 @@ def _refuse(problems: list[str]) -> None:
         raise ModelError(problems)
 
 
-def home_of_description(described: Description) -> Home:
+def home_of_description(described: Description) -> tuple[Home, list[str]]:
     """Return a pose in which a machine closes, projected onto what its legs keep constant.
 
     If no home is given, all motors are at the middle of their travel; among such poses the one with
     the smallest rotation of the platform is taken, and of mirror images in the plane of the base
-    joints the one on the positive side of z.
+    joints the one on the positive side of z. A note names another pose that is as likely.
     """
     if described.home is not None:
-        equations, T = _ClosingEquations(described, mid_travel=False), described.home.motion()
-        if equations.residual(T) < ROUNDING:
-            return described.home
-        if equations.residual(T) < MAX_HOME_RESIDUAL:
-            T = equations.nearest(T)
-        if equations.residual(T) < CLOSED:
-            return _written(T)
-        raise ModelError(
-            [
-                f"{described.source}: home could not be used: found {residual} there, needed a "
-                "pose in which the machine closes; correct home, lengths or axes."
-                for residual in equations.describe(described.home.motion())
-            ]
-        )
+        return _project(described, described.home), []
     closure = _ClosingEquations(described, mid_travel=True)
-    home = _search(closure, turning=False) or _search(closure, turning=True)
-    if home is None:
+    homes = _search(closure, turning=False) or _search(closure, turning=True)
+    if not homes:
         raise ModelError(
             f"{described.source}: no home was found: no pose has all motors at the middle of "
             "their travel with their axes in place, needed a pose in which the machine closes; "
             "write home, or correct the joints, offsets or travel."
         )
-    return home
+    poses = [home.motion() for home in homes[:2]]
+    where = [
+        f"({', '.join(f'{round(1e3 * x) + 0:d}' for x in T.translation)}) mm, turned by "
+        f"{round(T.rotation.as_euler('ZYX', degrees=True)[0]) + 0:d} deg about z"
+        for T in poses
+    ]
+    note = (
+        f"Two poses have all motors at mid-travel: home is {' and not '.join(where)}. If yours is "
+        "the other, give --height, or in the table home (YAML) or the joints of the platform as "
+        "they are at home in the base link ('B1 (home)')."
+    )
+    return homes[0], [note] if len(homes) > 1 else []
 
 
 class _ClosingEquations:
@@ -722,8 +723,26 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
     return readings
 
 
-def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
-    """Return the best pose that seeded starts lead to, None if none closes."""
+def _project(described: Description, home: Home) -> Home:
+    """Return the closed pose nearest to home."""
+    closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
+    if closure.residual(T) < ROUNDING:
+        return home
+    if closure.residual(T) < MAX_HOME_RESIDUAL:
+        T = closure.nearest(T)
+    if closure.residual(T) < CLOSED:
+        return _written(T)
+    raise ModelError(
+        [
+            f"{described.source}: home could not be used: found {residual} there, needed a pose in "
+            "which the machine closes; correct home, lengths or axes."
+            for residual in closure.describe(home.motion())
+        ]
+    )
+
+
+def _search(closure: _ClosingEquations, *, turning: bool) -> list[Home]:
+    """Return the best pose that seeded starts lead to, and others that are as likely as home."""
     rng = np.random.default_rng(1965)
     centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
     n_trials = TRIALS if turning else 8
@@ -744,14 +763,17 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> Home | None:
     solution = solve(
         equations, postures_after, points, tolerance=1e-15, unit=closure.unit, damped=True
     )
-    best: tuple[float, RigidTransform] | None = None
+    closed, best = list[tuple[float, RigidTransform]](), list[tuple[float, RigidTransform]]()
     for pose in solution.points[solution.worst <= CLOSED, :12].reshape(-1, 3, 4):
         T = motion_of(pose[:, :3], pose[:, 3])
         below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
-        rank = 10.0 * below + float(T.rotation.magnitude())
-        if best is None or rank < best[0] - 1e-6:
-            best = rank, T
-    return None if best is None else _written(closure.nearest(best[1]))
+        closed.append((10.0 * below + float(T.rotation.magnitude()), T))
+    for rank, T in sorted(closed, key=lambda entry: round(entry[0], 6)):
+        upright = rank % 10.0 if T.translation[2] > -1e-9 else rank
+        apart = [max(np.divide(pose_distance(T, other), (closure.size, 1.0))) for _, other in best]
+        if not best or (min(apart) > APART and upright < LIKELY * best[0][0] + APART):
+            best.append((rank, T))
+    return [_written(closure.nearest(T)) for _, T in best]
 
 
 def _written(T: RigidTransform) -> Home:

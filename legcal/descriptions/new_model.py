@@ -590,23 +590,32 @@ class Created:
     notes: tuple[str, ...] = ()  # on what was assumed
 
 
-def create_model(described: Description, output: Path, *, force: bool = False) -> Created:
-    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine, and load them."""
+def create_model(
+    described: Description,
+    output: Path,
+    *,
+    force: bool = False,
+    before: Callable[[Machine, tuple[str, ...]], object] = lambda machine, notes: None,
+) -> Created:
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine, and load them.
+
+    ``before`` takes the machine and the notes on it once all is in order, before the files appear.
+    """
     machine = assemble(described)
     names = f"models/{machine.name}.yaml", f"urdf/{machine.name}.urdf"
     with new_files(output, "model", names, force=force) as temporary:
         for name, text in zip(names, (yaml_text(machine), urdf_text(machine)), strict=True):
             (temporary / name).parent.mkdir()
             (temporary / name).write_bytes(text.encode())
-        _load(temporary / names[0], temporary, machine.source)
+        before(_load(temporary / names[0], temporary, machine.source), machine.notes)
     yaml_path, urdf_path = (output / name for name in names)
     return Created(load_mechanism(yaml_path), yaml_path, urdf_path, machine.notes)
 
 
-def _load(path: Path, temporary: Path, source: str) -> None:
+def _load(path: Path, temporary: Path, source: str) -> Machine:
     """Load the files in the temporary folder; errors name the source instead."""
     try:
-        load_mechanism(path)
+        return load_mechanism(path)
     except LegcalError as error:
         raise error.told(
             lambda problem: _attributed_to_source(problem, temporary, source)

@@ -1,11 +1,11 @@
 """The table of a machine: YAML or CSV, read strictly, lengths in its stated unit.
 
 A CSV is converted to the mapping of the same table in YAML (:func:`read_columns`), which alone can
-describe motors that carry rods. Common headings
-are understood, in three layouts: a row for each leg (``bx by bz px py pz``, ``base_x``,
-``x_base``), a row with all joints (``B1x``), and a row for each joint (``B1, x, y, z``, or side
-and number in two columns; headings are optional there). If both A and B occur they are base and
-platform, as in the paper; otherwise B is the base and P, or T, the platform.
+describe motors that turn, or slide along anything but z. Common headings are understood, in three
+layouts: a row for each leg (``bx by bz px py pz``, ``base_x``, ``x_base``), a row with all joints
+(``B1x``), and a row for each joint (``B1, x, y, z``, or side and number in two columns; headings
+are optional there). If both A and B occur they are base and platform, as in the paper; otherwise B
+is the base and P, or T, the platform. ``B1 (home)`` is the joint at home, in the base link.
 
 The mapping is validated as a :class:`TableFile`, whose entries are checked against each other and
 converted to a :class:`Description` in metres, whose legs are checked against their types. An entry
@@ -364,11 +364,17 @@ def read_description(
             f"{path}: --platform-radius could not be used: found a table of joints, needed the "
             "configuration of a printer, or --family; write the joints in the table."
         )
+    notes = tuple[str, ...]()
     if _is_csv(path, content):
         try:
             table = read_columns(path, unit)
         except DatasetError as error:
             raise ModelError(error.facts) from error
+        if "actuators" in table:
+            notes = (
+                "Carriages slide along z of the base link, and joints on them are where they are "
+                "at reading 0: a table in YAML can say otherwise (actuators).",
+            )
         table["name"] = name or table["name"]
         if not is_plain_name(table["name"]) and name is None:
             raise ModelError(
@@ -400,7 +406,8 @@ def read_description(
             f"{path}: the unit could not be decided: found --unit {unit} and "
             f"{describe(table['unit'])} in the table, needed one of them; leave out --unit."
         )
-    return described_machine({**table, **given}, path)
+    described = described_machine({**table, **given}, path)
+    return replace(described, notes=(*described.notes, *notes))
 
 
 def _is_csv(path: Path, content: str) -> bool:
@@ -495,8 +502,8 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
             problems.add(
                 refused,
                 f"{on} and the type {type_}",
-                "actuators and hangs_on (of a table in YAML) for types that begin with the motor "
-                "of a rod (PSS, RSS, PRS), and for no others",
+                "actuators and hangs_on (in a CSV a column 'rail') for types that begin with the "
+                "motor of a rod (PSS, RSS, PRS), and for no others",
                 "correct them",
             )
         elif motor is not None and actuators[motor].turns is not (
@@ -662,6 +669,8 @@ def _description(file: TableFile, source: str) -> Description:
         if kind is LegKind.PASSIVE and offset is None and _is_pair(file.travel):
             limits = None  # a single pair means readings
         tube, rod = (radius.tube, radius.rod) if isinstance(radius, Radii) else (radius, radius)
+        if not type_.has_slider:  # one part, whatever it is called
+            tube, rod = tube or rod, rod or tube
         legs.append(
             LegEntry(
                 name, type_, kind,
@@ -782,7 +791,8 @@ _OF_CONCEPTS = {  # columns by what their headings speak of, legs and joints asi
         "length": ("rod length",),
         "min_length": ("min length", "short", "short length"),
         "max_length": ("max length", "long", "long length"),
-        "stroke": ("stroke", "length stroke"),
+        "stroke": ("stroke", "length stroke", "rail stroke", "reading"),
+        "rail": ("rail", "rail name", "rail number"),
         "travel_low": ("min reading", "min stroke"),
         "travel_high": ("max reading", "max stroke"),
         "radius": ("radius",),
@@ -809,7 +819,7 @@ _NUMBERS = (
 COLUMNS = (
     *(
         Column(name, "text", required=False)
-        for name in ("leg", "type", "kind", "unit", "platform_in")
+        for name in ("leg", "rail", "type", "kind", "unit", "platform_in")
     ),
     *(
         Column(
@@ -861,8 +871,18 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
             for radius, tube, rod in zip(*map(cells.numbers, _RADII), strict=True)
         ],
     }
+    rails = cells.texts("rail")
+    if any(rails):  # upright
+        ends = dict(zip(reversed(rails), reversed(document["travel"]), strict=True))
+        document["actuators"] = {
+            rail: {"direction": [0.0, 0.0, 1.0], "travel": ends[rail]}
+            for rail in dict.fromkeys(filter(None, rails))
+        }
+        pairs = zip(document["travel"], rails, strict=True)
+        document["travel"] = [travel if rail is None else None for travel, rail in pairs]
     optional: dict[str, Any] = {
         "legs": cells.texts("leg"),
+        "hangs_on": rails,
         "kinds": cells.texts("kind"),
         "offsets": cells.numbers("offset"),
         "lengths": cells.numbers("length"),
@@ -947,7 +967,11 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
             for size, unit in zip(sizes, units, strict=False)
         ]
         lines = _scaled(lines, factors)
+    at_home = any(map(_is_at_home, [*header, *(text for _, cells in lines for text in cells[:2])]))
     lines = [(number, [_column(text, names) for text in header]), *lines[1:]]
+    first = [cells[0] for _, cells in lines[1:]]
+    if lines[0][1][0] == "rod" and first == [str(k) for k in range(1, len(first) + 1)]:
+        lines[0][1][0] = "leg"  # the number of the rod, not its radius
     if {"x", "y"} <= set(lines[0][1]) and len(lines) > 1:
         lines = _from_points(lines, path)
     coordinates = [None if text in names else _place(text) for text in lines[0][1]]
@@ -958,7 +982,8 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
         named = zip(coordinates, lines[0][1], strict=True)
         header = [f"{sides[x[0]]}_{x[2]}" if x and x[2] else text for x, text in named]
         lines = [(number, header), *lines[1:]]
-    return _of_legs(lines, of_lengths[0] if of_lengths else "")
+    stated = {"unit": of_lengths[0] if of_lengths else "", "platform_in": "base" if at_home else ""}
+    return _of_legs(lines, stated)
 
 
 def _column(text: str, names: Sequence[str]) -> str:
@@ -985,14 +1010,21 @@ def _scaled(lines: Lines, factors: Sequence[Decimal]) -> Lines:
     return scaled
 
 
-def _of_legs(lines: Lines, unit: str) -> Lines:
-    """Return lines with diameters halved, strokes added, legs named, remarks gone."""
+def _of_legs(lines: Lines, stated: Mapping[str, str]) -> Lines:
+    """Return lines with diameters halved, strokes added, legs named, remarks gone.
+
+    ``stated`` holds columns to add, the same in all rows; empty ones are left out.
+    """
     (number, header), n = lines[0], len(lines[0][1])
     lines = _scaled(
         lines, [Decimal("0.5") if name in _DIAMETERS else Decimal(1) for name in header]
     )
+    on_rails = "rail" in header
     add_stroke = "stroke" in header and "min_length" in header and "max_length" not in header
     kept = [i for i, name in enumerate(header) if name != "note"]
+    added = {key: text for key, text in stated.items() if text and key not in header}
+    if on_rails and "stroke" in header and "travel_low" not in header:
+        added["travel_low"] = "0"
     below: Lines = []
     for line, cells in lines[1:]:
         if len(cells) == n:
@@ -1001,13 +1033,14 @@ def _of_legs(lines: Lines, unit: str) -> Lines:
                 cells[header.index("stroke")] = str(
                     Decimal(row["min_length"]) + Decimal(row["stroke"])
                 )
-            if leg := row.get("leg", ""):
-                cells[header.index("leg")] = f"leg{leg}" if leg.isdigit() else _plain(leg)
-            cells = [*(cells[i] for i in kept), *([unit] if unit and "unit" not in header else [])]
+            for key in {"leg", "rail"} & {*header}:
+                if name := row[key]:
+                    cells[header.index(key)] = f"{key}{name}" if name.isdigit() else _plain(name)
+            cells = [*(cells[i] for i in kept), *added.values()]
         below.append((line, cells))
     names = {**_DIAMETERS, **({"stroke": "max_length"} if add_stroke else {})}
-    header = [names.get(header[i], header[i]) for i in kept]
-    return [(number, [*header, *(["unit"] if unit and "unit" not in header else [])]), *below]
+    names |= {"stroke": "travel_high"} if on_rails else {}
+    return [(number, [*(names.get(header[i], header[i]) for i in kept), *added]), *below]
 
 
 def _plain(name: str) -> str:
@@ -1037,14 +1070,20 @@ def _place(text: str) -> tuple[str, str, str] | None:
     """
     found = concepts(text)
     letters = [x for x in found if x in _LETTERS]
-    sides = {x for x in found if x in ("base", "platform")} or set(letters)
+    sides = {x for x in found if x in ("base", "platform", "rail")} or set(letters)
     numbers, axes = [x for x in found if x.isdigit()], [x for x in found if x in _XYZ]
-    others = set(found) - {*sides, *letters, *numbers, *axes, "joint", "leg", "number", "name"}
+    known = {"joint", "leg", "number", "name", *(["home"] if "rail" not in sides else [])}
+    others = set(found) - {*sides, *letters, *numbers, *axes, *known}
     if len(sides) != 1 or max(len(letters), len(numbers), len(axes)) > 1 or others:
         return None
     if not numbers and not axes:
         return None
     return sides.pop(), "".join(numbers), "".join(axes)
+
+
+def _is_at_home(text: str) -> bool:
+    """Return whether a heading or a name is that of a joint as it is at home."""
+    return "home" in concepts(text) and _place(text) is not None
 
 
 def _joint(name: str) -> tuple[str, str] | None:
@@ -1055,8 +1094,8 @@ def _joint(name: str) -> tuple[str, str] | None:
 
 def _sides(words: Iterable[str]) -> dict[str, str]:
     """Return the side of each word; B is the platform if there is an A."""
-    platform = {"base": "base", "platform": "platform", "a": "base", "p": "platform"}
-    return platform | {"t": "platform", "b": "platform" if "a" in set(words) else "base"}
+    known = {"base": "base", "rail": "base", "a": "base", "platform": "platform", "p": "platform"}
+    return known | {"t": "platform", "b": "platform" if "a" in set(words) else "base"}
 
 
 def _from_one_row(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legcal.calibration.quantities import FRAMES, Quantity, parameters_of
+from legcal.calibration.summary import FRAMES, Quantity, parameters_of
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import Literal
 
@@ -378,6 +379,9 @@ WORDS: dict[str, str] = {
     "articulation rotule liaison centre center mitte",
     "leg": "leg legs strut struts cylinder cylinders actuator limb axis drive motor bein strebe "
     "stab zylinder aktuator aktor antrieb achse spindel jambe verin axe actionneur moteur",
+    "rail": "rail tower carriage column slide slider turm schiene saule schlitten wagen colonne "
+    "chariot glissiere",
+    "home": "home grundstellung ruhelage nullstellung referenzlage repos",
     "name": "name label id bezeichnung nom designation",
     "number": "number nr no num nummer numero #",
     "side": "side seite cote",
@@ -398,13 +402,14 @@ WORDS: dict[str, str] = {
     "tool": "tool tcp werkzeug outil",
     "note": "note notes remark remarks comment comments bemerkung bemerkungen kommentar remarque "
     "remarques commentaire",
-    "view": "view camera cam viewpoint station setup kamera ansicht stativ standort vue",
+    "view": "view camera cam viewpoint station setup place tripod kamera ansicht stativ standort "
+    "ort platz vue lieu",
     "image": "image img file filename photo photograph picture pic frame shot bild foto datei "
     "dateiname aufnahme cliche fichier",
     "pose": "pose poseid poselabel position pos stellung lage",
     "time": "time timestamp datetime date clock elapsed elapsedtime takenat zeit uhrzeit "
     "zeitstempel datum heure temps horodatage",
-    "": "of the at der die das des von bei am de du la le au",
+    "": "of the at in der die das des von bei am de du la le au",
     **{letter: letter for letter in ("x", "y", "z", "a", "b", "p", "t")},
 }
 _CONCEPTS = {word: concept for concept, words in WORDS.items() for word in words.split()}
@@ -558,7 +563,8 @@ def _cell_text(value: object) -> str:
 def _without_title(lines: Lines) -> Lines:
     """Return the headings and what is below, without titles above and remarks below.
 
-    These fill few cells. A line above headings that repeat (``X Y Z X Y Z``) names their groups.
+    These fill few cells. A line above headings that repeat (``X Y Z X Y Z``) names their groups,
+    and columns of its own where nothing is below.
     """
     widths = [sum(map(bool, cells)) for _, cells in lines]
     if max(widths, default=0) < 3:
@@ -567,16 +573,19 @@ def _without_title(lines: Lines) -> Lines:
     end = len(lines)
     while end > start + 1 and widths[end - 1] == 1 and not is_number("".join(lines[end - 1][1])):
         end -= 1
-    number, header = lines[start]
-    named = [name for name in header if name]
-    if start and widths[start - 1] > 1 and len({*named}) < len(named):
-        above, group = lines[start - 1][1], ""
-        above = above + [""] * (len(header) - len(above))
-        joined = []
-        for name, over in zip(header, above, strict=False):
-            group = over or group
+    for k in (start + 1, start):
+        if not 0 < k < end or widths[k - 1] < 2:
+            continue
+        (_, above), (number, header) = lines[k - 1 : k + 1]
+        repeated = {name for name in header if header.count(name) > 1} - {"", *_UNITS_BELOW}
+        if not repeated or any(map(is_number, header)):
+            continue
+        joined, group, before = list[str](), "", ""
+        for name, over in zip_longest(header, above, fillvalue=""):
+            is_inside = name and (name in repeated) is (before in repeated)
+            group, before = over or (group if is_inside else ""), name
             joined.append(f"{group} {name}".strip())
-        return [(number, joined), *lines[start + 1 : end]]
+        return [(number, joined), *lines[k + 1 : end]]
     return lines[start:end]
 
 

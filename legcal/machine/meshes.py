@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from legcal.geometry.motions import matrix_applied
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.urdf import origins_of
 
+_UNREADABLE = (ValueError, KeyError, IndexError, AttributeError, TypeError, OSError)
 GRAZING = 1e-5  # sine of the angle of a ray and a triangle below which the triangle hides nothing
 
 
@@ -36,21 +36,17 @@ def mesh_of_file(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArr
 
 @lru_cache(maxsize=512)  # a CAD export has hundreds, which are read for each part of a model
 def _loaded(urdf_path: Path, shape: tuple[tuple[str, str], ...]) -> tuple[Array, IntArray]:
-    """Return corners and triangles from the scene of yourdfpy of a URDF with one ``<mesh>``."""
-    from yourdfpy import URDF  # half a second: imported only for meshes
+    """Return corners and triangles of the scene in the file of a ``<mesh>``, scaled as it says."""
+    import trimesh  # half a second: imported only for meshes
 
-    robot = etree.Element("robot", {"name": "visual"})
-    visual = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
-    etree.SubElement(etree.SubElement(visual, "geometry"), "mesh", dict(shape))
     name = dict(shape).get("filename", "")
     try:
-        scene: Any = URDF.load(
-            io.BytesIO(etree.tostring(robot)),
-            filename_handler=lambda fname: str(mesh_file(urdf_path, fname)),
-        ).scene
-        mesh = scene.to_geometry()
+        scale = [float(text) for text in dict(shape).get("scale", "1").split()]
+        file = str(mesh_file(urdf_path, name))
+        scene: Any = trimesh.load_scene(file, ignore_broken=True, skip_materials=True)
+        mesh = scene.scaled(scale[0] if len(scale) == 1 else scale).to_geometry()
         vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
-    except (ValueError, KeyError, IndexError, AttributeError, TypeError, OSError) as error:
+    except (*_UNREADABLE, ImportError) as error:  # packages that few formats need
         reason = " ".join(str(error).split())
         raise ValueError(
             f"found a mesh file '{name}' that cannot be read ({reason}), needed a complete one; "

@@ -103,8 +103,9 @@ def _of_image(search: Search, placement: Placement, row: int) -> Outlines:
     ends = placement.A_base, placement.B_base
     legs = predict_legs_and_arms(camera, T, ends, search.cylinders, placement.arms, row)
     here = ends[0][row], ends[1][row]
+    (placed,) = PlacedOccluders.at(search.occluders, here[0][None], here[1][None])
     grey, tables = search.load(row), []
-    for seen in bodies_in_view(search.occluders, camera, T, here, search.wanted[view], legs):
+    for seen in bodies_in_view(bodies, placed, camera, T, here, search.wanted[view], legs):
         found = edges_of_body(grey, camera, seen)
         tables.append(_table(row, seen.leg, seen.body.link, camera, found))
     return join_outlines(tables)
@@ -117,27 +118,28 @@ class BodyInView(NamedTuple):
     body: Cylinder
     A: Array  # (3,) joints of the leg in the camera frame [m]
     B: Array
-    along: Array  # (n,) distances from A at which its axis is in view, a pixel apart [m]
+    along: Array  # (n,) distances from A at which its axis is in view, evenly apart in pixels [m]
     hidden: BoolArray  # (n,) which of them other things hide
 
 
 def bodies_in_view(
-    occluders: Sequence[Occluder],
+    bodies: Sequence[Sequence[Cylinder]],  # of each leg
+    placed: PlacedOccluders,  # in the base link
     camera: Camera,
     T_base_camera: RigidTransform,
     ends: tuple[Array, Array],  # A and B in the base link, (n_legs, 3) each [m]
     wanted: BoolArray,  # (n_legs,)
     legs: Sequence[PredictedLeg] = (),  # round parts that may hide bodies
+    step: int = 1,  # between points along a body [px]
 ) -> list[BodyInView]:
     """Return the bodies of wanted legs, as far as their axes are in view."""
     T = T_base_camera.as_matrix()
     A, B = ((X - T[:3, 3]) @ T[:3, :3] for X in ends)
-    (placed,) = PlacedOccluders.at(occluders, ends[0][None], ends[1][None])
     placed, shown = placed.before(T), []
-    for j, of_leg in enumerate(bodies_of(occluders, len(A))):
+    for j, of_leg in enumerate(bodies):
         for body in of_leg if wanted[j] else ():
-            along = _in_view(camera, A[j], B[j], body)
-            if len(along) < LEAST_BLOCKS * BLOCK:
+            along = _in_view(camera, A[j], B[j], body, step)
+            if len(along) * step < LEAST_BLOCKS * BLOCK:
                 continue
             P = A[j] + along[:, None] * ((B[j] - A[j]) / np.linalg.norm(B[j] - A[j]))
             every, reach = np.full(len(P), j), np.full(len(P), body.radius)
@@ -148,20 +150,38 @@ def bodies_in_view(
     return shown
 
 
-def predicted_edges(row: int, camera: Camera, seen: BodyInView, sigma_px: float) -> Outlines:
+def predicted_edges(
+    occluders: Sequence[Occluder],
+    views: Sequence[tuple[Camera, RigidTransform]],  # with T_base_camera
+    view: IntArray,  # (n_images,)
+    ends: tuple[Array, Array],  # A and B of each image in the base link, (n_images, n_legs, 3) [m]
+    wanted: BoolArray,  # (n_views, n_legs)
+    sigma_px: float,
+) -> Outlines:
+    """Return the edges of bodies in images, hidden by bodies of other legs alone."""
+    tables, bodies = list[Outlines](), bodies_of(occluders, wanted.shape[1])
+    placed = PlacedOccluders.at(occluders, *ends) if any(bodies) else ()
+    for row, here in enumerate(placed):
+        v, joints = int(view[row]), (ends[0][row], ends[1][row])
+        for body in bodies_in_view(bodies, here, *views[v], joints, wanted[v], step=BLOCK):
+            tables.append(_silhouette(row, views[v][0], body, sigma_px))
+    return join_outlines(tables)
+
+
+def _silhouette(row: int, camera: Camera, seen: BodyInView, sigma_px: float) -> Outlines:
     """Return the two edges of a body as its silhouette has them, where nothing hides it.
 
     The body counts as round: what a fit learns from edges does not depend on where they are.
     """
     first, last = longest_runs(~seen.hidden)
-    if last - first < LEAST_BLOCKS * BLOCK:
+    if last - first < LEAST_BLOCKS:
         return no_outlines()
     u = (seen.B - seen.A) / np.linalg.norm(seen.B - seen.A)
     axis = seen.A + seen.along[[first, last], None] * u
     beside = cross(u, axis.mean(axis=0))
     beside *= seen.body.radius / np.linalg.norm(beside)
     covariance = sigma_px**2 * np.eye(2)
-    length = float(last - first)
+    length = float(BLOCK * (last - first))
     edges = [
         BodyEdge(camera.project(axis + side * beside), covariance, np.nan, length, np.nan)
         for side in (-1.0, 1.0)
@@ -169,8 +189,8 @@ def predicted_edges(row: int, camera: Camera, seen: BodyInView, sigma_px: float)
     return _table(row, seen.leg, seen.body.link, camera, edges)
 
 
-def _in_view(camera: Camera, A: Array, B: Array, body: Cylinder) -> Array:
-    """Return the distances from A at which the axis of a body is in view, a pixel apart [m]."""
+def _in_view(camera: Camera, A: Array, B: Array, body: Cylinder, step: int) -> Array:
+    """Return the distances from A at which the axis of a body is in view, *step* pixels apart."""
     length = float(np.linalg.norm(B - A))
     first = 0.0 if body.side == "base" else length
     s = np.linspace(first + body.start, first + body.end, N_SAMPLES)
@@ -179,7 +199,7 @@ def _in_view(camera: Camera, A: Array, B: Array, body: Cylinder) -> Array:
     s, X = s[start : end + 1], X[start : end + 1]
     px = camera.distort(X[:, :2] / X[:, 2:])
     passed = np.cumsum([0.0, *np.linalg.norm(np.diff(px, axis=0), axis=1)])
-    return np.asarray(np.interp(np.arange(passed[-1]), passed, s))
+    return np.asarray(np.interp(np.arange(0.0, passed[-1], step), passed, s))
 
 
 def _table(row: int, leg: int, link: str, camera: Camera, edges: Sequence[BodyEdge]) -> Outlines:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.data.corners import Corners
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, are_of_bodies
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
@@ -24,7 +24,7 @@ from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg
 
-MarkKind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted", "pair", "corner"]
+MarkKind = Literal["edge 1", "edge 2", "axis", "body", "rejected", "predicted", "pair", "corner"]
 N_POINTS = 40  # of a curve
 
 Canvas = NDArray[np.uint8]
@@ -36,6 +36,7 @@ COLOURS: dict[MarkKind, tuple[int, int, int]] = {  # blue, green, red
     "edge 1": (80, 230, 60),
     "edge 2": (255, 170, 40),
     "axis": (0, 225, 255),
+    "body": (220, 220, 0),
     "rejected": (70, 70, 255),
     "predicted": (30, 150, 255),
     "pair": (255, 120, 230),
@@ -45,6 +46,7 @@ _MEANING: dict[MarkKind, str] = {
     "edge 1": "edge 1",
     "edge 2": "edge 2",
     "axis": "axis",
+    "body": "edge of a body",
     "rejected": "rejected",
     "predicted": "expected here, not found",
     "pair": "edge pair",
@@ -91,8 +93,10 @@ def marks_of_image(
 ) -> list[PartMarks]:
     """Return the drawings over an image, one for each part of a leg in it.
 
-    From its outlines and the predicted legs.
+    From its outlines, those of bodies as well, and the predicted legs.
     """
+    of_bodies = outlines.choose(are_of_bodies(outlines))
+    outlines = outlines.choose(~are_of_bodies(outlines))
     of_part = {(leg.leg, segment.link): leg for leg in predicted for segment in leg.segments}
     several = {leg.leg for leg in predicted if len(leg.segments) > 1}
     pairs: dict[tuple[int, str], list[int]] = {}
@@ -118,7 +122,14 @@ def marks_of_image(
         marks = tuple(mark for i in parts for mark in _prediction(camera, absent, i))
         if marks:
             found.append(PartMarks(leg_names[absent.leg], "", marks))
-    return found
+    edges = tuple(
+        Mark(
+            "body" if of_bodies.used[i] else "rejected",
+            _curve(camera, of_bodies.h[i], camera.undistort(of_bodies.ends[i])),
+        )
+        for i in range(len(of_bodies))
+    )
+    return [*found, PartMarks("", "", edges)] if edges else found
 
 
 def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
@@ -242,7 +253,8 @@ def draw(
     for part, marks in zip(parts, curves, strict=True):
         if part.name:
             _label(picture, places, part, marks, letter)
-    return np.vstack([picture, _legend(picture.shape[1], letter, width, caption, bool(corners))])
+    kinds = {mark.kind for mark in [*corners, *(mark for part in parts for mark in part.marks)]}
+    return np.vstack([picture, _legend(picture.shape[1], letter, width, caption, kinds)])
 
 
 def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
@@ -300,7 +312,7 @@ def _lettering(letter: float) -> tuple[float, int]:
     return letter / _LETTER, max(1, round(letter / 12.0))
 
 
-def _legend(width: int, letter: float, line: int, caption: str, has_corners: bool) -> Canvas:
+def _legend(width: int, letter: float, line: int, caption: str, kinds: set[MarkKind]) -> Canvas:
     """Return the strip below a picture: what it shows, and what the colours mean."""
     height = round(3.6 * letter)
     strip = np.full((height, width, 3), _DARK, dtype=np.uint8)
@@ -313,7 +325,7 @@ def _legend(width: int, letter: float, line: int, caption: str, has_corners: boo
     )
     x, y = letter, 2.9 * letter
     for kind, meaning in _MEANING.items():
-        if kind == "corner" and not has_corners:
+        if kind in ("body", "pair", "corner") and kind not in kinds:
             continue
         (w, _), _ = cv2.getTextSize(meaning, _FONT, _SMALLER * scale, thick)
         start = np.array([x, y - 0.3 * letter])

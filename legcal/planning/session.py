@@ -21,7 +21,7 @@ from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import PredictedNoise
-from legcal.calibration.quantities import mm_deg
+from legcal.calibration.summary import mm_deg
 from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.dataset_file import dataset_texts
 from legcal.data.measurements import reading_columns

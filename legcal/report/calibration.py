@@ -11,11 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.text import Text
 
-from legcal.calibration.documents import NextStep, PlatformBlock, Result, WorkspaceAccuracy
+from legcal.calibration.documents import (
+    ExplanationBlock,
+    NextStep,
+    PlatformBlock,
+    Result,
+    WorkspaceAccuracy,
+)
 from legcal.calibration.pipeline import exact_cameras
-from legcal.calibration.quantities import DIGITS, joints_of, parameters_of
 from legcal.calibration.summary import (
+    DIGITS,
     brief_sentences,
+    joints_of,
+    parameters_of,
     sentences,
     tables,
 )
@@ -27,7 +35,6 @@ from legcal.pages.document import Step, Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
-    from legcal.calibration.change_detection import Explanation
     from legcal.calibration.evaluation import Evaluation
     from legcal.calibration.result import Calibration
     from legcal.calibration.verification import Check
@@ -212,7 +219,7 @@ def check_summary(check: Check) -> Report:
     ]
     if movement.explanations:
         best, *others = movement.explanations
-        change, amount = best.change.what, _amount(best)
+        change, amount = best.what, _amount(best)
         if best.p_value < movement.significance:
             lines.append(
                 f"No single leg explains it; {change} explains most ({amount}; residual statistic "
@@ -220,17 +227,17 @@ def check_summary(check: Check) -> Report:
             )
         else:
             lines.append(f"It is explained by {change}: {amount}.")
-            named = ", ".join(other.change.what for other in others[:_EXPLANATIONS])
+            named = ", ".join(other.what for other in others[:_EXPLANATIONS])
             lines += [f"These images cannot distinguish that from: {named}."] if named else []
     style = "bold red" if movement.moved else "bold green"
     return report([*lines, Text(check.sentence, style=style)])
 
 
-def _amount(explanation: Explanation) -> str:
+def _amount(change: ExplanationBlock) -> str:
     """Return the amount of a change in words."""
-    change, parts = explanation.change, []
+    parts = []
     components = zip(change.components, change.units, change.links, strict=True)
-    numbers = zip(explanation.values.tolist(), explanation.sigma.tolist(), strict=True)
+    numbers = zip(change.values, change.sigma, strict=True)
     for (name, unit, link), (value, sigma) in zip(components, numbers, strict=True):
         scale, shown = SHOWN_IN[unit]
         digits = DIGITS[shown]

@@ -1,8 +1,9 @@
-"""Text reports of a machine, its camera, and the location of its base and tool."""
+"""Text reports of a machine, its camera, what is identifiable, and where base and tool are."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,25 @@ import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
+from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
+from legcal.machine.parameters import leg_labels, legs_in_words, list_in_words
 from legcal.pages.document import Table
-from legcal.report.render import Report, heading, report, table
+from legcal.report.render import Part, Report, heading, report, table
 
 if TYPE_CHECKING:
     from legcal.calibration.camera_calibration.document import CameraCalibration
     from legcal.calibration.camera_calibration.projection import CameraComparison
+    from legcal.calibration.identify.report import (
+        ConditionBlock,
+        Identifiability,
+        Ranks,
+        WeakDirection,
+    )
     from legcal.calibration.location.document import Location
+    from legcal.calibration.location.tool_poses import ToolPoses
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
 _WIDTH = 80  # characters of a terminal
@@ -29,6 +39,7 @@ _PARTS = (
     ("left", "middle", "right"),
     ("bottom left", "bottom", "bottom right"),
 )
+_FIRST = 3  # tool poses shown before they are used
 _MAX_ROWS = 60  # rows of residuals shown; the file has all
 
 
@@ -196,6 +207,30 @@ def _length(leg: dict[str, Any]) -> str:
     return q0 if leg["kind"] == "constant" else f"{q0} {'+' if leg['sign'] > 0 else '-'} q"
 
 
+def understood(columns: Mapping[str, str], noun: str, unit: str) -> list[str]:
+    """Return lines on how the headings of a table and the unit of its readings were read."""
+    renamed = [f"{text} is {name}" for text, name in columns.items() if text != name]
+    return [
+        printable(f"Columns: {', '.join(renamed)}.") if renamed else "",
+        f"Unit of the {noun}: {unit}.",
+    ]
+
+
+def poses_table(poses: ToolPoses) -> Report:
+    """Return the interpretation of a table of tool poses: columns, unit, the first poses."""
+    rows = [
+        (str(number), *(f"{1e3 * x:z.3f}" for x in position), "yes" if oriented else "no")
+        for number, position, oriented in zip(
+            poses.numbers[:_FIRST], poses.position, poses.oriented, strict=False
+        )
+    ]
+    return report(
+        heading(printable(poses.source), f": {len(poses)} tool poses"),
+        understood(poses.columns, "readings", poses.unit),
+        table(">row", ">x [mm]", ">y [mm]", ">z [mm]", "orientation", rows=rows),
+    )
+
+
 def location_table(location: Location, written: Sequence[str]) -> Report:
     """Return base and tool with their residuals, in mm and degrees."""
     frames, sigma = [], location.sigma.reshape(2, 6)
@@ -353,3 +388,141 @@ def _model_and_sheet(calibration: CameraCalibration) -> str:
         f"{bend:.2g} +- {sigma:.2g} mm, and printed {wider:+.2g} +- {wider_sigma:.2g} % wider than "
         "high."
     )
+
+
+# legcal identify
+
+
+CONDITIONS = {
+    "eq12": "base joints and axes (12)",
+    "eq15": "offsets and lengths (15)",
+    "eq17": "platform joints (17)",
+    "every_leg_seen": "every leg seen",
+    "two_directions": "two directions of every leg",
+    "three_legs_at_once": "three legs at once (18, 19)",
+}
+_LEGEND = "length known: leg with an encoder (length = reading + offset), or of constant length"
+_SCALE = (
+    "readings are angles, and radii alone say how large the machine is, so that calibrate refuses "
+    "it until a length or radii are stated (--length, --set), or a board is seen"
+)
+_MAX_WEAK = 6  # directions shown
+_MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
+
+
+def identify_table(found: Identifiability) -> Report:
+    """Return an identifiability report as text, 80 columns wide."""
+    return report(
+        _heading(found),
+        [conditions_table(found.conditions, found.legs), Text(_LEGEND, style="dim")],
+        _weak(found.full) if found.full.weak else None,
+        _remedies(found) if found.remedies else None,
+        _verdict(found),
+    )
+
+
+def _heading(found: Identifiability) -> list[str]:
+    """Return the machine, views and boards of the report."""
+    space = "spatial" if found.spatial else "planar"
+    r = f", {found.r} with a revolute joint at the base" if found.r else ""
+    lines = [f"{space}, {found.n} legs ({found.n_ac} with known length{r})"]
+    labels = leg_labels(found.legs)
+    first = 0
+    for (view, images), group in groupby(zip(found.views, found.images, strict=True)):
+        last = first + len(list(group))
+        between = " and " if last == first + 2 else " to "
+        views_in_heading = (
+            f"view {last}" if last == first + 1 else f"views {first + 1}{between}{last}"
+        )
+        per_view = "" if last == first + 1 else " each"
+        legs = f"legs {', '.join(labels[name] for name in view)}" if view else "no leg"
+        lines.append(f"{views_in_heading}: {legs} in {images} image{'s' * (images != 1)}{per_view}")
+        first = last
+    if found.board:
+        lines.append("a calibration board on the base in every view")
+    if found.platform_board:
+        lines.append("a calibration board on the platform in every view")
+    return lines
+
+
+def conditions_table(conditions: Sequence[ConditionBlock], leg_names: Sequence[str]) -> Table:
+    """Return the paper's conditions."""
+    rows = []
+    for c in conditions:
+        failing = [leg_names.index(name) for name in c.failing or ()]
+        legs = f": {legs_in_words(failing, leg_names)}" if failing else ""
+        numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
+        remark = ", not needed with the board" if c.needed is False else ""
+        remark += ", by analogy" if c.by_analogy else ""
+        rows.append((CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
+    return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
+
+
+def _weak(ranks: Ranks) -> Table:
+    """Return the undetermined directions."""
+    rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MAX_WEAK]]
+    if len(ranks.weak) > _MAX_WEAK:
+        rows.append((f"and {len(ranks.weak) - _MAX_WEAK} more (see --json)", "", ""))
+    return table("undetermined combination", ">hides [mm]", ">[deg]", rows=rows)
+
+
+def _hidden(weak: WeakDirection) -> tuple[str, str]:
+    """Return the unobserved platform error of a direction with 1 mm in its largest component."""
+    if weak.dX_m is None or weak.dE_rad is None:
+        return "?", "?"
+    if weak.harmless:
+        return "harmless", ""
+    dX_mm, dE_deg = 1e3 * weak.dX_m, degrees(weak.dE_rad)
+    return (
+        f"{dX_mm:.2f}" if dX_mm < _MAX_MM else f"> {_MAX_MM:.0f}",
+        f"{dE_deg:.3f}" if dE_deg < _MAX_DEG else f"> {_MAX_DEG:.0f}",
+    )
+
+
+def _two_digits(value: float) -> str:
+    """Return a number with two significant digits, without exponent if it is large."""
+    return f"{float(f'{value:.2g}'):.12g}"
+
+
+def _remedies(found: Identifiability) -> Table:
+    """Return the remedies."""
+    n_parameters = found.full.of
+    rows = [
+        (
+            r.remedy,
+            f"{r.full_rank}/{n_parameters}",
+            "enough" if r.enough else "helps",
+        )
+        for r in found.remedies
+    ]
+    return table("remedy", ">rank", "", rows=rows)
+
+
+def _verdict(found: Identifiability) -> list[Part]:
+    """Return the verdict and the remedies."""
+    harmless = sum(weak.harmless for weak in found.full.weak)
+    determined = f"the joint fit determines {found.full.rank} of {found.full.of} parameters"
+    lines: list[Part] = []
+    if found.identifiable:
+        undetermined = (
+            f"; {harmless} undetermined directions do not move the platform" if harmless else ""
+        )
+        lines.append(f"Identifiable: {determined}{undetermined}.")
+        if found.scale_is_open:
+            lines.append(f"But for the scale: {_SCALE}.")
+    else:
+        lines.append(Text(f"NOT identifiable: {determined}.", style="bold"))
+    if found.platform_sigma is not None:
+        sigma = found.platform_sigma
+        expected = (
+            f"Predicted error of the platform (1 sigma): {_two_digits(1e3 * sigma.dX_m)} mm, "
+            f"{_two_digits(degrees(sigma.dE_rad))} deg."
+        )
+        lines.append(Text(expected, style="dim"))
+    if any(weak.dX_m is not None and not weak.harmless for weak in found.full.weak):
+        hidden = "hides: unobserved platform error if the largest component is 1 mm."
+        lines.append(Text(hidden, style="dim"))
+    failed = [CONDITIONS[c.name] for c in found.conditions if c.fails]
+    if failed:
+        lines.append(f"The paper's conditions fail: {list_in_words(failed)}.")
+    return [*lines, *(f"note: {note}" for note in found.notes)]

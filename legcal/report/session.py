@@ -19,7 +19,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
 from legcal.recordings.importing import Import
-from legcal.report.machine import scale_option
+from legcal.report.machine import scale_option, understood
 from legcal.report.render import Report, heading, report, table
 
 _MOST = 200  # largest number of rows shown
@@ -29,10 +29,8 @@ _LABELS = {
     "initial": "before",
     "literal": "steps as printed",
     "default": "weighted steps",
-    "fit": "joint fit",
-    "bound": "Cramer-Rao bound",
 }
-_COLUMNS = ("joints", ">dX [mm]", ">dE [deg]", ">parameters [mm]", ">of bound", ">runs")
+_COLUMNS = ("joints", ">dX [mm]", ">dE [deg]", ">parameters [mm]", ">runs")
 _LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 
 
@@ -54,8 +52,8 @@ def matching_table(new: NewDataset) -> Report:
     if len(pairs) > _MOST:
         rows.append(("...", "", f"{len(pairs) - _MOST} more", "", ""))
     counts = {view: new.views.count(view) for view in new.cameras}
-    columns = [f"{text} is {name}" for text, name in new.columns.items() if text != name]
     noun = "whole lengths of legs" if new.are_lengths else "readings"
+    unit_in_table = f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
         heading(
             printable(str(new.destination)),
@@ -63,8 +61,7 @@ def matching_table(new: NewDataset) -> Report:
             f"{len(joints)} encoders",
         ),
         [
-            printable(f"Columns: {', '.join(columns)}.") if columns else "",
-            f"Unit of the {noun}: {new.readings.unit}, {new.readings.unit_from}.",
+            *understood(new.columns, noun, unit_in_table),
             f"Photographs are matched {new.matching.how}.",
         ],
         table(
@@ -239,7 +236,7 @@ def study_table(document: Mapping[str, Any]) -> Report:
     rows, failures = [], []
     for is_coplanar in dict.fromkeys(row["coplanar"] for row in document["rows"]):
         joints = "coplanar" if is_coplanar else "non-coplanar"
-        rows.append((joints, *[""] * 5))
+        rows.append((joints, *[""] * 4))
         for row in (*document["initial"], *document["rows"]):
             if row["coplanar"] is not is_coplanar:
                 continue
@@ -250,7 +247,7 @@ def study_table(document: Mapping[str, Any]) -> Report:
                     f"{label}, {joints} joints: {row['failed']} of {row['runs'] + row['failed']} "
                     f"runs failed ({', '.join(row['failures'])}) and are not in the means."
                 )
-    rows.append(("paper, as printed", *[""] * 5))
+    rows.append(("paper, as printed", *[""] * 4))
     rows.append((" before", *_printed_cells(printed["initial"])))
     rows.append((" after", *_printed_cells(printed["calibrated"])))
     notes = [*failures, printed["note"], *document["readings"]]
@@ -260,13 +257,13 @@ def study_table(document: Mapping[str, Any]) -> Report:
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the figures of an estimator."""
     if not row["runs"]:
-        return ("all failed", "", "", "", "0")
-    is_bound = row["estimator"] == "bound"
+        return ("all failed", "", "", "0")
+    dX = row["dX_mm"]
+    digits = 3 if dX < _LARGE else 1
     return (
-        _with_sigma(row["dX_mm"], row["dX_mean_sigma_mm"], digits=3),
+        f"{dX:.{digits}f} +- {row['dX_mean_sigma_mm']:.{digits}f}",
         f"{row['dE_deg']:.4f}",
         _range(min(row["parameters_mm"]), max(row["parameters_mm"])),
-        "1" if is_bound else _with_sigma(row["of_bound"], row["of_bound_sigma"], digits=2),
         f"{row['runs']}",
     )
 
@@ -275,16 +272,10 @@ def _printed_cells(printed: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the figures of a row of the paper."""
     between = _range(*printed["parameters_mm"]) if "parameters_mm" in printed else ""
     runs = f"{printed.get('runs', '')}"
-    return (f"{printed['dX_mm']:g}", f"{printed['dE_deg']:g}", between, "", runs)
+    return (f"{printed['dX_mm']:g}", f"{printed['dE_deg']:g}", between, runs)
 
 
 def _range(lowest: float, highest: float) -> str:
     """Return the range of the errors of parameters."""
     digits = 3 if highest < _LARGE else 1
     return f"{lowest:.{digits}f} to {highest:.{digits}f}"
-
-
-def _with_sigma(mean: float, sigma: float, *, digits: int) -> str:
-    """Return a mean and its standard deviation; large ones with fewer digits."""
-    shown = digits if mean < _LARGE else digits - 2
-    return f"{mean:.{shown}f} +- {sigma:.{shown}f}"

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.corners import Corners, found_corners, join_corners
-from legcal.data.outlines import Outlines, join_outlines, no_outlines, unmeasured
+from legcal.data.outlines import Outlines, join_outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.errors import NotVisible, UsageError
 from legcal.geometry.lines import cross
@@ -25,7 +25,7 @@ from legcal.geometry.motions import matrix_applied
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg, cylinder_of_arm
 from legcal.machine.shapes import Occluder
-from legcal.perception.body_edges import bodies_in_view, bodies_of, predicted_edges
+from legcal.perception.body_edges import predicted_edges
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
 from legcal.vision.camera import Camera
@@ -275,19 +275,15 @@ def edges_of_bodies(
 ) -> Outlines:
     """Return the edges of the bodies of legs that images show, with errors."""
     images, tables = scene.images, list[Outlines]()
-    if not any(bodies_of(occluders, scene.A.shape[1])):
-        return no_outlines()
-    for row in range(len(images)):
-        view, pose = scene.views[images.view[row]], images.pose[row]
-        ends, every = (scene.A[pose], scene.B[pose]), np.ones(scene.A.shape[1], dtype=np.bool_)
-        T = view.T_base_camera
-        for body in bodies_in_view(occluders, view.camera, T, ends, every):
-            exact = predicted_edges(row, view.camera, body, 0.0)
-            if not len(exact):
-                continue
-            covariance = noise.covariance(float(exact.length[0]))
-            exact = replace(exact, covariance=np.tile(covariance, (len(exact), 1, 1)))
-            tables.append(noisy_outlines(exact, view.camera, rng) if noise.sigma_px else exact)
+    ends = scene.A[images.pose], scene.B[images.pose]
+    wanted = np.ones((len(scene.views), scene.A.shape[1]), dtype=np.bool_)
+    places = [(view.camera, view.T_base_camera) for view in scene.views]
+    exact = predicted_edges(occluders, places, images.view, ends, wanted, 0.0)
+    covariances = [noise.covariance(length) for length in exact.length.tolist()]
+    exact = replace(exact, covariance=np.array(covariances).reshape(-1, 2, 2))
+    for v, view in enumerate(scene.views):
+        of_view = exact.choose(images.view[exact.row] == v)
+        tables.append(noisy_outlines(of_view, view.camera, rng) if noise.sigma_px else of_view)
     return join_outlines(tables)
 
 

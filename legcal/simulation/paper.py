@@ -22,33 +22,19 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.special import elliprg
 
-from legcal.calibration.joint_fit.factors import average_images
-from legcal.calibration.joint_fit.fit import bound, refine
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.variables import (
-    FittedLegs,
-    Start,
-    cameras_from_hints,
-    platform_poses,
-    start_from,
-)
-from legcal.data.measurements import Measurements
-from legcal.data.outlines import LegAxes, axes_of_table, no_outlines
+from legcal.data.outlines import LegAxes, axes_of_table
 from legcal.errors import DidNotConverge, LegcalError, UsageError
 from legcal.files.folder import OutputKind, check_destination, result_folder
 from legcal.files.schema import Document, Number, SparseDocument
 from legcal.geometry.motions import look_at
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import BoolArray
 from legcal.machine.closing import solve_poses
-from legcal.machine.equations import pose_sensitivity
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, parameters_of_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
-from legcal.machine.rods import actuator_index, readings_of_rods
 from legcal.pages.svg import Bars, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
@@ -78,7 +64,6 @@ PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs in each vi
 RAISED = 0.030  # [m] height of raised joints above the plane of the others
 TRAVEL = (0.0, 0.140)  # [m] of every motor; the limits of the shipped model leave 4 mm more
 _DISTANCE = 0.9  # [m] approximate distance of cameras from the middle of the machine
-_WAY = (0.25, 0.5, 0.75)  # intermediate steps from home to the readings, as fractions
 _MAX_ERROR = 1e-12  # relative tolerance of leg lengths
 _MAX_ROUNDS = 100  # maximum rounds of drawing poses
 
@@ -146,7 +131,7 @@ class PaperStudy:
     n_poses: int = 15  # extreme poses of each camera position
     n_images: int = 3  # of each pose
     n_checked: int = 10  # random poses of eq (20)
-    estimators: tuple[str, ...] = ("literal", "default", "fit")  # the estimators compared
+    estimators: tuple[str, ...] = ("literal", "default")  # the estimators compared
 
     @property
     def name(self) -> str:
@@ -162,7 +147,7 @@ class PaperStudy:
             "raised": RAISED,
             "travel": list(TRAVEL),
             "views": [[f"leg{leg + 1}" for leg in legs] for legs in PAPER_VIEWS],
-            "estimators": [*self.estimators, BOUND],
+            "estimators": list(self.estimators),
         }
 
     def one_run(self, seed: np.random.SeedSequence) -> Record:
@@ -201,20 +186,14 @@ class PaperStudy:
         session = self.session(truth, paper_cameras(truth, rng), rngs)
         axes = axes_of_table(*axes_in_images(session.scene, self.noise, rngs["observations"]))
         checked = checked_poses(truth, initial, self.n_checked, rng)
-        covariance = bound_covariance(session, self.noise)
-        errors_by_estimator = {INITIAL: _errors(truth, initial, covariance, checked)}
+        errors_by_estimator = {INITIAL: _errors(truth, initial, checked)}
         for name in self.estimators:
             try:
                 legs = ESTIMATORS[name](session, axes, initial)
             except LegcalError as failure:
                 errors_by_estimator[name] = {"failure": failure_of(failure)}
             else:
-                errors_by_estimator[name] = _errors(truth, legs, covariance, checked)
-        sigma = np.sqrt(np.diagonal(covariance))
-        errors_by_estimator[BOUND] = asdict(expected_errors(truth, covariance, checked)) | {
-            "of_bound_squared": 1.0,
-            "parameters": (np.sqrt(2.0 / np.pi) * sigma).tolist(),
-        }
+                errors_by_estimator[name] = _errors(truth, legs, checked)
         return errors_by_estimator
 
 
@@ -235,24 +214,17 @@ def checked_poses(
     )
 
 
-def _errors(
-    truth: Machine, legs: Sequence[Leg], covariance: Array, checked: RigidTransform
-) -> Record:
+def _errors(truth: Machine, legs: Sequence[Leg], checked: RigidTransform) -> Record:
     """Return the errors of eq (20) and of every parameter, or the failure to compute them."""
     estimated, true = (
         to_vector(parameters_of_legs(some_legs), truth.frame_legs)
         for some_legs in (legs, geometries(truth))
     )
-    difference = estimated - true
-    squared = float(difference @ np.linalg.solve(covariance, difference)) / len(difference)
     try:
         errors = platform_errors(truth, legs, checked)
     except LegcalError as error:
         return {"failure": failure_of(error)}
-    return asdict(errors) | {
-        "of_bound_squared": squared,
-        "parameters": np.abs(difference).tolist(),
-    }
+    return asdict(errors) | {"parameters": np.abs(estimated - true).tolist()}
 
 
 # Errors of the platform, eq (20)
@@ -295,29 +267,6 @@ def poses_by_readings(
     return poses, np.asarray(solved.missed <= _MAX_ERROR * lengths.max(axis=1))
 
 
-def expected_errors(truth: Machine, covariance: Array, T_Rb_Re: RigidTransform) -> PlatformErrors:
-    """Return the expected errors of eq (20) for Gaussian parameters, to first order."""
-    legs, frame_legs = geometries(truth), truth.frame_legs
-    parametrization = parametrize(truth.leg_names, legs, frame_legs)
-    R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
-    motion = pose_sensitivity(legs, parametrization, frame_legs, R, t)
-    of_pose = motion @ covariance @ np.swapaxes(motion, -1, -2)
-    dX = float(expected_norm(of_pose[:, 3:, 3:]).mean())
-    dE = float(expected_norm(of_pose[:, :3, :3]).mean())
-    return PlatformErrors(dX, dE, dE)
-
-
-def expected_norm(covariance: Array) -> Array:
-    """Return the expected norm of Gaussian vectors with covariances (..., 3, 3).
-
-    The length of a Gaussian vector is a function of its direction times a chi-distributed number
-    of mean sqrt(8 / pi); the mean over directions is Carlson's elliptic integral R_G.
-    """
-    value = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
-    mean = elliprg(value[..., 0], value[..., 1], value[..., 2])
-    return np.asarray(np.sqrt(8.0 / np.pi) * mean)
-
-
 # Estimators: their inputs are measurements and axes of a session, and the initial legs
 
 
@@ -330,67 +279,18 @@ def four_steps(
     return run_steps(machine, axes, session.measurements, criteria=criteria).legs
 
 
-def one_fit(session: SimulatedSession, axes: LegAxes, initial: Sequence[Leg]) -> tuple[Leg, ...]:
-    """Return the legs of the joint fit, started from initial legs and rough cameras.
-
-    ``legcal calibrate`` also starts from the result of the steps and keeps the better fit; here the
-    fit is compared with the steps, and does not use them.
-    """
-    m, legs = session.measurements, _fitted(session.truth, initial)
-    start = nominal_start(legs, m, session.truth.T_base_Rb)
-    return refine(legs, m, no_outlines(), start, axes=average_images(axes, m)).legs
-
-
 Estimator = Callable[[SimulatedSession, LegAxes, Sequence[Leg]], Sequence[Leg]]
 ESTIMATORS: dict[str, Estimator] = {
     "literal": partial(four_steps, criteria="literal"),
     "default": partial(four_steps, criteria="default"),
-    "fit": one_fit,
 }
-
-
-def nominal_start(legs: FittedLegs, m: Measurements, T_base_Rb: RigidTransform) -> Start:
-    """Return nominal legs, moved from home to the readings, and the rough cameras."""
-    assert legs.home is not None
-    R, t = legs.home.rotation.as_matrix(), legs.home.translation
-    B = legs.home.apply([leg.B for leg in legs.nominal])
-    first = np.linalg.norm(B - [leg.A for leg in legs.nominal], axis=1)
-    first -= np.array([leg.q0 for leg in legs.nominal])
-    for j, a in enumerate(actuator_index(legs.nominal)):
-        if a >= 0:
-            first[j] = readings_of_rods(legs.nominal, R[None], t[None])[0, a]
-    wanted = legs.sign * m.q_of_poses
-    poses: Sequence[RigidTransform] = (legs.home,) * m.n_poses
-    for part in _WAY:
-        readings = first + part * (wanted - first)
-        poses = platform_poses(legs.nominal, readings, poses, legs.frame_legs)
-    cameras = cameras_from_hints(m, T_base_Rb)
-    return start_from(legs.nominal, m, legs, cameras, poses, "nominal")
-
-
-def bound_covariance(session: SimulatedSession, noise: TableNoise) -> Array:
-    """Return the Cramer-Rao bound of the parameters from all axes and all readings."""
-    truth = session.truth
-    exact = axes_of_table(*axes_in_images(session.scene, noise))
-    legs = _fitted(truth, geometries(truth))
-    m = session.measurements
-    problem = build_fit(legs, m, no_outlines(), axes=average_images(exact, m))
-    problem.require_determined()
-    cameras = [view.T_base_camera.inv() * truth.T_base_Rb for view in session.scene.views]
-    poses = platforms_in_base(truth, session.poses.poses)
-    return bound(problem, Start(legs.nominal, tuple(cameras), poses, "truth"))
-
-
-def _fitted(truth: Machine, legs: Sequence[Leg]) -> FittedLegs:
-    """Return legs in the form of the joint fit."""
-    return FittedLegs(truth.leg_names, tuple(legs), truth.frame_legs, {}, truth.home_of_frames)
 
 
 # Means over runs, and figure 4
 
 
-INITIAL, BOUND = "initial", "bound"
-SCALARS = ("dX", "dE", "angle", "of_bound_squared")
+INITIAL = "initial"
+SCALARS = ("dX", "dE", "angle")
 JOINTS = {"coplanar": "coplanar", "noncoplanar": "non-coplanar"}
 
 PRINTED_BEFORE = {"dX_mm": 1.0, "dE_deg": 0.12}
@@ -418,8 +318,7 @@ READINGS = (
     "poses differ.",
     '"randomly selecting configurations with extreme leg lengths": every leg at random within '
     "12 % of its travel from its shortest or its longest, reached from home without a singularity.",
-    '"three images are acquired" of each pose: each with its own noise. The fit and the bound use '
-    "the mean of a leg's axis in them, weighted by the covariances; it holds all that they tell.",
+    '"three images are acquired" of each pose: each with its own noise.',
     '"ten randomly chosen poses" of (20): leg lengths uniform in the travel, drawn anew in every '
     "run, of poses that the initial model reaches as well.",
     "(20) as printed: dX is the displacement of B_1 from A_1, dE the norm of the x-y-z Euler "
@@ -427,24 +326,16 @@ READINGS = (
     "The machine: the shipped hexapod, whose joints are coplanar, and the same with joints 2, 4 "
     "and 6 moved 30 mm out of the planes of 1, 3 and 5, with a travel of 140 mm; cameras stand "
     "0.9 m from its middle, and nothing hides the four legs that each sees.",
-    "joint fit: started from the initial model and from cameras up to 15 mm and 1.5 deg off, not "
-    "from what the steps find.",
-    "bound: the Cramer-Rao bound of the same data, all used at once; the table has the errors to "
-    "be expected of an estimator that reaches it. Errors of readings count as Gaussian there, "
-    "with the variance of the uniform ones.",
-    '"of bound": root mean square of the errors of all thirty parameters together, each measured '
-    "by the covariance of the bound of its run; 1 where it is reached. +- is one standard "
-    "deviation of the mean over runs.",
+    "+- is one standard deviation of the mean over runs.",
 )
 
-_DRAWN = {"literal": "steps as printed", "default": "weighted steps", "fit": "joint fit"}
+_DRAWN = {"literal": "steps as printed", "default": "weighted steps"}
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
 
 
-_FIGURES = ("dX_mm", "dE_deg", "angle_deg", "dX_mean_sigma_mm", "dE_mean_sigma_deg", "of_bound",
-            "of_bound_sigma")  # fmt: skip
+_FIGURES = ("dX_mm", "dE_deg", "angle_deg", "dX_mean_sigma_mm", "dE_mean_sigma_deg")
 _DEGREES = float(np.degrees(1.0))
-_SCALES = np.array([1e3, _DEGREES, _DEGREES, 1e3, _DEGREES, 1.0, 1.0])
+_SCALES = np.array([1e3, _DEGREES, _DEGREES, 1e3, _DEGREES])
 
 
 class EstimatorRow(Document):
@@ -458,28 +349,20 @@ class EstimatorRow(Document):
     angle_deg: Number | None
     dX_mean_sigma_mm: Number | None  # of the mean over the runs
     dE_mean_sigma_deg: Number | None
-    of_bound: Number | None  # rms error in units of the Cramer-Rao bound
-    of_bound_sigma: Number | None
     runs: int
     failed: int
     failures: dict[str, int]  # by kind of error
 
     @classmethod
     def of(cls, machine: str, estimator: str, records: Sequence[Record]) -> EstimatorRow:
-        """Return the means over the records of an estimator on a machine.
-
-        ``of_bound`` is the root mean square of the errors d of all n parameters, each measured by
-        the covariance C of the Cramer-Rao bound of its run, d' inv(C) d / n: 1 for an estimator
-        that reaches it. Its spread is far smaller than the spread of dX.
-        """
+        """Return the means over the records of an estimator on a machine."""
         good = [record for record in records if "failure" not in record]
         failures = Counter(r["failure"]["kind"] for r in records if "failure" in r)
         n, figures, parameters = len(good), dict[str, Any].fromkeys(_FIGURES), list[float]()
         if n:
             scalars = np.array([[record[name] for name in SCALARS] for record in good])
             mean, sigma = scalars.mean(axis=0), scalars.std(axis=0, ddof=min(n - 1, 1)) / np.sqrt(n)
-            ratio = np.sqrt(mean[3])
-            values = [mean[0], mean[1], mean[2], sigma[0], sigma[1], ratio, 0.5 * sigma[3] / ratio]
+            values = np.append(mean, sigma[:2])
             figures = dict(zip(_FIGURES, (_SCALES * values).tolist(), strict=True))
             parameters = (1e3 * np.mean([r["parameters"] for r in good], axis=0)).tolist()
         return cls(
@@ -544,7 +427,6 @@ class PaperDocument(Document):
                 for label, name in (
                     ("initial model", INITIAL),
                     (words, estimator),
-                    ("expected at the Cramer-Rao bound", BOUND),
                 )
             ]
             n_runs = shown.runs + shown.failed

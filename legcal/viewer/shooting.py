@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from legcal.calibration.quantities import mm_deg
+from legcal.calibration.summary import mm_deg
 from legcal.errors import LegcalError, printable
 from legcal.pages.document import Dialogue as DialogueBlock
 from legcal.pages.document import Page, Section, page_html

@@ -391,8 +391,11 @@ def image_size(content: bytes) -> ImageSize:
         raise BadImage(
             f"a {_FOREIGN_BRANDS[content[8:12]]} file, which cannot be read here", remedy=CONVERT
         )
-    else:
+    elif content.startswith(b"\0"):  # room that a program reserved before it copies
         raise BadImage("a file that is none of these")
+    else:
+        remedy = "save the photograph as PNG or JPEG, or remove the file"
+        raise BadImage("a file that is none of these, whatever its name", remedy=remedy)
     if problem := size_problem(size.width, size.height):
         raise BadImage(*problem)
     return size

@@ -45,11 +45,6 @@ _KNOWN = 2.5e-9  # mean leg lengths: of a radius that is known
 _VAGUE = RefinementSettings.radius_sigma / 2.0  # of the scale
 
 
-def is_of_arm(name: str) -> bool:
-    """Return whether a parameter is of the line of an arm."""
-    return ParameterId.parse(name).kind in ARMS
-
-
 @dataclass(frozen=True, eq=False)
 class Analysis:
     """Identifiability analysis of a session, computed lazily."""
@@ -77,7 +72,8 @@ class Analysis:
     def without_radii(self) -> Contributions:
         """The same if nothing is known of radii, and of lines of arms only what is stated."""
         choices, radii = self.choices, frozenset(self.session.radii)
-        arms = {n for n in self.session.fitted.parametrization.names if is_of_arm(n)}
+        names = self.session.fitted.parametrization.names
+        arms = {name for name in names if ParameterId.parse(name).kind in ARMS}
         open_arms = arms - choices.fixed - choices.priors.keys()
         open_choices = replace(
             choices,

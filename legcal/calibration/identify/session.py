@@ -19,6 +19,7 @@ from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
+    EDGE_SIGMA_PX,
     Contributions,
     PredictedNoise,
     information_of_images,
@@ -30,7 +31,7 @@ from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines, join_outlines, no_outlines
+from legcal.data.outlines import Outlines, join_outlines
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
@@ -57,7 +58,7 @@ from legcal.machine.rods import (
 )
 from legcal.machine.shapes import Occluder
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
-from legcal.perception.body_edges import bodies_in_view, bodies_of, predicted_edges
+from legcal.perception.body_edges import bodies_of, predicted_edges
 from legcal.vision.board import Board, FixedBoard, Link, facing_board
 from legcal.vision.camera import sample_camera
 from legcal.vision.visibility import Bodies, visible_parts
@@ -72,7 +73,6 @@ THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg lengt
 _BOARD = 0.5  # half side of a board on the platform, over the spread of its joints
 _SQUARES = 8  # along both of its sides
 _CORNER_PX = 0.1  # standard deviation of its corners
-EDGE_SIGMA_PX = 0.2  # of an edge of a body, at its ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,15 +152,10 @@ class Session:
 
     @cached_property
     def edges(self) -> Outlines:
-        """Edges of bodies of the legs that views show, hidden by bodies of other legs alone."""
-        B, tables = self.arm + self.t[:, None], list[Outlines]()
-        if not any(bodies_of(self.occluders, self.n_legs)):
-            return no_outlines()
-        for row, (v, pose) in enumerate(zip(self.view.tolist(), self.pose.tolist(), strict=True)):
-            camera, ends = self.cameras[v].camera, (self.A_at[pose], B[pose])
-            seen = bodies_in_view(self.occluders, camera, self.places[v], ends, self.seen[v])
-            tables += [predicted_edges(row, camera, body, EDGE_SIGMA_PX) for body in seen]
-        return join_outlines(tables)
+        """Edges of bodies of the legs that views show."""
+        views = [(view.camera, T) for view, T in zip(self.cameras, self.places, strict=True)]
+        ends = self.A_at[self.pose], (self.arm + self.t[:, None])[self.pose]
+        return predicted_edges(self.occluders, views, self.view, ends, self.seen, EDGE_SIGMA_PX)
 
     @cached_property
     def measurements(self) -> Measurements:

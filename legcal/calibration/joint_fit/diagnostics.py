@@ -68,11 +68,11 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
         return
     names = problem.choices.priors.keys()
     problems = [
-        f"The prior of {name} contradicts the measurements: prior {mean:.6g} +- {sigma:.2g} "
-        f"{problem.units[problem.named.index(name)]}, measurements about {estimate.value:.4g} "
-        f"{problem.units[problem.named.index(name)]}, {estimate.apart:.0f} standard deviations "
-        f"apart (limit {_SIGNIFICANT:g}); correct or remove the prior."
-        for name, mean, sigma, estimate in _contradicted(problem, state, normal, names)
+        f"The prior of {name} contradicts the measurements: prior {prior.mean:.6g} +- "
+        f"{prior.sigma:.2g} {problem.units[problem.named.index(name)]}, measurements about "
+        f"{estimate.mean:.4g} {problem.units[problem.named.index(name)]}, {apart:.0f} standard "
+        f"deviations apart (limit {_SIGNIFICANT:g}); correct or remove the prior."
+        for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
     ]
     if problems:
         raise DidNotConverge(problems)
@@ -88,24 +88,15 @@ def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalE
     names = board_of.keys() - problem.choices.priors.keys()
     problems = [
         f"The dimensions of the calibration board{board_of[name]} contradict the readings and the "
-        f"legs: the board is {estimate.value:.4g} times the size stated in the dataset "
-        f"({estimate.apart:.0f} standard deviations; assumed accuracy {1e2 * sigma:.2g} %); "
+        f"legs: the board is {estimate.mean:.4g} times the size stated in the dataset "
+        f"({apart:.0f} standard deviations; assumed accuracy {1e2 * prior.sigma:.2g} %); "
         "measure the board and correct its dimensions in dataset.yaml, or the scale of the "
         f"readings if the board is right, or estimate the size of the board (--set {name}=free)."
-        for name, _, sigma, estimate in _contradicted(problem, state, normal, names)
+        for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
         if estimate.sigma <= _MAX_SCALE_SIGMA
     ]
     if problems:
         raise DidNotConverge(problems)
-
-
-@dataclass(frozen=True)
-class EstimateWithoutPrior:
-    """The estimate of a parameter without its prior."""
-
-    value: float
-    sigma: float
-    apart: float  # distance from the prior, in standard deviations
 
 
 def _contradicted(
@@ -114,8 +105,10 @@ def _contradicted(
     normal: NormalEquations,
     names: Collection[str],
     most: float = _SIGNIFICANT,
-) -> Iterator[tuple[str, float, float, EstimateWithoutPrior]]:
-    """Yield priors of named unknowns that the measurements contradict: name, mean, sigma, estimate.
+) -> Iterator[tuple[str, Prior, Prior, float]]:
+    """Yield priors of named unknowns that the measurements contradict.
+
+    Each with its name, the estimate without it, and their distance in standard deviations.
 
     The unknown is estimated without its prior; measurements that hardly depend on it say nothing.
     For the information I of the measurements, an estimate at a distance d from the prior mean moves
@@ -134,8 +127,8 @@ def _contradicted(
         offset = (float(coordinates[i]) - mean) * (1.0 + 1.0 / (measured * sigma**2))
         apart = abs(offset) / float(np.sqrt(sigma**2 + 1.0 / measured))
         if apart > most:
-            estimate = EstimateWithoutPrior(mean + offset, float(measured**-0.5), apart)
-            yield problem.named[i], mean, sigma, estimate
+            estimate = Prior(mean + offset, float(measured**-0.5))
+            yield problem.named[i], Prior(mean, sigma), estimate, apart
 
 
 @dataclass(frozen=True)
@@ -500,9 +493,9 @@ def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquation
     radii = {radius_name(problem.legs.names[leg], part) for leg, part in problem.outlines.parts}
     names = radii - problem.choices.priors.keys()
     contradictions = [
-        f"{name} {1e3 * estimate.value:.2f} mm against {1e3 * mean:.2f} +- {1e3 * sigma:.2f} mm "
-        f"({estimate.apart:.0f} standard deviations)"
-        for name, mean, sigma, estimate in _contradicted(
+        f"{name} {1e3 * estimate.mean:.2f} mm against {1e3 * prior.mean:.2f} +- "
+        f"{1e3 * prior.sigma:.2f} mm ({apart:.0f} standard deviations)"
+        for name, prior, estimate, apart in _contradicted(
             problem, state, normal, names, RADIUS_SIGMAS
         )
     ]

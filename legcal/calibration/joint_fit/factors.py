@@ -1,4 +1,4 @@
-"""Measurements and their factors: outlines, edges of bodies, readings, axes, corners of boards.
+"""Measurements and their factors: outlines, edges of bodies, readings, corners of boards.
 
 Each kind is a class of arrays, one row per measurement, with its ``Factor``; :class:`Observed`
 registers the kinds. A measurement in an image depends on both ends of a leg in the camera frame,
@@ -22,7 +22,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, joints_of_le
 from legcal.calibration.joint_fit.variables import FittedLegs, State
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import LegAxes, Outlines, join_axes, polished_parts
+from legcal.data.outlines import Outlines, no_outlines, polished_parts
 from legcal.errors import Code, DatasetError, Problem
 from legcal.estimation.problem import Factor, Residuals, Touch
 from legcal.geometry.covariances import whitener
@@ -45,7 +45,6 @@ class Observed(NamedTuple):
 
     outlines: ObservedOutlines
     readings: Readings
-    axes: ObservedAxes
     edges: ObservedEdges  # of bodies
     corners: ObservedCorners  # of the board on the base
     platform_corners: ObservedCorners
@@ -57,7 +56,7 @@ class Observed(NamedTuple):
     @property
     def views(self) -> IntArray:
         """Indices of views with measurements."""
-        seen = (self.outlines, self.axes, self.edges, self.corners, self.platform_corners)
+        seen = (self.outlines, self.edges, self.corners, self.platform_corners)
         return np.unique(np.concatenate([kind.view for kind in seen]))
 
     @property
@@ -76,7 +75,6 @@ def observed_arrays(
     measurements: Measurements,
     legs: FittedLegs,
     outlines: Outlines,
-    axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     cameras: Sequence[Camera] | None = None,
     edges: Outlines | None = None,
@@ -86,7 +84,7 @@ def observed_arrays(
     Raises
     ------
     DatasetError
-        If an outline or an axis cannot be used.
+        If an outline cannot be used.
     """
     view_cameras = [view.camera for view in measurements.views]
     observed = observed_outlines(outlines, measurements, legs)
@@ -95,7 +93,6 @@ def observed_arrays(
     return Observed(
         observed,
         observed_readings(measurements, legs),
-        observed_axes(axes, measurements, legs),
         observed_edges(edges, measurements, legs, view_cameras if cameras is None else cameras),
         *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
     )
@@ -258,7 +255,7 @@ class ObservedOutlines:
 
         def predicted() -> tuple[Array, Array, _EndsInCamera, Array]:
             ends = _ends_in_camera(state, self.leg, self.view, self.pose, self.on_arm)
-            xy, by_key = self._feet, None
+            xy, by_key = np.ascontiguousarray(self.feet.T), None
             if keys:
                 moved, slopes = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
                 xy, by_key = np.ascontiguousarray(moved.T), slopes.transpose(3, 2, 1, 0)
@@ -276,11 +273,6 @@ class ObservedOutlines:
         return prediction
 
     @cached_property
-    def _feet(self) -> Array:
-        """Feet by coordinate and end, (2, 2, n)."""
-        return np.ascontiguousarray(self.feet.T)
-
-    @cached_property
     def _lens(self) -> Array:
         """Inverse transposed derivatives of pixels by row, column and end, (2, 2, 2, n)."""
         by_end = self.constants[:, :8].reshape(-1, 2, 2, 2)  # column by column
@@ -288,15 +280,8 @@ class ObservedOutlines:
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor, whitened by the claimed covariances."""
-        touches: tuple[Touch, ...] = (
-            ("legs", self.leg, _SIX),
-            ("camera_pose", self.view, _ALL),
-            ("radii", self.radius, _ONE),
-            ("biases", self.bias_index, _ONE),
-            ("cameras", self.view, _ALL),
-        )
-        if self.on_actuators:
-            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
+        own = ("radii", self.radius, _ONE), ("biases", self.bias_index, _ONE)
+        touches = _touches_of_legs(self, *own)
         whitening = whitener(self.covariance)
 
         def rows(state: State) -> Residuals:
@@ -515,20 +500,20 @@ class ObservedEdges:
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor."""
-        touches: tuple[Touch, ...] = (
-            ("legs", self.leg, _SIX),
-            ("camera_pose", self.view, _ALL),
-            ("leans", self.body, _ALL),
-            ("cameras", self.view, _ALL),
-        )
-        if self.on_actuators:
-            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
+        touches = _touches_of_legs(self, ("leans", self.body, _ALL))
         whitening = 1.0 / self.sigma[:, None, None]
 
         def rows(state: State) -> Residuals:
             return self.rows(keys, state)
 
         return Factor("edges", rows, touches, len(self), 1, self.pose, whitening, robust=True)
+
+
+def _touches_of_legs(seen: ObservedOutlines | ObservedEdges, *own: Touch) -> tuple[Touch, ...]:
+    """Return what measurements of legs in images depend on; *own* stand before the intrinsics."""
+    ends: tuple[Touch, ...] = ("legs", seen.leg, _SIX), ("camera_pose", seen.view, _ALL)
+    touches = (*ends, *own, ("cameras", seen.view, _ALL))
+    return (*touches, ("legs", seen.leg, _OF_ACTUATOR)) if seen.on_actuators else touches
 
 
 def observed_edges(
@@ -544,17 +529,14 @@ def observed_edges(
     DatasetError
         If the covariance of an edge is not positive definite.
     """
-    index = np.zeros(0, dtype=np.intp) if edges is None else np.flatnonzero(edges.used)
-    n, none = len(index), np.zeros(0, dtype=np.intp)
-    row = none if edges is None else edges.row[index]
-    leg = none if edges is None else edges.leg[index]
-    pixels = np.zeros((0, 2, 2)) if edges is None else edges.ends[index]
-    covariance = np.zeros((0, 2, 2)) if edges is None else edges.covariance[index]
+    edges = no_outlines() if edges is None else edges
+    index = np.flatnonzero(edges.used)
+    n, row, leg = len(index), edges.row[index], edges.leg[index]
+    pixels, covariance = edges.ends[index], edges.covariance[index]
     problems = _bad_covariances(covariance, row, leg, measurements, legs)
     if problems:
         raise DatasetError(problems)
-    links = () if edges is None else tuple(edges.part[i] for i in index.tolist())
-    keys = list(zip(leg.tolist(), links, strict=True))
+    keys = [(j, edges.part[i]) for i, j in zip(index.tolist(), leg.tolist(), strict=True)]
     bodies = tuple(sorted(set(keys)))
     body = np.array([bodies.index(key) for key in keys], dtype=np.intp)
     view = measurements.view[row]
@@ -721,95 +703,6 @@ def measured_lengths(names: Sequence[str], choices: Choices) -> MeasuredLengths:
         np.array([prior.mean for _, prior in stated]),
         np.array([prior.sigma for _, prior in stated]),
     )
-
-
-# ----------------------------------------------------------------------------------------- axes
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedAxes:
-    """The n measured axes of the fit."""
-
-    leg: IntArray  # (n,) indices
-    view: IntArray  # (n,) indices
-    pose: IntArray  # (n,) indices
-    M: Array  # (n, 3) a point of each axis in the camera frame [m]
-    basis: Array  # (n, 2, 3) unit vectors e1, e2 normal to the axis; its direction is e1 x e2
-    # (n, 4, 4) Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1,
-    # alpha2, beta1, beta2) [1/rad, 1/m]
-    whitening: Array
-    on_actuators: bool = False  # some joints at A move
-
-    def __len__(self) -> int:
-        return len(self.leg)
-
-    def rows(self, state: State) -> Residuals:
-        """Return alpha and beta (n, 4) with their derivatives."""
-        arm = np.zeros(len(self), dtype=np.bool_)
-        ends = _ends_in_camera(state, self.leg, self.view, self.pose, arm)
-        r, slope = axis_offsets(ends.A, ends.B, self.M.T, self.basis.T)
-        return Residuals(r.T, slope.T, ends.chain)
-
-    def factor(self, keys: tuple[str, ...]) -> Factor[State]:
-        """Return the factor; axes are in the camera frame and do not depend on intrinsics."""
-        del keys
-        touches: tuple[Touch, ...] = (("legs", self.leg, _SIX), ("camera_pose", self.view, _ALL))
-        if self.on_actuators:
-            touches = (*touches, ("legs", self.leg, _OF_ACTUATOR))
-        n, whitening = len(self), self.whitening
-        return Factor("axes", self.rows, touches, n, 4, self.pose, whitening, robust=True)
-
-
-def observed_axes(
-    axes: LegAxes | None, measurements: Measurements, legs: FittedLegs
-) -> ObservedAxes:
-    """Return measured axes as arrays.
-
-    Raises
-    ------
-    DatasetError
-        If the covariance of an axis is not positive definite.
-    """
-    if axes is None or len(axes) == 0:
-        none = np.zeros(0, dtype=np.intp)
-        return ObservedAxes(
-            none,
-            none,
-            none,
-            np.zeros((0, 3)),
-            np.zeros((0, 2, 3)),
-            np.zeros((0, 4, 4)),
-            legs.n_actuators > 0,
-        )
-    scale = np.sqrt(np.abs(np.einsum("nii->ni", axes.covariance)))
-    scale = np.where(scale > 0.0, scale, 1.0)  # rows in rad and m
-    correlation = axes.covariance / (scale[:, :, None] * scale[:, None, :])
-    least = np.linalg.eigvalsh(correlation)[:, 0]
-    problems = [
-        Problem(
-            f"The axis of {legs.names[axes.leg[i]]} in "
-            f"{measurements.image[axes.row[i]] or f'row {axes.row[i] + 1}'} could not be used",
-            "a covariance that is not positive definite",
-            remedy="correct its standard deviations",
-            code=Code.BAD_ROW,
-        )
-        for i in np.flatnonzero(~(least > 0.0))
-    ]
-    if problems:
-        raise DatasetError(problems)
-    whitening = whitener(correlation) / scale[:, None, :]
-    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
-    moves = legs.n_actuators > 0
-    return ObservedAxes(axes.leg, view, pose, axes.M, axes.basis, whitening, moves)
-
-
-def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
-    """Average the axes of each leg by pose and view, weighted by their covariances.
-
-    The mean is a sufficient statistic; the fit has fewer measurements.
-    """
-    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
-    return join_axes(axes, view * measurements.n_poses + pose)
 
 
 # -------------------------------------------------------------------------------------- corners
@@ -1029,37 +922,6 @@ def outline_offsets(
     np.einsum("ien,in->en", by_h, epsilon * across, out=by_leg[6])
     by_leg[6] += along * (radius * squared)
     return offset, by_leg, by_xy
-
-
-def axis_offsets(A: Array, B: Array, M: Array, basis: Array) -> tuple[Array, Array]:
-    """Return the errors of measured axes from predicted ones, and derivatives.
-
-    A measured axis passes through M along e1 x e2. alpha are the components of the predicted
-    direction along e1 and e2, over its component along the axis; beta is the intersection of the
-    predicted axis with the plane of e1 and e2 through M, relative to M [m].
-
-    Parameters
-    ----------
-    A, B, M : (3, n) array
-        Both ends and M in the camera frame [m].
-    basis : (3, 2, n) array
-        e1 and e2.
-
-    Returns
-    -------
-    r : (4, n) array
-        alpha1, alpha2, beta1, beta2.
-    by_ends : (6, 4, n) array
-        Derivatives by A and B.
-    """
-    leg, to_A, axis = B - A, A - M, _cross(basis[:, 0], basis[:, 1])
-    length, height = np.einsum("in,in->n", axis, leg), np.einsum("in,in->n", axis, to_A)
-    alpha = np.einsum("ien,in->en", basis, leg) / length
-    by_leg = (basis - alpha * axis[:, None]) / length
-    beta = np.einsum("ien,in->en", basis, to_A) - alpha * height
-    by_A = np.concatenate([-by_leg, (length + height) * by_leg], axis=1)
-    by_B = np.concatenate([by_leg, -height * by_leg], axis=1)
-    return np.concatenate([alpha, beta]), np.concatenate([by_A, by_B])
 
 
 def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""The joint fit (bundle adjustment): outlines in pixels or measured axes, readings and corners.
+"""The joint fit (bundle adjustment): outlines, readings and corners of boards.
 
 A first minimum with a wide robust loss, which outliers cannot lead astray; then rounds that
 estimate the noise of outlines, reject outliers, and fit the inliers again.
@@ -6,12 +6,14 @@ estimate the noise of outlines, reject outliers, and fit the inliers again.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from legcal.calibration.joint_fit.determinacy import (
+    HeldDirections,
     held_at_nominal,
     refuse_undetermined_inliers,
     undetermined_directions,
@@ -48,13 +50,11 @@ from legcal.calibration.joint_fit.variables import (
     State,
 )
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import LegAxes, Outlines, are_of_arms
+from legcal.data.outlines import Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize
-from legcal.estimation.solver import Minimum, information
-from legcal.estimation.uncertainty import named_covariance
-from legcal.geometry.types import Array
+from legcal.estimation.solver import Minimum, information, minimise
 from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
@@ -74,7 +74,6 @@ def refine(
     start: Start | Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
-    axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
     edges: Outlines | None = None,
@@ -96,9 +95,6 @@ def refine(
         Starting values.
     settings : RefinementSettings
         Settings of the fit.
-    axes : LegAxes, optional
-        Measured axes, in addition to outlines or instead of them (pass
-        :func:`legcal.data.outlines.no_outlines`). Their covariances are not re-estimated.
     board : BoardCorners, optional
         Calibration boards fixed to base and platform, and their corners in images.
     choices : Choices
@@ -115,16 +111,15 @@ def refine(
     NotIdentifiable
         If the data do not determine the parameters, from any start.
     DidNotConverge
-        If the solver does not converge from any start, or most outlines or axes are outliers of the
-        fit.
+        If the solver does not converge from any start, or most outlines are outliers of the fit.
     DatasetError
-        If an outline or an axis cannot be used.
+        If an outline cannot be used.
     """
     starts = [start] if isinstance(start, Start) else start
 
     def fitted(used: Outlines) -> Solution:
         problem = build_fit(
-            legs, measurements, used, settings, axes=axes, board=board, choices=choices, edges=edges
+            legs, measurements, used, settings, board=board, choices=choices, edges=edges
         )
         problem.require_determined()
         with explaining_missing_scale(problem):
@@ -219,7 +214,14 @@ def _fit_from_best_start(
             continue
         if solution.left_out or _common_mode_px(solution) > problem.settings.largest_rms_px:
             solution = _retry_from_other_starts(problem, outlines, start, minimum, solution)
-        _refuse_common_mode(solution, problem.settings.largest_rms_px)
+        shifted, most_px = _common_mode_px(solution), problem.settings.largest_rms_px
+        if shifted > most_px:
+            kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
+            raise DidNotConverge(
+                f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
+                f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or "
+                "start from a better nominal model."
+            )
         return dataclasses.replace(
             solution, notes=(*solution.notes, *notes), details=tuple(details)
         )
@@ -271,18 +273,6 @@ def _retry_from_other_starts(
 def _common_mode_px(solution: Solution) -> float:
     """Largest standard deviation of common-mode edge biases [px]."""
     return max(solution.quality.shared_px.values(), default=0.0)
-
-
-def _refuse_common_mode(solution: Solution, most_px: float) -> None:
-    """Raise DidNotConverge if common-mode edge biases are too large for light and blur."""
-    shifted = _common_mode_px(solution)
-    if shifted > most_px:
-        kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
-        raise DidNotConverge(
-            f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
-            f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or start "
-            "from a better nominal model."
-        )
 
 
 def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None) -> Minimum[State]:
@@ -367,29 +357,51 @@ def _refine_minimum(
     held = undetermined_directions(problem, first.state, normal)
     refuse_contradicted_board(problem, first.state, normal)
     without_held, state = problem, first.state
-    try:
-        if len(held.basis):
-            problem, state = held_at_nominal(problem, state, held)
-            continued = first_minimum(problem, state)
-            state = continued.state
-            first = dataclasses.replace(
-                continued, iterations=first.iterations + continued.iterations
-            )
-        fit = fit_in_rounds(problem, first)
-        normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-        refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
-        _refuse_other_radii(problem, fit.state)
-    except (DidNotConverge, NotIdentifiable) as failure:
-        refuse_contradicted_values(without_held, start, state, with_priors=True)
-        _refuse_contradicted(without_held, state)
-        _refuse_undetermined(without_held, state)
-        if isinstance(failure, DidNotConverge):
-            raise blaming_stated_values(without_held, failure) from None
-        raise
+    while True:
+        try:
+            if len(held.basis):
+                problem, state = held_at_nominal(without_held, state, held)
+                continued = first_minimum(problem, state)
+                state = continued.state
+                first = dataclasses.replace(
+                    continued, iterations=first.iterations + continued.iterations
+                )
+            fit = fit_in_rounds(problem, first)
+            normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
+            refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
+            _refuse_other_radii(problem, fit.state)
+            break
+        except (DidNotConverge, NotIdentifiable) as failure:
+            more = _open_farther_on(without_held, problem, state, len(held.basis))
+            if more is not None:
+                held = more
+                continue
+            refuse_contradicted_values(without_held, start, state, with_priors=True)
+            _refuse_contradicted(without_held, state)
+            _refuse_undetermined(without_held, state)
+            if isinstance(failure, DidNotConverge):
+                raise blaming_stated_values(without_held, failure) from None
+            raise
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(without_held, start, state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
+
+
+def _open_farther_on(
+    problem: FitProblem, held: FitProblem, state: State, n_held: int
+) -> HeldDirections | None:
+    """Return the open directions near the minimum if they are more than those held so far.
+
+    Axes of a translational 3-UPU look determined where the first minimum has them, and are not
+    where they are parallel.
+    """
+    with contextlib.suppress(DidNotConverge, NotIdentifiable):
+        near = minimise(held, state, held.loss, must_converge=False).state
+        there = linearize(problem, near)
+        found = undetermined_directions(problem, near, information(problem, near, there))
+        return found if len(found.basis) > n_held else None
+    return None
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
@@ -421,33 +433,3 @@ def _refuse_other_radii(problem: FitProblem, state: State) -> None:
     ]
     if problems:
         raise DidNotConverge(problems)
-
-
-def bound(problem: FitProblem, truth: Start, radii: Array | None = None) -> Array:
-    """Return the Cramer-Rao bound: the inverse of the information at the true state.
-
-    Parameters
-    ----------
-    problem : FitProblem
-        Built from data with the true covariances; outlines and axes are the linearisation points,
-        exact ones for the exact bound.
-    truth : Start
-        The true legs, cameras and poses.
-    radii : (n_radii,) array, optional
-        The true radii [m]; nominal by default.
-
-    Returns
-    -------
-    (n, n) array
-        Covariance of ``problem.named`` with all other unknowns marginalised out; includes priors.
-
-    Raises
-    ------
-    NotIdentifiable
-        If an open direction moves the platform.
-    """
-    state = problem.begin(truth)
-    state = state if radii is None else dataclasses.replace(state, radii=radii)
-    normal = information(problem, state, linearize(problem, state))
-    undetermined_directions(problem, state, normal)
-    return named_covariance(problem, state, normal.kept_covariance())

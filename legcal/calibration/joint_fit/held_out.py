@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -24,7 +25,7 @@ from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.estimation.problem import Linearization, linearize
+from legcal.estimation.problem import linearize
 from legcal.estimation.solver import NormalEquations, information, minimise, normal_equations
 from legcal.estimation.uncertainty import left_out_blocks, leverage, marginal
 from legcal.geometry.types import Array, IntArray
@@ -103,29 +104,12 @@ _MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))  # median norm of two unit Gaussians
 _RANK_TOLERANCE = 1e-18  # relative to the largest eigenvalue of a pose's information
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Held-out images compared with the predictions of a fit.
-
-    Offsets are corrected for the common-mode biases of the fit. Expected errors are one standard
-    deviation, from the noise of outlines and readings and the covariance of the fit.
-    """
-
-    images: int  # held-out images
-    poses: int
-    outlines: int  # in these images
-    wrong: int  # outliers, excluded below
-    rms_px: float | None  # of the offsets [px]; None without outlines
-    expected_px: float | None
-    views: dict[str, float]  # rms by name of the view [px]
-
-
 def compare_held_out(
     posterior: Posterior,
     measurements: Measurements,
     outlines: Outlines,
     T_Rb_Re: Sequence[RigidTransform],
-) -> HeldOut:
+) -> Holdout:
     """Compare held-out images with the predictions of a fit to other images.
 
     Common-mode biases known from the fit are subtracted. Expected errors include the noise of
@@ -146,23 +130,33 @@ def compare_held_out(
     predicted = replace(predicted, problem=problem)
     L = np.linalg.cholesky(posterior.noise.covariance(problem.outlines.covariance))
     linear = linearize(problem, state)
-    _refuse_unseen(linear)
+    n_inside = int(np.sum(~np.isfinite(linear["outlines"].r).all(axis=1)))
+    if n_inside:
+        raise NotVisible(
+            f"The held-out images could not be compared with the fit: for {n_inside} outlines, the "
+            "readings put a camera inside the leg; check the readings."
+        )
     readings = information(problem, state, linear, only=_READINGS)
     _refuse_undetermined(readings)
     expected = np.eye(2) + leverage(problem, linear, readings, "outlines", predicted.covariance)
     offsets = (L @ linear["outlines"].r[..., None])[..., 0]
-    norm = _norms(linear["outlines"].r, expected)
-    limit = problem.settings.rejection * _median_distance(norm)
-    inliers = norm < limit
+    r = linear["outlines"].r
+    norm = np.sqrt(np.einsum("ni,nij,nj->n", r, np.linalg.inv(expected), r))  # Mahalanobis
+    scatter = max(float(np.median(norm)) / _MEDIAN, 1.0) if len(norm) else 1.0
+    inliers = norm < problem.settings.rejection * scatter
+    view = problem.outlines.view[inliers]
     pixels = np.einsum("nij,njk,nik->ni", L, expected, L)
-    return HeldOut(
+    return Holdout(
         images=measurements.n_rows,
         poses=measurements.n_poses,
         outlines=len(problem.outlines),
         wrong=int(np.sum(~inliers)),
         rms_px=_rms(offsets[inliers]),
         expected_px=_rms(np.sqrt(pixels[inliers])),
-        views=_rms_by_view(measurements, problem.outlines.view[inliers], offsets[inliers]),
+        views={
+            measurements.views[v].name: float(np.sqrt(np.mean(offsets[inliers][view == v] ** 2)))
+            for v in np.unique(view).tolist()
+        },
     )
 
 
@@ -175,35 +169,6 @@ def _refuse_undetermined(readings: NormalEquations) -> None:
             "The held-out images could not be compared with the fit: their readings do not "
             f"determine platform pose {undetermined[0] + 1}; leave out --holdout."
         )
-
-
-def _refuse_unseen(linear: Linearization) -> None:
-    """Raise NotVisible if a camera is inside a leg."""
-    n_inside = int(np.sum(~np.isfinite(linear["outlines"].r).all(axis=1)))
-    if n_inside:
-        raise NotVisible(
-            f"The held-out images could not be compared with the fit: for {n_inside} outlines, the "
-            "readings put a camera inside the leg; check the readings."
-        )
-
-
-def _norms(r: Array, covariance: Array) -> Array:
-    """Mahalanobis distances (n,) of residuals (n, 2)."""
-    inverse = np.linalg.inv(covariance)
-    return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", r, inverse, r)))
-
-
-def _median_distance(norm: Array) -> float:
-    """Median distance of outlines in standard deviations, at least one."""
-    return max(float(np.median(norm)) / _MEDIAN, 1.0) if len(norm) else 1.0
-
-
-def _rms_by_view(measurements: Measurements, view: IntArray, offsets: Array) -> dict[str, float]:
-    """Root mean square of offsets by view [px]."""
-    return {
-        measurements.views[v].name: float(np.sqrt(np.mean(offsets[view == v] ** 2)))
-        for v in np.unique(view).tolist()
-    }
 
 
 def _rms(offsets: Array) -> float | None:

@@ -6,14 +6,13 @@ evaluate`` compares two models.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import Frames
@@ -102,15 +101,6 @@ _REACHED = 2.5e-8
 _REACHED_BY_ALL = 0.03  # with redundant motors, whose readings may disagree
 
 
-@dataclass(frozen=True, eq=False)
-class Effect:
-    """Effect of an error of a fixed quantity on the platform."""
-
-    what: str  # the error, in words
-    # Motion of the platform over the workspace; at the readings of the dataset if that is unknown
-    error: PlatformError
-
-
 @brief
 @dataclass(frozen=True, eq=False)
 class PlatformAccuracy:
@@ -121,7 +111,9 @@ class PlatformAccuracy:
     sigma: PlatformError  # Predicted error of the calibrated platform there, one standard deviation
     # Predicted error over the travel; None where the model cannot reach it
     workspace: PlatformError | None
-    effects: tuple[Effect, ...]  # of errors of fixed quantities
+    # Motion by errors of fixed quantities, by what they are: over the workspace, or at the readings
+    # of the dataset if that is unknown
+    effects: Mapping[str, PlatformError]
 
 
 def platform_accuracy(
@@ -131,7 +123,7 @@ def platform_accuracy(
     covariance: Array,
     q: Array,
     T_Rb_Re: Sequence[RigidTransform],
-    sensitivities: Sequence[Sensitivity] = (),
+    sensitivities: Mapping[str, Array],
 ) -> PlatformAccuracy | None:
     """Return the accuracy of calibrated legs at the platform.
 
@@ -160,7 +152,7 @@ def platform_accuracy(
         None
         if sensitivity_in_workspace is None
         else expected_error(sensitivity_in_workspace, covariance),
-        tuple(Effect(s.what, moved_by(judged_sensitivity, s.steps)) for s in sensitivities),
+        {what: moved_by(judged_sensitivity, steps) for what, steps in sensitivities.items()},
     )
 
 

@@ -53,7 +53,8 @@ from legcal.files.table import read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
-from legcal.machine.rods import reading_of_rod
+from legcal.machine.rods import ends_in_base, reading_of_rod
+from legcal.perception.body_edges import predicted_edges
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import Seen
@@ -61,6 +62,7 @@ from legcal.vision.visibility import Seen
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
 _WEAK, _WEAK_LENGTH = 1.0, 2.5
+EDGE_SIGMA_PX = 0.2  # of an edge of a body, at its ends
 _RANK = 1e-7  # of the largest singular value
 
 
@@ -205,6 +207,14 @@ class Predictor:
             sigma_by_joint=self.sigma_by_joint,
         )
         T_base_Rb = self.machine.T_base_Rb
+        edges = predicted_edges(
+            self.machine.occluders,
+            [(camera, T) for T in views.values()],
+            view,
+            ends_in_base(shown, T_base_Rb, *Frames.of(poses), measurements.q),
+            np.ones((len(views), len(shown)), dtype=np.bool_),
+            EDGE_SIGMA_PX,
+        )
         start = Start(
             shown,
             tuple(T.inv() * T_base_Rb for T in views.values()),
@@ -218,6 +228,7 @@ class Predictor:
             start,
             self.noise,
             self.choices,
+            edges=edges,
             is_fit=is_fit,
             known_length=self.machine.size,
         )

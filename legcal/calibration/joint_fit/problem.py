@@ -21,14 +21,12 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.joint_fit.factors import (
     BoardCorners,
     Observed,
-    ObservedAxes,
     ObservedCorners,
     ObservedEdges,
     ObservedOutlines,
     Readings,
     measured_lengths,
     observed_arrays,
-    observed_axes,
     observed_corners,
     observed_edges,
     observed_readings,
@@ -56,7 +54,7 @@ from legcal.calibration.joint_fit.variables import (
 )
 from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
 from legcal.data.measurements import Measurements, row_names
-from legcal.data.outlines import LegAxes, Outlines
+from legcal.data.outlines import Outlines
 from legcal.errors import NotIdentifiable
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import (
@@ -106,7 +104,7 @@ class FitProblem(EstimationProblem[State]):
 
     @property
     def loss(self) -> PseudoHuber:
-        """Robust loss of outlines, axes and corners."""
+        """Robust loss of outlines and corners."""
         return PseudoHuber(self.settings.loss_width)
 
     @property
@@ -123,11 +121,6 @@ class FitProblem(EstimationProblem[State]):
     def readings(self) -> Readings:
         """The readings."""
         return self.observed.readings
-
-    @property
-    def axes(self) -> ObservedAxes:
-        """The measured axes."""
-        return self.observed.axes
 
     @property
     def edges(self) -> ObservedEdges:
@@ -177,13 +170,10 @@ class FitProblem(EstimationProblem[State]):
         equations = self.n_equations + len(self.priors.mean)
         if equations >= self.n_unknowns:
             return
-        observations = f"{len(self.outlines)} outlines"
-        if len(self.axes):
-            observations = f"{len(self.axes)} axes" + f", {observations}" * bool(len(self.outlines))
         raise NotIdentifiable(
-            f"The fit is not determined: {len(self.images)} images with {observations} and "
-            f"{len(self.readings)} readings give {equations} equations for {self.n_unknowns} "
-            "unknowns; add images."
+            f"The fit is not determined: {len(self.images)} images with {len(self.outlines)} "
+            f"outlines and {len(self.readings)} readings give {equations} equations for "
+            f"{self.n_unknowns} unknowns; add images."
         )
 
     def begin(self, start: Start) -> State:
@@ -252,14 +242,13 @@ class FitProblem(EstimationProblem[State]):
     def with_measurements(
         self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
     ) -> FitProblem:
-        """Replace the measurements by other images of the same views, without axes and boards.
+        """Replace the measurements by other images of the same views, without boards.
 
         The parts of the problem come first in *outlines*; further parts have fixed radii.
         """
         observed = Observed(
             replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
             observed_readings(measurements, self.legs),
-            observed_axes(None, measurements, self.legs),
             replace(observed_edges(None, measurements, self.legs, ()), bodies=self.edges.bodies),
             *observed_corners(None, measurements, ()),
         )
@@ -291,7 +280,6 @@ def build_fit(
     outlines: Outlines,
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
-    axes: LegAxes | None = None,
     board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
     edges: Outlines | None = None,
@@ -304,14 +292,14 @@ def build_fit(
     Raises
     ------
     DatasetError
-        If an outline or an axis cannot be used.
+        If an outline cannot be used.
     """
     names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
     owners = shared_cameras(names, given)
     cameras = tuple(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
-    observed = observed_arrays(measurements, legs, outlines, axes, board, cameras, edges)
+    observed = observed_arrays(measurements, legs, outlines, board, cameras, edges)
     n_poses, images = measurements.n_poses, _images(measurements)
     return _build_problem(
         _FitInputs(legs, observed, cameras, owners, n_poses, images, settings), choices

@@ -68,14 +68,6 @@ _MAX_CHANGED = 0.05  # of the accepted outlines
 
 
 @dataclass(frozen=True, eq=False)
-class RepeatedErrors:
-    """Errors of edges that return to places; not estimated as biases."""
-
-    sigma: Array  # (2,) of ``PLACES``, root mean squares over all places [px]
-    covariance: Array  # (n_kept, n_kept) added to the covariance of the kept unknowns
-
-
-@dataclass(frozen=True, eq=False)
 class Fit:
     """A minimum with the noise, biases and weights of its outlines."""
 
@@ -84,7 +76,9 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
-    at_places: RepeatedErrors | None = None  # errors shared there, None where there are none
+    # Errors of edges that return to places, not estimated as biases: root mean squares (2,) of
+    # ``PLACES`` [px], and what they add to the covariance of the kept unknowns; None without any
+    at_places: tuple[Array, Array] | None = None
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
     edge_scale: float = 1.0  # of the standard deviations of edges of bodies
 
@@ -119,7 +113,7 @@ class Fit:
     @property
     def shared_px(self) -> dict[str, float]:
         """Standard deviations of common-mode errors by kind [px]."""
-        there = () if self.at_places is None else self.at_places.sigma.tolist()
+        there = () if self.at_places is None else self.at_places[0].tolist()
         return self.edge_biases.sizes | dict(zip(PLACES, there, strict=False))
 
 
@@ -176,7 +170,6 @@ def first_minimum(
 def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
-    Axes keep their claimed covariances; only the robust loss guards against outliers among them.
     *first* is the result of :func:`first_minimum`. Readings of redundant motors that contradict
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
@@ -184,7 +177,7 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     Raises
     ------
     DidNotConverge
-        If a minimisation fails, most outlines or axes are outliers, or the rounds do not converge.
+        If a minimisation fails, most outlines are outliers, or the rounds do not converge.
     """
     try:
         return _fit_in_rounds(problem, first)
@@ -213,7 +206,6 @@ def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
         fit, minimum=_minimise_near(fit.problem, fit.minimum, computed_rows=computed_rows)
     )
     _refuse_disagreement(fit)
-    _refuse_wrong_axes(fit)
     return replace(
         fit,
         at_places=_repeated_errors(fit),
@@ -311,7 +303,7 @@ def _without_wrong_readings(
     return problem, minimum
 
 
-def _repeated_errors(fit: Fit) -> RepeatedErrors | None:
+def _repeated_errors(fit: Fit) -> tuple[Array, Array] | None:
     """Return errors at places and their effect on the covariance; None where there are none.
 
     They are estimated where residuals show biases at all; those of polished parts are there anyway.
@@ -334,7 +326,7 @@ def _repeated_errors(fit: Fit) -> RepeatedErrors | None:
     normal = information(problem, state, linear, problem.loss)
     moved = response(problem, linear, normal, columns) * of_places
     sigma = np.sqrt(np.mean(of_places.reshape(len(PLACES), -1) ** 2, axis=1))
-    return RepeatedErrors(sigma, moved @ moved.T)
+    return sigma, moved @ moved.T
 
 
 def _approach_minimum(
@@ -367,14 +359,9 @@ def with_edge_biases(
     problem: FitProblem, state: State, biases: EdgeBiases
 ) -> tuple[FitProblem, State]:
     """Replace the biases of problem and state; biases of the same name keep their value."""
-    values = _values_of_biases(problem, state, biases)
-    return problem.with_biases(biases), replace(state, biases=values)
-
-
-def _values_of_biases(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
-    """Values of biases at a state, zero for new ones."""
     value_of = dict(zip(problem.block("biases").labels, state.biases.tolist(), strict=True))
-    return np.array([value_of.get(name, 0.0) for name in biases.names])
+    values = np.array([value_of.get(name, 0.0) for name in biases.names])
+    return problem.with_biases(biases), replace(state, biases=values)
 
 
 def _noise(fit: Fit, included: NoiseModel) -> NoiseModel:
@@ -440,18 +427,6 @@ def _refuse_disagreement(fit: Fit) -> None:
             f"The joint fit ended with {n - n_accepted} of {n} outlines rejected and an error of "
             f"{rms:.1f} px (rms) of the others; more than half must agree within {most_px:g} px. "
             "Check camera poses, readings and outlines."
-        )
-
-
-def _refuse_wrong_axes(fit: Fit) -> None:
-    """Raise DidNotConverge if most axes are outliers."""
-    n, most = len(fit.problem.axes), fit.problem.settings.axis_disagreement
-    wrong = int(np.sum(fit.minimum.linear["axes"].squared_norms > most**2))
-    if 2 * wrong > n:
-        raise DidNotConverge(
-            f"The joint fit ended with errors of {wrong} of {n} axes above {most:g} standard "
-            "deviations; more than half must agree. Check the camera poses, the readings, and the "
-            "units (rad, m) of axes and their sigmas."
         )
 
 

@@ -20,7 +20,7 @@ from legcal.calibration.joint_fit.factors import measured_lengths
 from legcal.calibration.joint_fit.held_out import Posterior, with_weights
 from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_of_length
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.sensitivity import Sensitivity, kinematic_steps
+from legcal.calibration.joint_fit.sensitivity import kinematic_steps
 from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.measurements import few
@@ -82,7 +82,7 @@ def explaining_missing_scale(problem: FitProblem) -> Iterator[None]:
 
 def sensitivity_to_scale(
     problem: FitProblem, state: State, linear: Linearization, covariance: Array
-) -> tuple[Sensitivity, ...]:
+) -> dict[str, Array]:
     """Return the change of parameters with one sigma of a scale that no sigma of the fit contains.
 
     *covariance* is of the kept unknowns. Where radii alone say the scale, it is the relative change
@@ -97,12 +97,12 @@ def sensitivity_to_scale(
         variance = 1.0 / (problem.legs.sigma_travel**-2 + information)
         off = float(np.hypot(score * variance, np.sqrt(variance)))
         moved = kinematic_steps(problem, response(problem, linear, normal, columns))
-        return (Sensitivity(ALL_READINGS, off * moved),)
+        return {ALL_READINGS: off * moved}
     parametrization = problem.legs.parametrization
     column = parametrization.place[:, LegColumns.LENGTH]
     rods = np.flatnonzero(column >= 0)
     if not len(rods) or has_length(problem):
-        return ()
+        return {}
     by_scale = np.zeros(len(parametrization))
     by_scale[column[rods]] = 1.0 / (len(rods) * np.array([state.legs[j].q0 for j in rods]))
     n = problem.n_kinematic
@@ -110,7 +110,7 @@ def sensitivity_to_scale(
     moved = covariance[:n, :n] @ by_scale
     step = np.zeros((len(parametrization), 1))
     step[problem.free, 0] = moved / np.sqrt(by_scale @ moved)
-    return (Sensitivity(SCALE, step),)
+    return {SCALE: step}
 
 
 def scale_witnesses(problem: FitProblem) -> list[str]:

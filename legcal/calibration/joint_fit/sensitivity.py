@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 
@@ -31,24 +31,16 @@ _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
 
 
-@dataclass(frozen=True)
-class Sensitivity:
-    """Change of the kinematic parameters by an error of a fixed quantity."""
-
-    what: str  # the error, in words
-    steps: Array  # (p, c) steps of all parameters [m, rad], for c independent errors
-
-
 def sensitivity_to_cameras(
     cameras: CameraResiduals, normal: NormalEquations, contradicted: Sequence[WrongIntrinsic]
-) -> tuple[Sensitivity, ...]:
+) -> dict[str, Array]:
     """Return how the corrections of contradicted intrinsics change the parameters, if any are.
 
     *cameras* are at the minimum of the fit, *normal* is the information there. Of intrinsics with
     a prior, the correction is that of its mean.
     """
     if not contradicted:
-        return ()
+        return {}
     problem, linear, place = cameras.problem, cameras.linear, _camera_columns(cameras.problem)
     error = np.sum([one.error for one in contradicted], axis=0)
     of_priors = np.zeros(problem.n_kept + 1)
@@ -60,7 +52,7 @@ def sensitivity_to_cameras(
     }
     steps = response(problem, linear, normal, changes)
     steps += normal.kept_covariance() @ linear.prior_J.T @ pull[:, None]
-    return (Sensitivity(FITTED_CAMERA, kinematic_steps(problem, steps)),)
+    return {FITTED_CAMERA: kinematic_steps(problem, steps)}
 
 
 def _camera_columns(problem: FitProblem) -> IntArray:
@@ -96,19 +88,45 @@ def kinematic_steps(problem: FitProblem, steps: Array) -> Array:
     return kinematic
 
 
+Intrinsic = Literal["focal_length", "zoom", "principal_point", "distortion"]
+_OF_CAMERAS: tuple[Intrinsic, ...] = ("focal_length", "principal_point", "distortion")
+_Unit = tuple[Mapping[str, float], Mapping[str, float]]  # a relative and an added error
+_TESTED: Mapping[Intrinsic, tuple[tuple[str, ...], list[_Unit], str]] = {  # keys, units, name
+    "focal_length": (("fx",), [(_FOCAL, {})], "focal length of"),
+    "principal_point": (("cx", "cy"), [({}, {"cx": 1.0}), ({}, {"cy": 1.0})], "principal point of"),
+    # By its first coefficient k1, which is the largest in most lenses
+    "distortion": (("k1",), [({}, {"k1": 1.0})], "distortion of"),
+    # A view against the others with its camera file
+    "zoom": (("fx",), [(_FOCAL, {})], "focal length of view"),
+}
+_REMEDIES: Mapping[Intrinsic, str] = {
+    "focal_length": (
+        "calibrate the camera again at the same focus and zoom, look for photographs that were "
+        "scaled or refocused, or estimate it (--set {0}.fx=free --set {0}.fy=free)"
+    ),
+    "principal_point": (
+        "look for photographs that were cropped or stabilised, calibrate the camera again at the "
+        "same focus and zoom, or estimate it (--set {0}.cx=free --set {0}.cy=free)"
+    ),
+    "distortion": (
+        "take and process the photographs of board and machine alike, with lens correction in all "
+        "or in none, and calibrate the camera again"
+    ),
+    "zoom": (
+        "look for photographs of that view that were zoomed, scaled, cropped or refocused, and "
+        "calibrate its camera with the settings used there"
+    ),
+}
+
+
 @dataclass(frozen=True, eq=False)
 class WrongIntrinsic:
     """Intrinsics in a camera file that contradict the measurements."""
 
-    units: ClassVar[tuple[tuple[Mapping[str, float], Mapping[str, float]], ...]]  # relative, added
-    keys: ClassVar[tuple[str, ...]]  # of the intrinsics
-    name: ClassVar[str]  # in words
-    remedy: ClassVar[str]
-    against: ClassVar[str] = "the measurements"
-
+    kind: Intrinsic
     view: str  # the first one by name if several have the camera
     given: Array  # (u,) in the camera file
-    change: Array  # (u,) correction, in ``units``
+    change: Array  # (u,) correction; of focal lengths as a part of them, else [px] or of k1
     sigma: Array  # (u,) standard deviations of the correction
     apart: float  # correction in standard deviations
     error: Array  # (n_views, 5) the correction, in all views
@@ -116,95 +134,34 @@ class WrongIntrinsic:
     @property
     def found(self) -> str:
         """What the measurements say, as a clause."""
-        raise NotImplementedError
-
-    def __str__(self) -> str:
-        return (
-            f"The {self.name} {self.view} does not agree with {self.against}: {self.found}, "
-            f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
-            f"this error; {self.remedy.format(self.view)}."
-        )
-
-
-class FocalLength(WrongIntrinsic):
-    """A focal length: ``given`` is fx [px], ``change`` that of fx and fy, as a part of them."""
-
-    units = ((_FOCAL, {}),)
-    keys = ("fx",)
-    name = "focal length of"
-    remedy = (
-        "calibrate the camera again at the same focus and zoom, look for photographs that were "
-        "scaled or refocused, or estimate it (--set {0}.fx=free --set {0}.fy=free)"
-    )
-
-    @property
-    def found(self) -> str:
-        """What the measurements say, as a clause."""
-        (given,), (change,) = self.given, self.change
-        return (
-            f"found fx = {given * (1.0 + change):.1f} +- {given * self.sigma[0]:.1f} px, given "
-            f"{given:.1f} px ({1e2 * change:+.2f} %)"
-        )
-
-
-class ZoomedView(FocalLength):
-    """The focal length of a view against that of the other views with its camera file."""
-
-    name = "focal length of view"
-    against = "the other views of its camera"
-    remedy = (
-        "look for photographs of that view that were zoomed, scaled, cropped or refocused, and "
-        "calibrate its camera with the settings used there"
-    )
-
-    @property
-    def found(self) -> str:
-        """What the measurements say, as a clause."""
-        return f"it differs by {1e2 * self.change[0]:+.2f} +- {1e2 * self.sigma[0]:.2f} %"
-
-
-class PrincipalPoint(WrongIntrinsic):
-    """A principal point, cx and cy [px]."""
-
-    units = (({}, {"cx": 1.0}), ({}, {"cy": 1.0}))
-    keys = ("cx", "cy")
-    name = "principal point of"
-    remedy = (
-        "look for photographs that were cropped or stabilised, calibrate the camera again at the "
-        "same focus and zoom, or estimate it (--set {0}.cx=free --set {0}.cy=free)"
-    )
-
-    @property
-    def found(self) -> str:
-        """What the measurements say, as a clause."""
-        (cx, cy), (dx, dy) = self.given + self.change, self.sigma
-        return (
-            f"found it at ({cx:.1f} +- {dx:.1f}, {cy:.1f} +- {dy:.1f}) px, given "
-            f"({self.given[0]:.1f}, {self.given[1]:.1f}) px"
-        )
-
-
-class LensDistortion(WrongIntrinsic):
-    """A distortion, by its first coefficient k1, which is the largest in most lenses."""
-
-    units = (({}, {"k1": 1.0}),)
-    keys = ("k1",)
-    name = "distortion of"
-    remedy = (
-        "take and process the photographs of board and machine alike, with lens correction in all "
-        "or in none, and calibrate the camera again"
-    )
-
-    @property
-    def found(self) -> str:
-        """What the measurements say, as a clause."""
-        (given,), (found,) = self.given, self.given + self.change
-        looks = ""
+        (given, *_), (change, *_), (sigma, *_) = self.given, self.change, self.sigma
+        if self.kind == "zoom":
+            return f"it differs by {1e2 * change:+.2f} +- {1e2 * sigma:.2f} %"
+        if self.kind == "focal_length":
+            return (
+                f"found fx = {given * (1.0 + change):.1f} +- {given * sigma:.1f} px, given "
+                f"{given:.1f} px ({1e2 * change:+.2f} %)"
+            )
+        if self.kind == "principal_point":
+            (cx, cy), (dx, dy) = self.given + self.change, self.sigma
+            return (
+                f"found it at ({cx:.1f} +- {dx:.1f}, {cy:.1f} +- {dy:.1f}) px, given "
+                f"({self.given[0]:.1f}, {self.given[1]:.1f}) px"
+            )
+        found, looks = given + change, ""
         if abs(found) < 0.5 * abs(given):
             looks = " (the lens distortion of the photographs appears to have been removed)"
         elif given == 0.0:
             looks = " (the lens distortion of the photographs appears not to have been removed)"
-        return f"found k1 = {found:.3f} +- {self.sigma[0]:.3f}, given {given:.3f}{looks}"
+        return f"found k1 = {found:.3f} +- {sigma:.3f}, given {given:.3f}{looks}"
+
+    def __str__(self) -> str:
+        against = "the other views of its camera" if self.kind == "zoom" else "the measurements"
+        return (
+            f"The {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
+            f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
+            f"this error; {_REMEDIES[self.kind].format(self.view)}."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,9 +234,9 @@ class CameraResiduals:
         are not tested. The problem includes common-mode biases and the covariance of camera files,
         so that these are not mistaken for a wrong file.
         """
-        kinds, errors, columns = list[type[WrongIntrinsic]](), list[Array](), list[IntArray]()
-        for kind in (FocalLength, PrincipalPoint, LensDistortion):
-            units = [_camera_error(self.state, *unit) for unit in kind.units]
+        kinds, errors, columns = list[Intrinsic](), list[Array](), list[IntArray]()
+        for kind in _OF_CAMERAS:
+            units = [_camera_error(self.state, *unit) for unit in _TESTED[kind][1]]
             views = self._known_views(np.sum(units, axis=0)) & of_camera
             if views.any():
                 kinds.append(kind)
@@ -301,14 +258,14 @@ class CameraResiduals:
         wrong_intrinsics = []
         for k, apart in selected.items():
             own = np.isin(together.columns, columns[k])
-            given_values = np.array([intrinsic_of(camera, key) for key in kinds[k].keys])
+            given_values = np.array([intrinsic_of(camera, key) for key in _TESTED[kinds[k]][0]])
             error = np.tensordot(change[own], [errors[i] for i in columns[k].tolist()], axes=1)
             wrong_intrinsics.append(
-                kinds[k](owner, given_values, change[own], sigma[own], apart, error)
+                WrongIntrinsic(kinds[k], owner, given_values, change[own], sigma[own], apart, error)
             )
         return wrong_intrinsics
 
-    def _zoomed_view(self, of_camera: BoolArray) -> ZoomedView | None:
+    def _zoomed_view(self, of_camera: BoolArray) -> WrongIntrinsic | None:
         """Return the view of a camera whose focal length differs most from its other views.
 
         Causes are digital zoom and refocusing. Cameras with choices for intrinsics, or with only
@@ -328,7 +285,7 @@ class CameraResiduals:
                 name, camera = self.problem.outlines.views[v], self.problem.first_cameras[v]
                 focal, apart = np.array([intrinsic_of(camera, "fx")]), float(np.sqrt(number.square))
                 wrong = change[0] * in_view[i]
-                zoomed.append(ZoomedView(name, focal, change, sigma, apart, wrong))
+                zoomed.append(WrongIntrinsic("zoom", name, focal, change, sigma, apart, wrong))
         return max(zoomed, key=lambda test: test.apart, default=None)
 
     def _known_views(self, error: Array) -> BoolArray:

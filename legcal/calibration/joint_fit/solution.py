@@ -36,7 +36,6 @@ from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_rea
 from legcal.calibration.joint_fit.scale import sensitivity_to_scale
 from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
-    Sensitivity,
     WrongIntrinsic,
     sensitivity_to_cameras,
 )
@@ -209,7 +208,9 @@ class Solution:
     # T_Rb_board and T_Re_board, by the link that the board is fixed to, where images show one
     T_frame_board: dict[Link, RigidTransform]
     gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
-    sensitivities: tuple[Sensitivity, ...]  # to errors of fixed quantities
+    # (p, c) changes of the parameters [m, rad] by c independent errors of a fixed quantity, by what
+    # it is
+    sensitivities: Mapping[str, Array]
     outlines: Outlines  # the input table, with the rejections of the fit
     start: str  # label of the start
     iterations: int  # of the solver, all rounds
@@ -247,7 +248,7 @@ def assemble_solution(
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     kept = normal.kept_covariance()
     if fit.at_places is not None:
-        kept = kept + fit.at_places.covariance
+        kept = kept + fit.at_places[1]
     covariance = named_covariance(problem, state, kept)
     quality = _goodness_of_fit(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
@@ -272,10 +273,8 @@ def assemble_solution(
             if len(corners)
         },
         gammas=gammas,
-        sensitivities=(
-            *sensitivity_to_cameras(cameras, normal, contradicted),
-            *sensitivity_to_scale(problem, state, linear, kept),
-        ),
+        sensitivities=sensitivity_to_cameras(cameras, normal, contradicted)
+        | sensitivity_to_scale(problem, state, linear, kept),
         outlines=_with_rejections(outlines, fit),
         start=label,
         iterations=fit.minimum.iterations,
@@ -305,8 +304,9 @@ def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> Goodness
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
+    claimed = problem.weighted(NoiseModel())
     return GoodnessOfFit(
-        cost=_comparable_cost(problem, state),
+        cost=robust_cost(claimed, linearize(claimed, state), claimed.loss),
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
         dof=n_residuals - problem.n_unknowns + n_held,
         rms_px=_rms(used),
@@ -319,12 +319,6 @@ def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> Goodness
         shared_px=fit.shared_px,
         redundant_readings=readings,
     )
-
-
-def _comparable_cost(problem: FitProblem, state: State) -> float:
-    """Robust cost of all observations with their claimed covariances."""
-    claimed = problem.weighted(NoiseModel())
-    return robust_cost(claimed, linearize(claimed, state), claimed.loss)
 
 
 def _gammas(
@@ -478,7 +472,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         radii=dict(sorted(radii.items())),
         estimates=estimates.in_order(tuple(parameters)),
         kinematic=solution.kinematic.in_order(parametrization),
-        sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
+        sensitivities={what: moved[steps] for what, moved in solution.sensitivities.items()},
         outlines=order.restore(solution.outlines),
         edges=None if solution.edges is None else order.restore(solution.edges),
         quality=replace(

@@ -67,7 +67,6 @@ class RefinementSettings:
     rejection_rounds: int = 6  # at most, until the rejected outlines stay the same
     noise_rounds: int = 10  # at most, of noise estimation after that
     error_tolerance: float = 0.02  # relative change of these errors at which the rounds end
-    axis_disagreement: float = 20.0  # distance of outlier axes; if most are, the fit is refused
     largest_rms_px: float = 3.0  # of the offsets of accepted outlines [px]
     other_starts: int = 8  # at most, if a fit rejects a leg of a view
     judges_stated_values: bool = True  # refuse values that contradict the measurements

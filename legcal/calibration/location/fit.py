@@ -18,6 +18,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, fdtrc
 
+from legcal.calibration.location.document import (
+    LocatedFrame,
+    OpenPart,
+    PoseComponent,
+    direction_of,
+    open_parts_in_words,
+)
 from legcal.calibration.location.frames import (
     N_STEP,
     PosePairs,
@@ -28,7 +35,8 @@ from legcal.calibration.location.frames import (
     residuals,
     tool_motions,
 )
-from legcal.calibration.location.tool_poses import PoseNoise, ToolMeasurements
+from legcal.calibration.location.tool_poses import MIN_SIGMA, PoseNoise, ToolMeasurements
+from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import (
     EstimationProblem,
     Factor,
@@ -40,11 +48,12 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.solver import minimise
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.configurations import random_poses
 
 RANK_TOLERANCE = 1e-9  # smallest singular value of a determined direction, relative to the largest
 _MAX_ROUNDS = 30  # alternations of frames and variances
 _MAX_REML_ITERATIONS = 300
-_FACTOR_TOLERANCE = 1e-7
+_SIGMA_TOLERANCE = 1e-7
 _MAX_STEP = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # turn [rad], displacement [m]
 _TURN_FIRST = [3, 4, 5, 0, 1, 2]  # components of a step in the order of estimation.Frames
 _MAX_HOLD_ROUNDS = 60
@@ -60,7 +69,7 @@ class FrameFit:
     """The most likely frames."""
 
     frames: Array  # (2, 3, 4)
-    noise: PoseNoise  # standard deviations with the stated or estimated factors
+    noise: PoseNoise  # stated or estimated
     whitened: Array  # (n, 6): residuals in standard deviations, errors of the model subtracted
     # (n * 6 + k, 12 + k): whitened derivative by a step in units of ``pairs.scale``, and by the k
     # errors of the model, whose priors are the last rows
@@ -85,7 +94,7 @@ def fit(
     pairs: PosePairs,
     # within the basin of convergence; undetermined directions stay there
     start: Array,
-    noise: PoseNoise,  # standard deviations; factors that were not stated are estimated
+    noise: PoseNoise,  # standard deviations; those that were not stated are estimated
     motions: Array | None = None,  # (n, 6, k): platform motions by errors of the model
 ) -> FrameFit:
     """Return the most likely frames near a start.
@@ -97,9 +106,9 @@ def fit(
         frames = _most_likely(pairs, frames, noise, motions)
         if all(noise.stated):
             break
-        factor, _ = _variances(pairs, frames, noise, motions)
-        converged = np.abs(factor / noise.factor - 1.0).max() < _FACTOR_TOLERANCE
-        noise = noise.scaled(factor)
+        sigma, _ = _variances(pairs, frames, noise, motions)
+        converged = np.abs(sigma / noise.sigma - 1.0).max() < _SIGMA_TOLERANCE
+        noise = replace(noise, sigma=sigma)
         if converged:
             break
     return fit_at(pairs, frames, noise, motions)
@@ -197,45 +206,36 @@ def _most_likely(
 def _variances(
     pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
 ) -> tuple[Array, Array]:
-    """Return the factors of restricted maximum likelihood (2,) and their degrees of freedom (2,).
+    """Return sigmas by restricted maximum likelihood, (2,), and their degrees of freedom (2,).
 
     With P = S^-1 - S^-1 A (A^T S^-1 A)^-1 A^T S^-1 the estimate of a variance v with dS/dv = D
     satisfies y^T P D P y = tr(P D): v is multiplied by the ratio of both sides until it is one.
-    Stated factors stay.
+    Stated sigmas stay.
     """
-    factor, dof = noise.factor, np.zeros(2)
-    base = np.repeat(noise.sigma, 3, axis=1)
+    sigma, dof, n = noise.sigma, np.zeros(2), len(pairs)
     raw = _unweighted(pairs, frames, motions)
     for _ in range(_MAX_REML_ITERATIONS):
-        W = noise.scaled(factor).whitening(pairs.oriented)
+        W = replace(noise, sigma=sigma).whitening(pairs.oriented)
         y, A = _whitened(*raw, W)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * s[0]]
-        remaining = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
+        remaining = (y - U @ (U.T @ y))[: 6 * n].reshape(n, 6)
         W_T = np.swapaxes(W, 1, 2)
-        Py = (W_T @ remaining[:, :, None])[:, :, 0] * base
-        spread = W_T @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]
-        diagonal = (W**2).sum(axis=1) * base**2 - (spread**2).sum(axis=2)
+        Py = (W_T @ remaining[:, :, None])[:, :, 0]
+        spread = W_T @ U[: 6 * n].reshape(n, 6, -1)
+        diagonal = (W**2).sum(axis=1) - (spread**2).sum(axis=2)
         squares = (Py**2).reshape(-1, 2, 3).sum(axis=(0, 2))
         traces = diagonal.reshape(-1, 2, 3).sum(axis=(0, 2))
-        dof = factor**2 * traces
+        dof = sigma**2 * traces
         ratio = np.sqrt(squares / np.maximum(traces, 1e-300))
         ratio[list(noise.stated)] = 1.0
         ratio[dof < 1e-6] = 1.0
-        after = np.maximum(factor * ratio, np.where(noise.stated, factor, noise.min_factor))
-        converged = bool(np.abs(after / factor - 1.0).max() < 0.1 * _FACTOR_TOLERANCE)
-        factor = after
+        after = np.maximum(sigma * ratio, np.where(noise.stated, sigma, MIN_SIGMA))
+        converged = bool(np.abs(after / sigma - 1.0).max() < 0.1 * _SIGMA_TOLERANCE)
+        sigma = after
         if converged:
             break
-    return factor, dof
-
-
-def frame_design_at(
-    pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
-) -> Array:
-    """Return the whitened columns (m, 12) of the frames, errors of the model eliminated."""
-    raw = _unweighted(pairs, frames, motions)
-    return frame_design(_whitened(*raw, noise.whitening(pairs.oriented))[1])
+    return sigma, dof
 
 
 def frame_design(design: Array) -> Array:
@@ -300,7 +300,7 @@ class Inliers:
     distance: Array
     angle: Array
     frames: Array  # frames estimated from the inliers
-    factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`PoseNoise`
+    sigma: Array  # (2,): the scatter of the inliers, as of :class:`PoseNoise`
 
 
 def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
@@ -315,12 +315,16 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
     inside[np.argsort(distance, kind="stable")[: kept_rows(n, measurements.fewest)]] = True
     frames = start
     while True:
-        frame_fit = _fit_to(pairs.of(inside), frames, noise.of(inside))
+        # With the estimated scatter, or the stated one if it is larger
+        frame_fit = fit(pairs.of(inside), frames, replace(noise, stated=(False, False)))
+        least = np.where(noise.stated, noise.sigma, 0.0)
+        scatter = replace(frame_fit.noise, sigma=np.maximum(frame_fit.noise.sigma, least))
+        frame_fit = replace(frame_fit, noise=scatter)
         frames = frame_fit.frames
         outside: IntArray = np.flatnonzero(~inside)
         if not len(outside):
             break
-        likely = _probability(pairs.of(outside), noise.of(outside), frame_fit, noise.stated)
+        likely = _probability(pairs.of(outside), noise, frame_fit)
         best = int(np.argmax(likely))
         if likely[best] < FALSE_ALARM / n:
             break
@@ -332,32 +336,23 @@ def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
         np.linalg.norm(r[:, :3], axis=1),
         np.linalg.norm(r[:, 3:], axis=1),
         frames,
-        frame_fit.noise.factor,
+        frame_fit.noise.sigma,
     )
 
 
-def _fit_to(pairs: PosePairs, start: Array, noise: PoseNoise) -> FrameFit:
-    """Return the fit of rows with their estimated scatter, or the stated one if it is larger."""
-    result = fit(pairs, start, replace(noise, stated=(False, False)))
-    min_factor = np.where(noise.stated, noise.factor, 0.0)
-    return replace(result, noise=result.noise.scaled(np.maximum(result.noise.factor, min_factor)))
-
-
-def _probability(
-    pairs: PosePairs, noise: PoseNoise, frame_fit: FrameFit, stated: tuple[bool, bool]
-) -> Array:
+def _probability(pairs: PosePairs, noise: PoseNoise, frame_fit: FrameFit) -> Array:
     """Return the probability of residuals as large as those of the given rows, (n,)."""
-    sigma = noise.scaled(frame_fit.noise.factor).standard_deviations()
+    sigma = frame_fit.noise.sigma
     H = frame_fit.information
     H = H + _UNKNOWN * float(np.linalg.norm(H, 2)) * np.eye(len(H))
     J = jacobian(frame_fit.frames, pairs) * pairs.scale
     covariance = J @ np.linalg.solve(H, np.swapaxes(J, 1, 2))
-    covariance[:, range(6), range(6)] += sigma**2
+    covariance[:, range(6), range(6)] += np.repeat(sigma**2, 3)
     r = residuals(frame_fit.frames, pairs)
     smallest = np.ones(len(pairs))
     for kind, rows in enumerate((slice(0, 3), slice(3, 6))):
         dof = float(frame_fit.kind_dof[kind])
-        at_stated = stated[kind] and bool(frame_fit.noise.factor[kind] <= noise.factor[kind])
+        at_stated = noise.stated[kind] and bool(sigma[kind] <= noise.sigma[kind])
         if dof < _MIN_DOF and not at_stated:
             continue
         part = np.linalg.solve(covariance[:, rows, rows], r[:, rows, None])[:, :, 0]
@@ -366,3 +361,212 @@ def _probability(
         probability = chdtrc(3, distance) if at_stated else fdtrc(3, dof, distance / 3.0)
         smallest = np.minimum(smallest, np.where(pairs.oriented | (kind == 0), probability, 1.0))
     return np.minimum(1.0, 2.0 * smallest)
+
+
+# Directions that measured poses leave open
+
+
+_MAX_SIGMA = 0.1  # largest sigma of a determined direction [rad, machine lengths]
+# smallest singular value, relative to the largest, of a direction that the workspace determines
+_MACHINE_TOLERANCE = 2e-3
+_PART_TOLERANCE = 0.03  # smallest component of a unit direction that messages name
+_RESOLVED = 1e-3  # smallest motion of the tool along a unit direction that holding it fixes
+_N_POSES, _SEED = 30, 1  # random poses of the workspace
+_BLOCKS: tuple[tuple[slice, LocatedFrame, PoseComponent], ...] = (
+    (slice(0, 3), "base", "position"),
+    (slice(3, 6), "base", "orientation"),
+    (slice(6, 9), "tool", "position"),
+    (slice(9, 12), "tool", "orientation"),
+)  # components of a step
+
+
+@dataclass(frozen=True, eq=False)
+class Determinacy:
+    """The most likely frames with their covariance and their undetermined parts."""
+
+    fit: FrameFit  # evaluated at the frames, with the undetermined directions held
+    # (12, 12): covariance of a step: displacement and rotation of the base about world axes, of the
+    # tool about platform axes [m, rad]; zero along held directions
+    covariance: Array
+    held: tuple[OpenPart, ...]  # parts that no pose of the machine determines
+    words: str  # description of the held parts; "" if everything is determined
+
+
+def determine(
+    measurements: ToolMeasurements,
+    fit: FrameFit,
+    # (3,): position of the tool in the platform, used where the machine does not determine it [m]
+    tool_position: Array,
+    name: str,  # name of the poses in messages
+) -> Determinacy:
+    """Split a fit into determined and held parts.
+
+    Raises NotIdentifiable if other poses of the machine would determine more than these, or if
+    holding the tool does not fix all undetermined directions.
+    """
+    pairs, oriented = measurements.pairs, measurements.is_oriented
+    basis = _open_directions(fit.frame_design, oriented=oriented)
+    parts: list[OpenPart] = []
+    words = ""
+    if basis.shape[1]:
+        _check_machine(measurements, fit, basis, name)
+        fit = hold_open_part(measurements, fit, tool_position)
+        basis = _open_at(measurements, fit, basis.shape[1], fit.frames)
+        parts = _open_parts(basis, fit.frames)
+        words = _held_words(parts, tool_position)
+    scale = pairs.scale
+    unit = _covariance_with(fit.information, basis, oriented=oriented)
+    covariance = unit * np.outer(scale, scale)
+    return Determinacy(fit, covariance, tuple(parts), words)
+
+
+def hold_open_part(measurements: ToolMeasurements, fit: FrameFit, tool_position: Array) -> FrameFit:
+    """Return the fit moved along its undetermined directions until the tool is at its position."""
+    k = _open_directions(fit.frame_design, oriented=measurements.is_oriented).shape[1]
+    if k == 0:
+        return fit
+    return hold_tool(
+        measurements, fit, lambda frames: _open_at(measurements, fit, k, frames), tool_position
+    )
+
+
+def _open_directions(
+    # (m, 12): whitened derivatives by a step in units of the machine's length and radians
+    design: Array,
+    *,
+    # whether any orientation of the tool was measured; if not, the orientation of the tool in the
+    # platform is not estimated
+    oriented: bool,
+) -> Array:
+    """Return an orthonormal basis (12, k) of the undetermined directions of a design."""
+    return _unseen(design, oriented, lambda s: (s < RANK_TOLERANCE * s[0]) | (s * _MAX_SIGMA < 1.0))
+
+
+def _shown_elsewhere(
+    basis: Array,  # (12, k): undetermined directions of the measured poses
+    # (m, 12): derivatives of poses all over the workspace by a step, both in units of the machine's
+    # length and radians; the noise does not enter
+    jacobian: Array,
+    *,
+    oriented: bool,
+) -> Array:
+    """Return the undetermined directions (12, k) that other poses of the machine determine."""
+    undetermined = _unseen(jacobian, oriented, lambda s: s < _MACHINE_TOLERANCE * s[0])
+    U, s, _ = np.linalg.svd(basis - undetermined @ (undetermined.T @ basis), full_matrices=False)
+    return np.asarray(U[:, s > 0.5])
+
+
+def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]) -> Array:
+    """Return the right singular vectors (12, k) whose singular values are too small."""
+    n = 12 if oriented else 9
+    _, s, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
+    s = np.concatenate([s, np.zeros(n - len(s))])
+    small = is_open(s)
+    basis = np.zeros((12, int(small.sum())))
+    basis[:n] = Vt[small].T
+    return basis
+
+
+def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
+    """Return the parts of the frames that undetermined directions (12, k) move."""
+    parts = []
+    for block, frame, kind in _BLOCKS:
+        rows = basis[block]
+        if frame == "base":
+            rows = frames[0, :, :3].T @ rows
+        U, s, _ = np.linalg.svd(rows, full_matrices=False)
+        directions = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
+        if directions:
+            parts.append(OpenPart(frame=frame, kind=kind, directions=directions))
+    return parts
+
+
+def _open_at(measurements: ToolMeasurements, fit: FrameFit, k: int, frames: Array) -> Array:
+    """Return the k least determined directions (12, k) at given frames."""
+    n = 12 if measurements.is_oriented else 9
+    raw = _unweighted(measurements.pairs, frames, measurements.by_model)
+    design = frame_design(_whitened(*raw, fit.noise.whitening(measurements.pairs.oriented))[1])
+    _, _, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
+    basis = np.zeros((12, k))
+    basis[:n] = Vt[n - k :].T
+    return basis
+
+
+def _workspace(measurements: ToolMeasurements) -> PosePairs:
+    """Return random poses of the workspace, measured like the actual poses."""
+    _, poses = random_poses(measurements.machine, _N_POSES, _SEED)
+    matrices = np.array([T.as_matrix() for T in poses])
+    return PosePairs(
+        R=matrices[:, :3, :3],
+        t=matrices[:, :3, 3],
+        M=np.tile(np.eye(3), (_N_POSES, 1, 1)),
+        p=np.zeros((_N_POSES, 3)),
+        oriented=np.full(_N_POSES, measurements.is_oriented),
+        length=measurements.pairs.length,
+    )
+
+
+def _check_machine(measurements: ToolMeasurements, fit: FrameFit, basis: Array, name: str) -> None:
+    """Refuse directions that other poses would determine or that holding the tool does not fix."""
+    pairs = measurements.pairs
+    design = jacobian(fit.frames, _workspace(measurements)) * pairs.unit[:, None] * pairs.scale
+    resolvable = _shown_elsewhere(
+        basis, design.reshape(-1, N_STEP), oriented=measurements.is_oriented
+    )
+    start = f"{name}: base and tool could not be located, because"
+    if resolvable.shape[1]:
+        raise NotIdentifiable(
+            f"{start} {open_parts_in_words(_open_parts(resolvable, fit.frames))} cannot be told "
+            f"from these {len(pairs)} poses; add some that turn about another axis, that are "
+            "displaced in another direction or further apart, from all over the workspace, or "
+            "measure them better."
+        )
+    by_tool = np.linalg.svd(basis[6:], compute_uv=False)
+    if np.any(by_tool <= _RESOLVED) or len(by_tool) < basis.shape[1]:
+        raise NotIdentifiable(
+            f"{start} no pose of this machine tells "
+            f"{open_parts_in_words(_open_parts(basis, fit.frames))}, even with the tool held in "
+            "the platform; measure orientations too, or the base itself."
+        )
+
+
+def _held_words(parts: list[OpenPart], tool_position: Array) -> str:
+    """Return a sentence that names the held parts."""
+    tool = [part for part in parts if part.frame == "tool"]
+    base = [part for part in parts if part.frame == "base"]
+    position = ", ".join(f"{x:g}" for x in tool_position)
+    with_it = f" from {open_parts_in_words(base)}" if base else ""
+    assumptions = [
+        f"the tool is taken at ({position}) m in the platform"
+        if part.kind == "position"
+        else "the tool is taken along the axes of the platform"
+        for part in tool
+    ]
+    return (
+        f"No pose of this machine tells {open_parts_in_words(tool)} apart{with_it}: "
+        f"{' and '.join(assumptions)} there, "
+        "and the base follows; where the tool is in the world does not depend on it."
+    )
+
+
+def _kept_directions(basis: Array) -> Array:
+    """Return a basis (12, 12 - k) of the steps that leave the held part of the tool at rest."""
+    held = basis.copy()
+    held[:6] = 0.0
+    U, s, _ = np.linalg.svd(held, full_matrices=True)
+    return np.asarray(U[:, int(np.sum(s > 0.0)) :])
+
+
+def _covariance_with(
+    information: Array,  # (12, 12): inverse covariance of a step in the same units
+    basis: Array,  # (12, k): undetermined directions
+    *,
+    oriented: bool,  # whether the orientation of the tool is known; else its rows are zero
+) -> Array:
+    """Return the covariance (12, 12) of a step; zero along held directions."""
+    Z = _kept_directions(basis) if basis.shape[1] else np.eye(N_STEP)
+    if not oriented:
+        U, s, _ = np.linalg.svd(Z[:9], full_matrices=False)
+        Z = np.zeros((N_STEP, int(np.sum(s > _RESOLVED))))
+        Z[:9] = U[:, s > _RESOLVED]
+    return np.asarray(Z @ np.linalg.solve(Z.T @ information @ Z, Z.T))

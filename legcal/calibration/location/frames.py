@@ -326,13 +326,9 @@ def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
     if not has_orientations:
         return
     wrong_order = "quaternions in the order w, x, y, z", "write qx, qy, qz, qw under their names"
-    yield replace(pairs, M=_reordered(pairs.M)), *wrong_order
+    as_read = Rotation.from_matrix(pairs.M).as_quat()
+    reordered = Rotation.from_quat(as_read[:, [1, 2, 3, 0]]).as_matrix()
+    yield replace(pairs, M=reordered), *wrong_order
     back = np.swapaxes(pairs.M, 1, 2)
     world = replace(pairs, M=back, p=-np.einsum("nij,nj->ni", back, pairs.p))
     yield world, "poses of the world in the tool", "give those of the tool in the world"
-
-
-def _reordered(M: Array) -> Array:
-    """Return orientations with quaternions w, x, y, z that were read as x, y, z, w."""
-    quaternions = Rotation.from_matrix(M).as_quat()
-    return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()

@@ -10,14 +10,21 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtrc
 
-from legcal.calibration.location.determinacy import Determinacy, determine, hold_open_part
 from legcal.calibration.location.document import (
     Location,
     LocationStatus,
     MeasurementNoise,
     RowResidual,
 )
-from legcal.calibration.location.fit import FrameFit, Inliers, find_inliers, fit
+from legcal.calibration.location.fit import (
+    Determinacy,
+    FrameFit,
+    Inliers,
+    determine,
+    find_inliers,
+    fit,
+    hold_open_part,
+)
 from legcal.calibration.location.frames import (
     FrameCandidates,
     jacobian,
@@ -95,8 +102,8 @@ def locate(
     """
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     _check_numbers(position_sigma, angle_sigma, tool_position, machine.size)
-    name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
+    name = measured.source
     measurements = tool_measurements(
         machine,
         measured,
@@ -306,11 +313,10 @@ def _tested(frame_fit: FrameFit) -> tuple[float | None, str]:
 
 
 def _noise(measurements: ToolMeasurements, frame_fit: FrameFit) -> MeasurementNoise:
-    rms = frame_fit.noise.rms
-    oriented = measurements.is_oriented
+    sigma, oriented = frame_fit.noise.sigma, measurements.is_oriented
     return MeasurementNoise(
-        position=float(rms[0]),
-        angle=float(rms[1]) if oriented else None,
+        position=float(sigma[0]),
+        angle=float(sigma[1]) if oriented else None,
         position_stated=measurements.noise.stated[0],
         angle_stated=measurements.noise.stated[1] and oriented,
         model=measurements.by_model is not None,
@@ -339,7 +345,7 @@ def _rows(
 
 def _off(measurements: ToolMeasurements, inliers: Inliers, i: int) -> str:
     """Return the distance of a row from its prediction by the others, in words."""
-    sigma = inliers.factor * measurements.noise.sigma[i]
+    sigma = inliers.sigma
     distance = f"{1e3 * inliers.distance[i]:.3g} mm"
     scatter = f"{1e3 * sigma[0]:.2g} mm"
     if measurements.pairs.oriented[i]:

@@ -15,7 +15,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
 
@@ -57,7 +57,7 @@ _MAX_POSITION = 1e6  # [m]; squares of far larger positions overflow
 _NORM_TOLERANCE = 1e-5  # deviation of the norm of a quaternion from one that is worth a note
 _NEGLIGIBLE = 1e-12  # negligible eigenvalue of the covariance, relative to the largest
 _RADIAN = 0.25  # mean leg lengths equivalent to a radian
-_FIRST_FACTOR = 1e-2  # start of the estimate of an unknown scatter [machine lengths, rad]
+_FIRST_SIGMA = 1e-2  # start of the estimate of an unknown scatter [machine lengths, rad]
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _COLUMNS = (
@@ -93,6 +93,9 @@ class ToolPoses:
     oriented: BoolArray  # (n,): whether the orientation was measured too
     numbers: IntArray  # (n,): numbers of the rows in the file, from 1
     notes: tuple[str, ...] = ()  # warnings about the table
+    source: str = "The tool poses"  # the file, for messages
+    columns: Mapping[str, str] = field(default_factory=dict)  # meaning of its headings
+    unit: str = "m and rad"  # of the readings in it, and where that is from, in words
 
     def __len__(self) -> int:
         return len(self.position)
@@ -105,6 +108,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     """
     joints = [column.name for column in reading_columns(machine.legs)]
     sheet = read = None
+    columns: dict[str, str] = {}  # meaning of the other headings
     header = _first_line(path)
     if not any(re.search(rf"\b{re.escape(joint)}\b", header) for joint in joints):
         sheet = ReadingsSheet(path, machine, "pose")
@@ -119,7 +123,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         reshape=(
             None
             if sheet is None or read is None
-            else lambda lines: _tool_columns(lines, sheet.taken, read.q, joints)
+            else lambda lines: _tool_columns(lines, sheet.taken, read.q, joints, columns)
         ),
     )
     readings, notes = readings_in(table, machine.legs)
@@ -138,8 +142,6 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     table.check()
     q = np.full((len(table), machine.n_legs), math.nan)
     q[:, list(machine.motors)] = readings
-    if read is not None:
-        notes = (*notes, f"{path}: readings are in {read.unit}, {read.unit_from}.")
     if worst > _NORM_TOLERANCE:
         notes = (
             *notes,
@@ -153,6 +155,9 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         oriented=oriented,
         numbers=np.arange(1, len(table) + 1),
         notes=notes,
+        source=str(path),
+        columns={} if sheet is None else {**sheet.taken, **columns},
+        unit="m and rad" if read is None else f"{read.unit}, {read.unit_from}",
     )
 
 
@@ -167,8 +172,9 @@ def _tool_columns(
     taken: Mapping[str, str],  # meaning of each heading that the sheet of readings uses
     q: Array,  # (n_rows, n_motors) [m or rad]
     joints: Sequence[str],
+    columns: dict[str, str],
 ) -> Lines:
-    """Return lines under our names in metres and radians, with readings."""
+    """Return lines under our names in metres and radians, with readings; fill *columns*."""
     (number, header), below = lines[0], lines[1:]
     known = {split_heading(column.name)[0]: column.name for column in _COLUMNS}
     names, factors = dict[int, str](), dict[int, Decimal]()
@@ -180,6 +186,7 @@ def _tool_columns(
         if name or taken.get(text) not in (*joints, "view", "image", "pose", "time"):
             names[i] = name or text.lower()
             factors[i] = Decimal(repr({**LENGTH, **ANGLE}.get(unit, 1.0)))
+            columns[text] = names[i]
     rows: Lines = []
     for (line, cells), of_row in zip(below, q.tolist(), strict=True):
         rows.append((line, [*map(str, of_row), *(in_unit(cells[i], factors[i]) for i in names)]))
@@ -214,42 +221,15 @@ def _orientations(table: Table) -> tuple[Array, BoolArray, float]:
 
 @dataclass(frozen=True, eq=False)
 class PoseNoise:
-    """Standard deviations of the rows."""
+    """Standard deviations of a component of all positions and of all orientations."""
 
-    # (n, 2): standard deviation of position [m] and orientation [rad] of each row, up to ``factor``
-    sigma: Array
-    factor: Array  # (2,): common factors of all positions and all orientations
-    # whether the standard deviations of positions and of orientations were stated; otherwise their
-    # factor is estimated
+    sigma: Array  # (2,) [m], [rad]
+    # whether each was stated; otherwise it is estimated
     stated: tuple[bool, bool]
-
-    def of(self, rows: BoolArray | IntArray) -> PoseNoise:
-        """Return the noise of selected rows."""
-        return replace(self, sigma=self.sigma[rows])
-
-    def scaled(self, factor: Array) -> PoseNoise:
-        """Return a copy with other factors."""
-        return replace(self, factor=factor)
-
-    @property
-    def min_factor(self) -> Array:
-        """The smallest plausible factor of each kind, (2,)."""
-        return np.asarray(MIN_SIGMA / self.sigma.min(axis=0))
-
-    @property
-    def rms(self) -> Array:
-        """Standard deviations of a component, rms over the rows, (2,) [m], [rad]."""
-        return np.asarray(self.factor * np.sqrt((self.sigma**2).mean(axis=0)))
-
-    def standard_deviations(self) -> Array:
-        """Return the standard deviations, (n, 6) [m, rad]."""
-        return np.repeat(self.sigma * self.factor, 3, axis=1)
 
     def whitening(self, oriented: BoolArray) -> Array:
         """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero if not measured."""
-        sigma = self.standard_deviations()
-        W = np.zeros((*sigma.shape, 6))
-        W[:, range(6), range(6)] = 1.0 / sigma
+        W = np.tile(np.diag(np.repeat(1.0 / self.sigma, 3)), (len(oriented), 1, 1))
         W[~oriented, 3:] = 0.0
         return W
 
@@ -272,7 +252,6 @@ class ToolMeasurements:
         return replace(
             self,
             pairs=self.pairs.of(rows),
-            noise=self.noise.of(rows),
             by_model=None if self.by_model is None else self.by_model[rows],
         )
 
@@ -311,11 +290,15 @@ def tool_measurements(
         oriented=poses.oriented,
         length=_RADIAN * machine.size,
     )
+    stated = position_sigma is not None, angle_sigma is not None or not poses.oriented.any()
+    sigma = np.array([position_sigma or _FIRST_SIGMA * pairs.length, angle_sigma or _FIRST_SIGMA])
+    if not poses.oriented.any():
+        sigma[1] = 1.0
     return ToolMeasurements(
         machine=machine,
         poses=poses,
         pairs=pairs,
-        noise=_noise(poses, position_sigma, angle_sigma, pairs.length),
+        noise=PoseNoise(sigma, stated),
         by_model=_motions_by_model(machine, T),
         fewest=fewest,
     )
@@ -336,17 +319,6 @@ def _check_count(poses: ToolPoses, name: str, fewest: int) -> None:
         f"poses {kind}{' were measured' * (not poses.oriented.any())}, with rotations about two "
         "axes where the machine has them; measure more poses."
     )
-
-
-def _noise(
-    poses: ToolPoses, position_sigma: float | None, angle_sigma: float | None, length: float
-) -> PoseNoise:
-    """Return the stated standard deviations, and a start for the others."""
-    stated = position_sigma is not None, angle_sigma is not None or not poses.oriented.any()
-    factor = np.array([position_sigma or _FIRST_FACTOR * length, angle_sigma or _FIRST_FACTOR])
-    if not poses.oriented.any():
-        factor[1] = 1.0
-    return PoseNoise(np.ones((len(poses), 2)), factor, stated)
 
 
 def _of_table(problem: Problem, name: str) -> Problem:
