@@ -43,7 +43,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import NotIdentifiable
 from legcal.machine.parameters import vector_of
 from legcal.report.render import Report
-from legcal.simulation.study import Record
+from legcal.simulation.paper import Record
 
 ERRORS = StartErrors(0.002, float(np.deg2rad(1.0)), 0.015, float(np.deg2rad(1.5)), full=False)
 LARGEST_RATIO = 1.02

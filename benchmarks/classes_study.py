@@ -63,7 +63,7 @@ from legcal.machine.leg import Leg, radius_name
 from legcal.machine.parameters import vector_of
 from legcal.paper.criteria import Criteria
 from legcal.report.render import Report, report
-from legcal.simulation.study import Record, failure_of
+from legcal.simulation.paper import Record, failure_of
 
 NOMINAL, FIT = "nominal", "fit"
 STEPS: tuple[Criteria, ...] = ("literal", "default")

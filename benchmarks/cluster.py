@@ -29,8 +29,7 @@ from legcal import load_dataset
 from legcal.calibration.board import rough_placement
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.progress import no_progress
-from legcal.simulation.paper import PaperStudy
-from legcal.simulation.study import run_study
+from legcal.simulation.paper import PaperStudy, run_study
 from legcal.workers import Workers, in_turn, worker_pool
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "hexapod"

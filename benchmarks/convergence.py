@@ -35,7 +35,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.leg import Leg
 from legcal.report.render import Report
-from legcal.simulation.study import Record
+from legcal.simulation.paper import Record
 
 FAR = 5.0  # standard deviations
 ENOUGH = 0.99  # of the runs must be right

@@ -14,7 +14,7 @@ import numpy as np
 from legcal import calibrate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.calibration.result import Calibration
-from legcal.data.axes import axes_from_outlines
+from legcal.data.outlines import axes_from_outlines
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import KinematicParameters, point_like_legs
 from legcal.machine.parameters import to_vector

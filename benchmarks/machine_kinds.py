@@ -64,8 +64,8 @@ from legcal.machine.leg import radius_name
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import simulate
+from legcal.simulation.paper import failure_of
 from legcal.simulation.settings import Level, SimulationSettings, parameter_errors
-from legcal.simulation.study import failure_of
 from legcal.vision.cylinder import EPSILON
 
 N_VIEWS, N_POSES = 3, 15

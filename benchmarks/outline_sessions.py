@@ -26,9 +26,8 @@ from legcal.calibration.joint_fit.variables import (
     platform_poses,
     start_from,
 )
-from legcal.data.axes import axes_from_outlines
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, axes_from_outlines
 from legcal.descriptions.new_model import create_model
 from legcal.descriptions.table import described_machine
 from legcal.errors import DidNotConverge
@@ -43,7 +42,6 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries, moved_legs, parametrize
 from legcal.machine.rods import (
     actuator_index,
-    arms_at,
     ends_at_poses,
     reading_legs,
     readings_of_rods,
@@ -53,11 +51,10 @@ from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.cameras import cameras_around, mild_lens
-from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of
+from legcal.simulation.observe import OutlineNoise, Scene, noisy_outlines, outlines_of, take_images
 from legcal.simulation.paper import noncoplanar_hexapod
-from legcal.simulation.poses import draw_poses
+from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import dressed, pose_machine
-from legcal.simulation.visibility import take_images
 from legcal.vision.camera import Camera
 
 COPLANAR, NONCOPLANAR = "6-spu-coplanar", "6-spu-noncoplanar"
@@ -193,24 +190,18 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     at = RigidTransform.concatenate([platform_in_base(machine, T) for T in drawn.poses])
     rotation: Rotation = at.rotation
     R, t = closed_poses(legs, machine.frame_legs, rotation.as_matrix(), at.translation)
-    # Joint centres stand where the equations of the legs put them, to the last digit.
-    A, B = ends_at_poses(legs, R, t)
-    A_base, B_base = (
-        np.array([machine.T_base_Rb.apply(points) for points in ends]) for ends in (A, B)
-    )
-    arms = arms_at(legs, readings_of_rods(legs, R, t))
-    in_base = {
-        j: machine.T_base_Rb.apply(ends.reshape(-1, 3)).reshape(ends.shape)
-        for j, ends in arms.items()
-    }
-    scene = Scene(A_base, B_base, views, images, in_base)
+    _, B = ends_at_poses(legs, R, t)
+    in_base = [np.array([getattr(m, side) for m in machines]) for side in "AB"]
+    scene = Scene(in_base[0], in_base[1], views, images)
     outlines = outlines_of(scene, OutlineNoise(sigma_px, None))
     most = _MOST_LEGS if machine.n_legs >= _MANY_LEGS else machine.n_legs
     seen = []
     for v in range(n_views):
         rows = np.flatnonzero(images.view == v)
-        length = [[leg.length_px * leg.is_seen for leg in images.shown[r]] for r in rows]
-        longest = np.argsort(-np.mean(length, axis=0), kind="stable")
+        length = np.zeros(len(legs))
+        for image in (images.shown[r] for r in rows):
+            np.add.at(length, image.leg, np.where(image.is_arm, 0.0, image.length_px))
+        longest = np.argsort(-length, kind="stable")
         seen.append(sorted(longest[:most].tolist()))
     shown = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
     told = np.flatnonzero([j in seen[images.view[r]] for r, j in shown])

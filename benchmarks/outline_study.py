@@ -32,7 +32,7 @@ from rich.text import Text
 from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
 from legcal.report.render import Report, report, table
-from legcal.simulation.study import Record, failure_of, run_study
+from legcal.simulation.paper import Record, failure_of, run_study
 from legcal.workers import processors
 
 Found = dict[str, Any]

@@ -19,9 +19,10 @@ from legcal.machine.leg import Cylinder as Visible
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.simulation.poses import commanded_poses
+from legcal.simulation.observe import legs_in_image, shares
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.scene import prepare_view
+from legcal.simulation.session import commanded_poses
 from legcal.simulation.settings import ParameterErrors, Sampling, Spread
 from legcal.simulation.solids import (
     Box,
@@ -34,15 +35,14 @@ from legcal.simulation.solids import (
     pose_machine,
 )
 from legcal.simulation.truth import write_true_model
-from legcal.simulation.visibility import LegView, legs_in_image
 from legcal.vision.camera import Camera
+from legcal.vision.visibility import Seen
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 VISIBLE = 0.5  # of a leg's length in one piece, from which on it must be found
 SIZES = ((640, 480),) * 7 + ((1024, 768),) * 3 + ((1600, 1200), (2448, 2048))
 WIDTHS = (12.0, 60.0)  # of the legs [px], for every 640 px of the picture's width the upper one
 TRIES = 60  # of cameras and occluders
-Shown = tuple[tuple[LegView, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Truth:
     A_base, B_base : (n_images, n_legs, 3) array
         Joint centres [m].
     cylinders : tuple, for each leg a tuple of SolidCylinder
-    shown : tuple, for each image a tuple of LegView, one for each leg
+    shown : tuple of Seen, for each image
         What can be seen of the legs.
     width : (n_images, n_legs) array
         Width of the thickest cylinder of each leg, in the middle of the leg [px].
@@ -98,13 +98,15 @@ class Truth:
     A_base: Array
     B_base: Array
     cylinders: tuple[tuple[Visible, ...], ...]
-    shown: tuple[tuple[LegView, ...], ...]
+    shown: tuple[Seen, ...]
     width: Array
 
     @property
     def visible(self) -> BoolArray:
         """Which legs must be found, (n_images, n_legs)."""
-        return np.asarray((_shares(self.shown) >= VISIBLE) & (self.width >= WIDTHS[0]))
+        return np.asarray(
+            (_shares(self.shown, self.width.shape[1]) >= VISIBLE) & (self.width >= WIDTHS[0])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +235,7 @@ def _lens(rng: np.random.Generator, gamma: float) -> Camera:
 
 def _viewpoint(
     truth: Machine, machines: tuple[PosedMachine, ...], gamma: float, rng: np.random.Generator
-) -> tuple[Camera, RigidTransform, Shown]:
+) -> tuple[Camera, RigidTransform, tuple[Seen, ...]]:
     """Return a camera, a place from which it sees enough legs, and how much of each leg."""
     joints = np.concatenate([np.concatenate([m.A, m.B]) for m in machines])
     centre, size = joints.mean(axis=0), float(np.linalg.norm(np.ptp(joints, axis=0)))
@@ -255,21 +257,21 @@ def _viewpoint(
         if any(m.encloses(T.translation) for m in machines):
             continue
         shown = _shown(truth, machines, camera, T)
-        if (_shares(shown) >= VISIBLE).sum(axis=1).mean() >= least:
+        if (_shares(shown, truth.n_legs) >= VISIBLE).sum(axis=1).mean() >= least:
             return camera, T, shown
     raise RuntimeError("no place for a camera was found")
 
 
 def _shown(
     truth: Machine, machines: tuple[PosedMachine, ...], camera: Camera, T: RigidTransform
-) -> Shown:
-    """Return what can be seen of every leg in every image."""
-    return tuple(legs_in_image(truth.legs, m, camera, T) for m in machines)
+) -> tuple[Seen, ...]:
+    """Return what can be seen of the legs in every image."""
+    return tuple(legs_in_image(truth.legs, m, camera, T, least=0.0) for m in machines)
 
 
-def _shares(shown: Shown) -> Array:
-    """Return the longest visible piece of every leg in every image, as part of its length."""
-    return np.array([[leg.share for leg in image] for image in shown])
+def _shares(shown: tuple[Seen, ...], n_legs: int) -> Array:
+    """Return what can be seen of every leg in every image, as part of its length."""
+    return np.array([shares(image, n_legs)[0] for image in shown])
 
 
 def _occluders(
@@ -277,17 +279,17 @@ def _occluders(
     machines: tuple[PosedMachine, ...],
     camera: Camera,
     T: RigidTransform,
-    free: Shown,
+    free: tuple[Seen, ...],
     rng: np.random.Generator,
-) -> tuple[tuple[PlacedSolid, ...], Shown]:
+) -> tuple[tuple[PlacedSolid, ...], tuple[Seen, ...]]:
     """Return boxes and rods in front that hide up to half of the legs, and what is left to see."""
-    seen = int((_shares(free) >= VISIBLE).sum())
+    seen = int((_shares(free, truth.n_legs) >= VISIBLE).sum())
     for _ in range(TRIES):
         solids = tuple(
             _occluder(i, machines[0], camera, T, rng) for i in range(int(rng.integers(1, 4)))
         )
         shown = _shown(truth, tuple(_beside(m, solids) for m in machines), camera, T)
-        left = int((_shares(shown) >= VISIBLE).sum())
+        left = int((_shares(shown, truth.n_legs) >= VISIBLE).sum())
         if 0.5 * seen <= left < seen and left >= 1.5 * len(machines):
             return solids, shown
     return (), free

@@ -24,7 +24,7 @@ import numpy as np
 
 from legcal import detect
 from legcal.calibration.detection import Detection
-from legcal.data.axes import axes_from_outlines
+from legcal.data.outlines import axes_from_outlines
 from legcal.geometry.types import Array, IntArray
 from legcal.vision.cylinder import angles_of_direction
 

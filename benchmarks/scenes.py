@@ -42,8 +42,8 @@ from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognition import TWO_POSES, place_views
 from legcal.perception.tuning import JOINT_ERROR
 from legcal.perception.view_fit import refine_views
-from legcal.simulation.visibility import field_of_view
-from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
+from legcal.simulation.cameras import field_of_view
+from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import worker_pool
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
@@ -168,27 +168,18 @@ def _pose(poses: CameraPoses, i: int) -> RigidTransform:
 def ideal_pictures(scene: Scene) -> list[Picture]:
     """Return pictures whose pairs are exactly the visible stretches of the true legs."""
     truth, given, camera = scene.truth, scene.given, scene.given.camera
-    T, pixel = truth.T_base_camera.inv(), 1.0 / float(camera.K[0, 0])
-    legs = np.arange(len(given.leg_names))
+    pixel, legs = 1.0 / float(camera.K[0, 0]), np.arange(len(given.leg_names))
     pictures = []
     for row, shown in enumerate(truth.shown):
-        ends, width = [], []
-        for stretch in (s for leg in shown for s in leg.stretches):
-            A, B = truth.A_base[row, stretch.leg], truth.B_base[row, stretch.leg]
-            u = (B - A) / np.linalg.norm(B - A)
-            X = T.apply(A + np.outer([stretch.start, stretch.end], u))
-            normal = np.cross(X[0], X[1])
-            flat = np.linalg.norm(normal[:2]) / np.linalg.norm(normal)
-            ends.append(X[:, :2] / X[:, 2:])
-            width.append(2.0 * stretch.radius / (X[:, 2] * flat))
-        xy = np.array(ends).reshape(-1, 2, 2)
+        edges = camera.undistort(shown.ends[~shown.is_arm])  # (n, 2 outlines, 2 ends, 2)
+        xy, width = edges.mean(axis=1), np.linalg.norm(edges[:, 1] - edges[:, 0], axis=-1)
         step = xy[:, 1] - xy[:, 0]
         length = np.linalg.norm(step, axis=1)
         pairs = CandidatePairs(
             xy.mean(axis=1),
             step / length[:, None],
             0.5 * length,
-            np.array(width).reshape(-1, 2),
+            width,
             length,
             pixel,
         )
@@ -283,15 +274,9 @@ def _true_outlines(
     picture: NDArray[np.uint8], scene: Scene, row: int, leg: int, colour: tuple[int, int, int]
 ) -> None:
     """Draw both outlines of the visible stretches of a leg."""
-    truth, camera = scene.truth, scene.given.camera
-    T = truth.T_base_camera.inv()
-    A, B = T.apply(truth.A_base[row, leg]), T.apply(truth.B_base[row, leg])
-    u = (B - A) / np.linalg.norm(B - A)
-    for stretch in truth.shown[row][leg].stretches:
-        h = outlines_of_axis(u, A, stretch.radius)
-        for step in steps_to_outlines(h, stretch.radius):
-            ends = A + np.outer([stretch.start, stretch.end], u) + step
-            _line(picture, camera.project(ends), colour, 1)
+    shown = scene.truth.shown[row]
+    for ends in shown.ends[(shown.leg == leg) & ~shown.is_arm].reshape(-1, 2, 2):
+        _line(picture, ends, colour, 1)
 
 
 def _line(

@@ -28,8 +28,8 @@ from legcal.machine.parameters import geometries, in_joint_frames, moved_legs
 from legcal.machine.rods import reading_legs
 from legcal.simulation.cameras import mild_lens
 from legcal.simulation.dataset import simulate
-from legcal.simulation.poses import draw_poses
 from legcal.simulation.rendering.appearance import CAMERAS, Appearance
+from legcal.simulation.session import draw_poses
 from legcal.simulation.settings import Distribution, ParameterErrors, SimulationSettings, Spread
 from legcal.simulation.truth import write_model_with
 from legcal.vision.camera import intrinsic_names

@@ -32,11 +32,11 @@ from .planning.request import plan as plan
 from .report.calibration_page import write_report as write_report
 from .simulation.dataset import simulate as simulate
 from .simulation.observe import TableNoise as TableNoise
+from .simulation.observe import Viewpoint as Viewpoint
 from .simulation.rendering.appearance import Appearance as Appearance
 from .simulation.settings import ParameterErrors as ParameterErrors
 from .simulation.settings import SimulationSettings as SimulationSettings
 from .simulation.settings import Spread as Spread
-from .simulation.visibility import Viewpoint as Viewpoint
 from .version import __version__ as __version__
 
 __all__: list[str]

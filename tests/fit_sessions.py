@@ -52,10 +52,10 @@ from legcal.machine.rods import (
 from legcal.simulation import observe
 from legcal.simulation.observe import (
     OutlineNoise,
+    Viewpoint,
     moved_outlines,
     outlines_of,
 )
-from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
 

@@ -24,15 +24,14 @@ from legcal.data.dataset_file import DatasetEntry
 from legcal.data.new_dataset import NewDatasetDocument
 from legcal.descriptions.table import TableFile
 from legcal.exports.formats import ExportDocument
-from legcal.files.published import write_schemas
+from legcal.files.folder import write_schemas
 from legcal.files.schema import Document, SparseDocument
 from legcal.machine.files import MechanismFile
 from legcal.machine.inspection import Inspection
 from legcal.planning.session import PlanDocument
 from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
-from legcal.simulation.paper import PaperDocument
-from legcal.simulation.study import StudyHeading
+from legcal.simulation.paper import PaperDocument, StudyHeading
 from legcal.vision.board import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
 

@@ -10,9 +10,8 @@ import numpy as np
 from machines import from_vector
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.axes import LegAxes, axes_from_outlines, axes_of_table
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, axes_of_table
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import point_like_legs
@@ -21,15 +20,16 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import to_vector
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import (
+    Images,
     OutlineNoise,
     Scene,
     TableNoise,
+    Viewpoint,
     axes_in_images,
     outlines_of,
 )
 from legcal.simulation.paper import PAPER_VIEWS, paper_cameras
-from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import simulate_session, streams
+from legcal.simulation.session import draw_poses, simulate_session, streams
 from legcal.simulation.settings import (
     Distribution,
     Level,
@@ -39,8 +39,9 @@ from legcal.simulation.settings import (
     Spread,
 )
 from legcal.simulation.truth import write_true_model
-from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint
 from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
+from legcal.vision.visibility import Seen
 
 SIGMA_Q = 2e-6  # [m]
 
@@ -75,31 +76,31 @@ def plain_scene(
     arms: Mapping[tuple[int, str], Array] | None = None,  # which parts are arms: their ends
 ) -> Scene:
     """Return a scene in which nothing is hidden: images show legs over one part of their length."""
-    length, arms = np.linalg.norm(B - A, axis=-1), arms or {}
-    shown = []
-    for row, k in enumerate(pose.tolist()):
-        stretches: list[list[Stretch]] = [[] for _ in length[k]]
-        of_arms: list[Stretch | None] = [None for _ in length[k]]
-        for (j, part), radius in radii.items():
-            if seen is not None and j not in seen[row]:
-                continue
-            whole = length[k, j]
-            if (j, part) in arms:
-                whole = np.linalg.norm(np.diff(arms[j, part][k], axis=0))
-            start, end = (float(part_of * whole) for part_of in span)
-            stretch = Stretch(j, part, radius, start, end)
-            if (j, part) in arms:
-                of_arms[j] = stretch
-            else:
-                stretches[j].append(stretch)
+    arms, shown = arms or {}, list[Seen]()
+    for row, (v, k) in enumerate(zip(view.tolist(), pose.tolist(), strict=True)):
+        keys = [key for key in radii if seen is None or key[0] in seen[row]]
+        of_arm = np.array([key in arms for key in keys], dtype=np.bool_)
+        ends = [arms[key][k] if key in arms else (A[k, key[0]], B[k, key[0]]) for key in keys]
+        ends = views[v].T_base_camera.inv().apply(np.reshape(ends, (-1, 3))).reshape(-1, 2, 3)
+        along, radius = ends[:, 1] - ends[:, 0], np.array([radii[key] for key in keys])
+        u = along / np.linalg.norm(along, axis=1, keepdims=True)
+        h = outlines_of_axis(u, ends[:, 0], radius)
+        axis = ends[:, :1] + np.array(span)[:, None] * along[:, None]
+        px = views[v].camera.project(axis[:, None] + steps_to_outlines(h, radius)[:, :, None])
         shown.append(
-            tuple(
-                LegView((span[1] - span[0]) * bool(s), 0.0, tuple(s), arm)
-                for s, arm in zip(stretches, of_arms, strict=True)
+            Seen(
+                np.zeros(len(keys), dtype=np.intp),
+                np.array([j for j, _ in keys], dtype=np.intp),
+                of_arm,
+                tuple(part for _, part in keys),
+                h,
+                px,
+                np.tile(span, (len(keys), 1)),
+                np.linalg.norm(px[:, :, 1] - px[:, :, 0], axis=-1).mean(axis=1),
             )
         )
     images = Images(view, pose, np.zeros(len(view), dtype=np.intp), tuple(shown))
-    return Scene(A, B, tuple(views), images, {j: ends for (j, _), ends in arms.items()})
+    return Scene(A, B, tuple(views), images)
 
 
 @cache

@@ -14,8 +14,8 @@ import numpy as np
 from legcal.files.motions import MotionEntry
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import SimulatedDataset, simulate
+from legcal.simulation.observe import Viewpoint
 from legcal.simulation.settings import Level, SimulationSettings
-from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 

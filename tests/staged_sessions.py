@@ -10,8 +10,8 @@ from hexapod_sessions import PaperSession, disturbed_hexapod, moved, paper_sessi
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.identify.session import Session
-from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements
+from legcal.data.outlines import LegAxes, axes_from_outlines
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.leg import KinematicParameters, Leg
 from legcal.machine.model import Machine

@@ -25,7 +25,7 @@ from toy_studies import Draws
 
 from legcal import workers
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.simulation.study import run_study
+from legcal.simulation.paper import run_study
 from legcal.workers import Workers, worker_pool
 
 

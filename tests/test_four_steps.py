@@ -11,7 +11,7 @@ from hexapod_sessions import PaperSession, extreme_poses, nominal_of
 from machines import from_vector
 from staged_sessions import Observed, errors, exact_session, noisy_session, shipped, staged
 
-from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.data.outlines import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import LegKind, point_like_legs

@@ -31,8 +31,8 @@ ROOMS = (
 BESIDE = "simulation"  # it knows the truth
 # The modules of each room that other rooms use; all others are its own affair.
 PUBLIC: dict[str, set[str]] = {
-    "geometry": {"axes", "covariances", "lines", "motions", "rotations", "types"},
-    "files": {"folder", "motions", "published", "quantity", "reading", "schema", "table"},
+    "geometry": {"covariances", "lines", "motions", "rotations", "types"},
+    "files": {"folder", "motions", "quantity", "reading", "schema", "table"},
     "pages": {"document", "svg"},
     "machine": {
         "actuator",
@@ -72,7 +72,6 @@ PUBLIC: dict[str, set[str]] = {
         "visibility",
     },
     "data": {
-        "axes",
         "cache",
         "corners",
         "dataset",
@@ -89,7 +88,7 @@ PUBLIC: dict[str, set[str]] = {
         "readings_sheet",
         "reasons",
     },
-    "recordings": {"arrivals", "importing"},
+    "recordings": {"frames", "importing"},
     "estimation": {
         "clusters",
         "loss",
@@ -155,7 +154,7 @@ PUBLIC: dict[str, set[str]] = {
     },
     "viewer": {"click_server", "server", "shooting", "source", "view_server"},
     "cli": set(),
-    "simulation": {"dataset", "observe", "paper", "session", "settings", "study"},
+    "simulation": {"dataset", "observe", "paper", "session", "settings"},
 }
 OUTSIDE = {
     "__main__",

@@ -176,37 +176,25 @@ def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
     return Layout(tuple(legs))
 
 
-def _stops_on_the_chain(machine: Machine, readings: Array) -> bool:
-    try:
-        follow(machine, machine.home_configuration, readings, on_the_chain=True)
-    except DidNotConverge:
-        return True
-    return False
-
-
 @pytest.mark.parametrize(
-    ("leg_type", "seed", "stops"),
-    [("SS", 2, False), pytest.param("US", 6, True, marks=pytest.mark.system)],
+    ("leg_type", "seed"),
+    [("SS", 2), pytest.param("US", 6, marks=pytest.mark.system)],
 )
 def test_random_readings_give_the_same_poses_in_every_tree(
-    leg_type: str, seed: int, stops: bool, tmp_path: Path
+    leg_type: str, seed: int, tmp_path: Path
 ) -> None:
     machine = of_types([leg_type] * 6, seed=seed)
     cut = load_mechanism(write_machine(tmp_path / "cut", machine, _square(seed)))
     layout = _square(seed, hung="platform", sphere=False)
     other = load_mechanism(write_machine(tmp_path / "other", machine, layout))
     columns = slider_columns(other, other.motors)[0]
-    drawn = random_configurations(cut, 20 if stops else 8, 1)
-    stopped = 0
+    drawn = random_configurations(cut, 8, 1)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
         found = forward_kinematics(other, q)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
-        if stops and stopped < 1 and _stops_on_the_chain(other, q):
-            stopped += 1
-            closed = follow(other, other.home_configuration, q)
-            assert np.abs(other.chain.residual(closed)).max() < 1e-12
-            np.testing.assert_allclose(closed[columns], q, rtol=0.0, atol=1e-12)
-    assert stopped == stops
+    closed = follow(other, other.home_configuration, q)
+    assert np.abs(other.chain.residual(closed)).max() < 1e-12
+    np.testing.assert_allclose(closed[columns], q, rtol=0.0, atol=1e-12)
 
 
 def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:

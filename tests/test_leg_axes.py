@@ -7,8 +7,13 @@ import pytest
 from hexapod_sessions import PaperSession, disturbed_hexapod, paper_session
 from staged_sessions import exact_session
 
-from legcal.data.axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import (
+    LegAxes,
+    Outlines,
+    axes_from_outlines,
+    join_axes,
+    outline_derivative,
+)
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array

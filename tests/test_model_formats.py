@@ -22,7 +22,7 @@ from legcal.machine.model import Machine
 from legcal.machine.model_writer import (
     write_model,
 )
-from legcal.machine.spanning_tree import close_loop
+from legcal.machine.spanning_tree import close_loops
 from legcal.machine.urdf import XmlProblems, parse_xml
 
 machine_of = cache(load_mechanism)
@@ -154,7 +154,7 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
     root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), XmlProblems(path)
     reader = MjcfReader(root, problems)
     reader.read_bodies()
-    pairs = [close_loop(loop, reader.tree)[0] for loop in reader.loops()]
+    pairs, _ = close_loops(list(reader.loops()), reader.tree, path)
     problems.raise_if_any()
     chain = ClosedChain(reader.tree.robot("machine").decode(), [])
     q = chain.neutral()

@@ -21,7 +21,7 @@ from outline_study import Found
 from thinned import thinned
 
 from legcal.machine.parameters import vector_of
-from legcal.simulation.study import Record
+from legcal.simulation.paper import Record
 
 NOISE = Noise()
 N_POSES = 5

@@ -15,8 +15,15 @@ from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
 from legcal.machine.shapes import Carrier, Occluder
 from legcal.perception.blocks import BlockLine
-from legcal.perception.outline import NARROW_BIAS, PartVerdict, measure_outlines, verdict
-from legcal.perception.part_edges import LONE_SCORE, EdgePair, _alone
+from legcal.perception.outline import (
+    LONE_SCORE,
+    NARROW_BIAS,
+    EdgePair,
+    PartVerdict,
+    _alone,
+    measure_outlines,
+    verdict,
+)
 from legcal.perception.placement import Placement, Search
 from legcal.perception.subpixel_edges import LostEdge, MeasuredEdge
 from legcal.vision.camera import Camera

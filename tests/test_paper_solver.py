@@ -14,8 +14,7 @@ from random_legs import closed_leg
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.axes import axis_angles, turned_axis
-from legcal.geometry.lines import normal_basis
+from legcal.geometry.lines import axis_angles, normal_basis, turned_axis
 from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations
 from legcal.machine.leg import EquationKind, JointType

@@ -17,7 +17,7 @@ from hexapod_example import Run
 
 import legcal
 from legcal.calibration.result import Calibration
-from legcal.files.published import schema_names
+from legcal.files.folder import schema_names
 
 ROOT = Path(__file__).parents[1]
 

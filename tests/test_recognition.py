@@ -30,9 +30,9 @@ from legcal.perception.camera_search import (
     pose_hypotheses,
 )
 from legcal.perception.candidate_pairs import find_candidate_pairs
-from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import (
     CameraPoses,
+    EdgeMaps,
     PairMatches,
     Picture,
     Pictures,

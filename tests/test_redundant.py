@@ -36,7 +36,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, readings_at, slider_columns
 from legcal.machine.parameters import geometries
 from legcal.simulation.dataset import simulate
-from legcal.simulation.poses import given_poses
+from legcal.simulation.session import given_poses
 
 
 def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Array) -> Array:

@@ -19,7 +19,7 @@ from legcal.cli.app import app
 from legcal.data.dataset_file import read_dataset_file
 from legcal.descriptions.table import read_description
 from legcal.errors import LegcalError
-from legcal.files.published import schema_names
+from legcal.files.folder import schema_names
 from legcal.files.schema import read_yaml
 from legcal.machine.files import read_mechanism_file
 from legcal.vision.camera_file import read_camera

@@ -23,8 +23,8 @@ from legcal.files.folder import write_atomically
 from legcal.geometry.types import Array
 from legcal.planning import shooting
 from legcal.planning.shooting import GuidedSession
-from legcal.recordings import arrivals
-from legcal.recordings.arrivals import LiveCamera, WatchedFolder
+from legcal.recordings import frames as recordings
+from legcal.recordings.frames import LiveCamera, WatchedFolder
 from legcal.viewer import shooting as dialogues
 from legcal.viewer.server import TOKEN_HEADER
 from legcal.viewer.shooting import Dialogue, DialogueServer
@@ -194,7 +194,7 @@ class Frames:
 
 
 def test_a_camera_photographs_when_two_frames_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arrivals, "_PAUSE", 0.0)
+    monkeypatch.setattr(recordings, "_PAUSE", 0.0)
     frames = Frames(4)
     camera = LiveCamera(0, 1024, 768, lambda _: frames)
     assert camera.poll(wanted=False) is None
@@ -202,7 +202,7 @@ def test_a_camera_photographs_when_two_frames_agree(monkeypatch: pytest.MonkeyPa
     assert path is not None
     assert np.array_equal(np.asarray(cv2.imread(str(path))), frames.last)
     assert frames.moving == -1  # the second frame at rest
-    monkeypatch.setattr(arrivals, "PATIENCE", 0.5)
+    monkeypatch.setattr(recordings, "PATIENCE", 0.5)
     frames.moving = 10**6
     with pytest.raises(OutOfResources, match="frames that still change"):
         camera.poll(wanted=True)

@@ -24,7 +24,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.report.session import simulation_table
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset, simulate, summary_document
-from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.observe import OutlineNoise, Viewpoint
 from legcal.simulation.settings import (
     Distribution,
     Level,
@@ -33,7 +33,6 @@ from legcal.simulation.settings import (
     Spread,
     requested,
 )
-from legcal.simulation.visibility import Viewpoint
 
 FEW = settings(poses=1, views=1)
 

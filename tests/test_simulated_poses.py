@@ -19,8 +19,8 @@ from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine, vectors_A_to_B
-from legcal.simulation import poses as module
-from legcal.simulation.poses import commanded_poses, draw_poses, given_poses
+from legcal.simulation import session as module
+from legcal.simulation.session import commanded_poses, draw_poses, given_poses
 from legcal.simulation.settings import DEFAULT_ERRORS, Sampling
 from legcal.simulation.truth import write_true_model
 

@@ -15,7 +15,7 @@ from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.meshes import ray_caster
 from legcal.machine.model import Machine, vectors_A_to_B
-from legcal.simulation.poses import draw_poses
+from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import (
     Box,
     Mesh,

@@ -8,7 +8,7 @@ from machines import from_vector
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.axes import LegAxes
+from legcal.data.outlines import LegAxes
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
 from legcal.machine.configurations import JITTER
@@ -22,15 +22,15 @@ from legcal.simulation.paper import (
     ESTIMATORS,
     PAPER_VIEWS,
     SCALARS,
-    Means,
+    EstimatorRow,
     PaperStudy,
+    StudyResult,
     paper_cameras,
     paper_machine,
     platform_errors,
+    run_study,
 )
-from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import SimulatedSession, streams
-from legcal.simulation.study import StudyResult, run_study
+from legcal.simulation.session import SimulatedSession, draw_poses, streams
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:
@@ -92,11 +92,11 @@ def test_a_session_is_that_of_the_paper(name: str) -> None:
 
 def test_means_have_their_standard_deviations() -> None:
     drawn = np.random.default_rng(0).uniform(1.0, 2.0, (7, len(SCALARS)))
-    means = Means.of("coplanar", "literal", [
+    means = EstimatorRow.of("coplanar", "literal", [
         {**dict(zip(SCALARS, row.tolist(), strict=True)), "parameters": [float(row[0])]}
         for row in drawn
     ])  # fmt: skip
-    row, sigma = means.row().document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
+    row, sigma = means.document(), drawn.std(axis=0, ddof=1) / np.sqrt(len(drawn))
     assert row["dX_mm"] == pytest.approx(1e3 * drawn[:, 0].mean())
     assert row["dE_deg"] == pytest.approx(np.rad2deg(drawn[:, 1].mean()))
     assert row["parameters_mm"] == pytest.approx([1e3 * drawn[:, 0].mean()])

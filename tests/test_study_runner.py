@@ -8,7 +8,7 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.simulation.study import DOCUMENT_NAME, run_study
+from legcal.simulation.paper import DOCUMENT_NAME, run_study
 
 
 def test_runs_do_not_depend_on_their_number_and_are_counted(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from legcal.data.axes import LegAxes, axes_of_table
+from legcal.data.outlines import LegAxes, axes_of_table
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray

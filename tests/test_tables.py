@@ -16,16 +16,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
-from legcal.data.axes import (
-    LegAxes,
-    axes_from_outlines,
-    axes_of_table,
-    join_axes,
-)
 from legcal.data.measurements import row_names
 from legcal.data.outlines import (
     MEASURED,
+    LegAxes,
     Outlines,
+    axes_from_outlines,
+    axes_of_table,
+    join_axes,
     no_outlines,
     read_observations,
     write_observations,

@@ -16,17 +16,12 @@ from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.simulation.cameras import cameras_around
+from legcal.simulation.observe import legs_in_image, shares, take_images
 from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
-from legcal.simulation.visibility import (
-    MIN_SHARE,
-    LegView,
-    legs_in_image,
-    take_images,
-)
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import DistortionModel
-from legcal.vision.visibility import Bodies, in_picture, pixels_inside, visible_parts
+from legcal.vision.visibility import Bodies, Seen, in_picture, pixels_inside, visible_parts
 
 FAR = np.array([1.4, 0.3, 0.25])
 MIDDLE = np.array([0.0, 0.0, 0.2])
@@ -53,7 +48,7 @@ def box(centre: Array, size: tuple[float, float, float]) -> Solid:
     return Solid("box", None, Box(size), RigidTransform.from_translation(centre))
 
 
-def seen_at_home(*more: Solid) -> tuple[LegView, ...]:
+def seen_at_home(*more: Solid) -> Seen:
     T = look_at(FAR, MIDDLE)
     return legs_in_image(
         posed_machine("hexapod").legs, posed("hexapod", 1, *more)[0], sample_camera(), T
@@ -69,51 +64,50 @@ def test_a_box_hides_what_the_lines_of_sight_say() -> None:
     height = (split + 0.5 * (FAR - split))[2]
     middle = 0.5 * (FAR + split)
     wall = box(np.array([middle[0], middle[1], height - 0.5]), (0.02, 2.0, 1.0))
-    [stretch] = seen_at_home(wall)[nearest].stretches
-    found = stretch.start / np.linalg.norm(B - A)
-    assert found == pytest.approx(0.3, abs=0.03)  # the box is thick, the leg is round
+    seen = seen_at_home(wall)
+    [(start, _)] = seen.span[seen.leg == nearest]
+    assert start == pytest.approx(0.3, abs=0.03)  # the box is thick, the leg is round
 
 
 def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
-    def view(share: float) -> LegView:
-        return LegView(share, 100.0, seen_at_home()[3].stretches)
-
-    assert MIN_SHARE == 0.4
-    assert view(0.41).is_seen
-    assert view(0.4).is_seen
-    assert not view(0.39).is_seen
+    machine, here = posed_machine("hexapod"), posed("hexapod", 1)[0]
+    least = list[float]()
+    for height in np.linspace(0.0, 0.6, 40):
+        T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, height]))  # more and more is below the image
+        image = machine.legs, here, sample_camera(), T
+        seen, every = legs_in_image(*image), legs_in_image(*image, least=0.0)
+        share = shares(every, machine.n_legs)[0]
+        np.testing.assert_array_equal(np.unique(seen.leg), np.flatnonzero(share >= 0.4))
+        least += share[share > 0.0].tolist()
+    assert min(abs(share - 0.4) for share in least) < 0.02
 
 
 def test_the_border_of_the_image_cuts_legs() -> None:
     machine, camera = posed_machine("hexapod"), sample_camera()
     here = posed("hexapod", 1)[0]
     T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, 0.45]))  # the base is below the image
-    views = legs_in_image(machine.legs, here, camera, T)
-    seen = [s for view in views for s in view.stretches]
-    assert seen
-    for s in seen:
-        u = (here.B[s.leg] - here.A[s.leg]) / np.linalg.norm(here.B[s.leg] - here.A[s.leg])
-        v = camera.project(T.inv().apply(here.A[s.leg] + s.start * u))[1]
-        assert v < camera.height
-    assert max(view.share for view in views) < 0.95
+    seen = legs_in_image(machine.legs, here, camera, T, least=0.0)
+    assert len(seen.leg)
+    assert np.all(seen.ends[..., 1] < camera.height)
+    assert seen.ends[..., 1].max() > camera.height - 20
+    assert shares(seen, machine.n_legs).max() < 0.95
 
 
 def test_a_thick_tube_covers_the_rod_in_it() -> None:
     leg = posed_machine("3-rps").legs[0]
     here = posed("3-rps", 1)[0]
     T = look_at(np.array([1.0, -0.8, 0.3]), MIDDLE)
-    [first, *_] = legs_in_image(
+    seen = legs_in_image(
         (leg,),
         PosedMachine(here.A[:1], here.B[:1], here.solids, here.vertices, here.faces),
         sample_camera(),
         T,
     )
-    tube, rod = first.stretches
+    tube, rod = (next(c for c in leg.cylinders if c.link == part) for part in seen.part)
     assert tube.radius > rod.radius
-    assert tube.end <= rod.start
+    assert seen.span[0, 1] <= seen.span[1, 0]
     length = float(np.linalg.norm(here.B[0] - here.A[0]))
-    hidden = next(c for c in leg.cylinders if c.link == rod.part)
-    assert hidden.span(length)[0] < tube.end < hidden.span(length)[1]
+    assert rod.span(length)[0] < seen.span[0, 1] * length < rod.span(length)[1]
 
 
 def test_cameras_around_a_machine_see_its_legs_and_all_of_it() -> None:
@@ -129,8 +123,7 @@ def test_cameras_around_a_machine_see_its_legs_and_all_of_it() -> None:
             assert np.all(inside < [camera.width, camera.height])
             assert not m.encloses(T.translation)
     images = take_images(machine.legs, posed_machines, views, [range(len(posed_machines))], 1)
-    seen = np.array([[leg.is_seen for leg in shown] for shown in images.shown])
-    assert seen.mean() > 0.7
+    assert np.mean([len(images.seen(row)) for row in range(len(images))]) > 0.7 * machine.n_legs
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2)))
@@ -200,20 +193,16 @@ def test_what_sight_predicts_of_legs_is_what_rays_at_their_solids_meet(name: str
         parts = zip(seen.image.tolist(), seen.leg.tolist(), seen.part, strict=True)
         predicted = dict(zip(parts, seen.ends, strict=True))
         for image, m in enumerate(here):
-            for leg in legs_in_image(machine.legs, m, view.camera, view.T_base_camera):
-                for s in (*leg.stretches, *([] if leg.arm is None else [leg.arm])):
-                    ends = predicted.pop((image, s.leg, s.part), None)
-                    if ends is None:
-                        missed += leg.is_seen
-                        continue
-                    is_arm = machine.legs[s.leg].is_arm(s.part)
-                    A, B = m.arms[s.leg] if is_arm else (m.A[s.leg], m.B[s.leg])
-                    u = (B - A) / np.linalg.norm(B - A)
-                    axis = A + np.array([[s.start], [s.end]]) * u
-                    first, last = view.camera.project(view.T_base_camera.inv().apply(axis))
-                    along = (ends.mean(axis=0) - first) @ (last - first)
-                    along /= np.sum((last - first) ** 2)
-                    beyond.append(max(-along.min(), along.max() - 1.0, 0.0))
+            shown = legs_in_image(machine.legs, m, view.camera, view.T_base_camera)
+            for leg, part, px in zip(shown.leg.tolist(), shown.part, shown.ends, strict=True):
+                ends = predicted.pop((image, leg, part), None)
+                if ends is None:
+                    missed += 1
+                    continue
+                first, last = px.mean(axis=0)
+                along = (ends.mean(axis=0) - first) @ (last - first)
+                along /= np.sum((last - first) ** 2)
+                beyond.append(max(-along.min(), along.max() - 1.0, 0.0))
         assert not predicted
     assert missed <= 0.15 * len(beyond)
     assert np.median(beyond) < 0.02

@@ -37,7 +37,7 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.machine.urdf import UrdfPatch
-from legcal.simulation.poses import draw_poses
+from legcal.simulation.session import draw_poses
 from legcal.simulation.settings import (
     Distribution,
     ParameterErrors,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from legcal.errors import DidNotConverge
-from legcal.simulation.study import Record
+from legcal.simulation.paper import Record
 
 
 @dataclass(frozen=True)

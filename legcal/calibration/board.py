@@ -18,10 +18,10 @@ from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.location.frames import PosePairs, search, transforms
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data.axes import LegAxes
 from legcal.data.corners import Corners, join_corners
 from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
 from legcal.data.measurements import Measurements
+from legcal.data.outlines import LegAxes
 from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.motions import components, pose_distance

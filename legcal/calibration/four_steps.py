@@ -11,10 +11,9 @@ from legcal.brief import brief
 from legcal.calibration.board import BoardViews, Poses, in_one_camera
 from legcal.calibration.joint_fit.variables import Start, start_from
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
-from legcal.data.axes import axes_from_outlines
 from legcal.data.image_tables import Order, inverse
 from legcal.data.measurements import few_views
-from legcal.data.outlines import Outlines, along_legs
+from legcal.data.outlines import Outlines, along_legs, axes_from_outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.machine.leg import Leg
 from legcal.machine.parameters import geometries, parametrization_of, reframed

@@ -58,8 +58,7 @@ from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import row_names
 from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
-from legcal.geometry.axes import turned_axis
-from legcal.geometry.lines import normal_basis
+from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences

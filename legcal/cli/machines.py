@@ -508,7 +508,7 @@ def schema(
     ] = None,
 ) -> None:
     """Print the JSON Schema of a file or document, for editors and programs that check them."""
-    from legcal.files.published import schema_content, schema_names
+    from legcal.files.folder import schema_content, schema_names
     from legcal.files.schema import closest
 
     names = schema_names()

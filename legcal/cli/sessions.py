@@ -268,7 +268,7 @@ def shoot(
 
     from legcal.files.quantity import LENGTH, parse_quantity
     from legcal.planning.shooting import GuidedSession
-    from legcal.recordings.arrivals import LiveCamera, WatchedFolder
+    from legcal.recordings.frames import LiveCamera, WatchedFolder
     from legcal.viewer.server import LOCAL, Address, check_address
     from legcal.viewer.shooting import WORDS, Dialogue, DialogueServer
 

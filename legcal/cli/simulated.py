@@ -166,8 +166,7 @@ def paper(
     from legcal.pages.document import Drawing
     from legcal.report.session import study_table
     from legcal.simulation.observe import TableNoise
-    from legcal.simulation.paper import PaperStudy
-    from legcal.simulation.study import StudyResult, run_study
+    from legcal.simulation.paper import PaperStudy, StudyResult, run_study
     from legcal.workers import processors
 
     def make_page(study_result: StudyResult, folder: Path) -> None:

@@ -291,10 +291,26 @@ def load_dataset(
             f"({entry.measurements}), needed a relative path inside it; move the table there."
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
-    cameras = _read_cameras(camera_paths, problems)
+    cameras = dict[Path, Camera]()
+    for camera_path in dict.fromkeys(camera_paths):
+        try:
+            cameras[camera_path] = read_camera(camera_path)
+        except DatasetError as error:
+            problems += error.facts
     mechanism = _mechanism_path(folder, entry.mechanism)
     machine = load_mechanism(mechanism)
-    problems += _leg_problems(yaml_path, entry.views, machine.leg_names)
+    problems += [
+        entry_problem(
+            yaml_path,
+            f"views.{name}.legs",
+            f"the unknown leg {describe(leg)}",
+            "legs of the mechanism",
+            closest(leg, machine.leg_names),
+        )
+        for name, view in entry.views.items()
+        for leg in view.legs or ()
+        if leg not in machine.leg_names
+    ]
     if problems:
         raise DatasetError(problems)
     views = tuple(
@@ -306,7 +322,15 @@ def load_dataset(
     sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
     unread = unread_motors(table_path, machine.legs)
     if unread:
-        _check_unread(table_path, machine, unread)
+        # Without readings of what moves joints at A, their positions are unknown.
+        moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
+        if moving:
+            columns = f"column{'s' * (len(moving) > 1)} {few(moving)}"
+            raise DatasetError(
+                f"{table_path}, {columns}: the readings could not be left open: found empty cells "
+                "in all rows of what moves joints at the base, needed its readings, since the "
+                "images alone do not say where the rods begin; record them."
+            )
         machine = load_mechanism(mechanism, without=unread)
         by_joint = {name: sigma for name, sigma in by_joint.items() if name not in unread}
     rows, notes = read_measurements(
@@ -353,18 +377,6 @@ def load_dataset(
     if unusable:
         raise DatasetError(_without_photographs(dataset) or [problem for _, problem in unusable])
     return dataset
-
-
-def _check_unread(path: Path, machine: Machine, unread: Sequence[str]) -> None:
-    """Refuse unread motors that move joints at A: the positions of A would be unknown."""
-    moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
-    if moving:
-        columns = f"column{'s' * (len(moving) > 1)} {few(moving)}"
-        raise DatasetError(
-            f"{path}, {columns}: the readings could not be left open: found empty cells in all "
-            "rows of what moves joints at the base, needed its readings, since the images alone do "
-            "not say where the rods begin; record them."
-        )
 
 
 def _without_readings(path: Path, machine: Machine, unread: Sequence[str]) -> str:
@@ -427,41 +439,12 @@ def _invisible(dataset: Dataset) -> list[str]:
     ]
 
 
-def _read_cameras(paths: tuple[Path, ...], problems: list[str | Problem]) -> dict[Path, Camera]:
-    """Return the camera of each file; files that cannot be used add to the problems."""
-    cameras = {}
-    for path in dict.fromkeys(paths):
-        try:
-            cameras[path] = read_camera(path)
-        except DatasetError as error:
-            problems += error.facts
-    return cameras
-
-
 def _mechanism_path(folder: Path, named: str) -> Path:
     """Return the model's path relative to the dataset if there is one, else a shipped one."""
     path = folder / named
     if not os.path.isfile(path) and named in shipped_names():
         return shipped_folder("models") / f"{named}.yaml"
     return path
-
-
-def _leg_problems(
-    path: Path, views: Mapping[str, ViewEntry], leg_names: Sequence[str]
-) -> list[Problem]:
-    """Return the legs of views that the mechanism does not have."""
-    return [
-        entry_problem(
-            path,
-            f"views.{name}.legs",
-            f"the unknown leg {describe(leg)}",
-            "legs of the mechanism",
-            closest(leg, leg_names),
-        )
-        for name, view in views.items()
-        for leg in view.legs or ()
-        if leg not in leg_names
-    ]
 
 
 def _view(name: str, entry: ViewEntry, camera: Camera) -> View:

@@ -23,8 +23,8 @@ from pydantic import (
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
 from legcal.errors import Code, DatasetError, Problem, UsageError
+from legcal.files.folder import with_schema
 from legcal.files.motions import MotionEntry
-from legcal.files.published import with_schema
 from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
 from legcal.files.table import format_table

@@ -245,7 +245,10 @@ def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]
     wanted = max(1, round(fraction * measurements.n_rows))
     most = np.minimum(np.ceil(fraction * shown.sum(axis=0)), shown.sum(axis=0) - 1)
     held_out = np.zeros(measurements.n_rows, dtype=np.bool_)
-    for pose in _shuffled_poses(dataset):
+    m = dataset.measurements
+    rows = canonical_order(m, dataset.machine.leg_names).rows
+    poses = np.array(list(dict.fromkeys(m.pose[rows].tolist())), dtype=np.intp)
+    for pose in np.random.default_rng(_SEED).permutation(poses):
         tried = held_out | (measurements.pose == pose)
         fits = np.all(shown[tried].sum(axis=0) <= np.maximum(most, 0.0))
         if fits and tried.sum() <= wanted:
@@ -272,14 +275,6 @@ def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
         corners=None if corners is None else corners.at(rows),
         landmarks=None if dataset.landmarks is None else dataset.landmarks.at(rows),
     )
-
-
-def _shuffled_poses(dataset: Dataset) -> IntArray:
-    """Return all poses in a random order that does not depend on the order of the rows."""
-    measurements = dataset.measurements
-    rows = canonical_order(measurements, dataset.machine.leg_names).rows
-    poses = np.array(list(dict.fromkeys(measurements.pose[rows].tolist())), dtype=np.intp)
-    return np.random.default_rng(_SEED).permutation(poses)
 
 
 def _shown(dataset: Dataset) -> BoolArray:

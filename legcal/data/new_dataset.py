@@ -231,7 +231,12 @@ def plan_new_dataset(
     """
     folder, path, destination = Path(folder), Path(readings), Path(destination)
     machine = load_mechanism(model)
-    _check_place(folder, destination)
+    check_path(destination, DATASET_FOLDER)
+    if destination.resolve().is_relative_to(folder.resolve()):
+        raise UsageError(
+            f"{destination}: the dataset could not be written: found a place in the folder of the "
+            "photographs, which is not changed, needed one beside it; give another folder with -o."
+        )
     photographs = find_photographs(folder)
     by_names, pattern = with_likely_views(photographs)
     sheet = ReadingsSheet(path, machine, "photograph")
@@ -357,16 +362,6 @@ def _link(path: Path, place: Path) -> None:
         os.link(path, place)
     except OSError:
         shutil.copy2(path, place)
-
-
-def _check_place(folder: Path, destination: Path) -> None:
-    """Refuse to write into the folder of the photographs."""
-    check_path(destination, DATASET_FOLDER)
-    if destination.resolve().is_relative_to(folder.resolve()):
-        raise UsageError(
-            f"{destination}: the dataset could not be written: found a place in the folder of the "
-            "photographs, which is not changed, needed one beside it; give another folder with -o."
-        )
 
 
 def _sigmas(

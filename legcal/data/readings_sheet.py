@@ -104,18 +104,21 @@ class ReadingsSheet:
     ) -> None:
         self.path = path
         self.motors = [machine.legs[j] for j in machine.motors]
-        headings = _Headings(path, self.motors)
+        self.taken: dict[str, str] = {}
+        self.notes: list[str] = []
+        self._joints = [column.name for column in reading_columns(self.motors)]
+        self._heading_units: dict[str, str] = {}  # by joint
+        columns = [Column(name, "text", required=False) for name in _COLUMNS]
+        columns += [Column(joint, what="reading") for joint in self._joints]
         self._table = read_table(
             path,
             "table of readings",
             "row",
-            headings.columns(),
+            columns,
             needed=f"one row for each {row_noun}; write them",
-            reshape=headings.reshape,
+            reshape=self._renamed_columns,
         )
         self._table.check()
-        self._joints, self._heading_units = headings.joints, headings.units
-        self.taken, self.notes = headings.taken, headings.notes
 
     def __contains__(self, name: str) -> bool:
         return name in self._table
@@ -174,6 +177,97 @@ class ReadingsSheet:
         last = [abs(unit.size) * 10.0**digit for digit, unit in zip(digits, units, strict=True)]
         return SheetReadings(q, np.array(last), units, unit_from, lengths)
 
+    def _renamed_columns(self, lines: Lines) -> Lines:
+        """Return the lines with columns renamed to our names; unknown columns are left out."""
+        number, header = lines[0]
+        if sum(is_number(text) and not text.isdecimal() for text in header) > 1:
+            raise DatasetError(
+                f"{self.path}: the readings could not be found: found numbers in the first line, "
+                f"needed headings that name the legs ({self.motors[0].name}) or number them (L1, "
+                "q1, 1); add a first line of headings."
+            )
+        split = [split_heading(text) for text in header]
+        known = (*LENGTH, *READING_ANGLES)
+        readings = [split_heading(x.replace("°", "deg"), known, others=True) for x in header]
+        meaning: dict[int, str] = {}
+        clock: dict[int, float] = {}  # seconds in a unit of a column of times
+        for i in sorted(range(len(header)), key=lambda i: _is_vague(header[i])):
+            key = split[i][0]
+            for name in _COLUMNS:
+                timed = _TIME.fullmatch(key) if name == "time" else None
+                if (_means(header[i]) == name or timed) and name not in meaning.values():
+                    meaning[i] = name
+                if timed and meaning.get(i) == name:
+                    clock = {i: _SECONDS[timed[1]]}
+        free = [i for i in range(len(header)) if i not in meaning]
+        meaning |= self._joints_of_columns(free, readings, header)
+        for i, name in meaning.items():
+            self.taken[header[i]] = name
+            if name in self._joints:
+                self._heading_units[name] = unit = readings[i][1] or _foreign(readings[i][0])
+                if unit and not _is_known(unit):
+                    raise DatasetError(
+                        f"{self.path}, header: the unit of {describe(header[i])} could not be "
+                        f"used: found '{unit}', needed one of {', '.join(known)}, or counts with "
+                        "their scale (80 counts/mm); convert the readings, or leave the unit out "
+                        "of the heading if it is none."
+                    )
+        unused = [text for i, text in enumerate(header) if i not in meaning and text]
+        if unused:
+            is_single = len(unused) == 1
+            self.notes.append(
+                f"Column{'' if is_single else 's'} {few([describe(text) for text in unused])} of "
+                f"{self.path} {'is' if is_single else 'are'} not used."
+            )
+        kept = sorted(meaning)
+        below = [
+            (line, [_dated(cells[i], clock.get(i)) for i in kept])
+            if len(cells) == len(header)
+            else (line, cells)
+            for line, cells in lines[1:]
+        ]
+        return [(number, [meaning[i] for i in kept]), *below]
+
+    def _joints_of_columns(
+        self, free: Sequence[int], split: Sequence[tuple[str, str]], header: Sequence[str]
+    ) -> dict[int, str]:
+        """Return the joint of each column of readings, by names or else by numbers."""
+        joint_of_column: dict[int, str] = {}
+        for joint, leg in zip(self._joints, self.motors, strict=True):
+            words = {split_heading(joint)[0], split_heading(leg.name)[0]}
+            columns_of_leg = [i for i in free if any(_names(split[i][0], word) for word in words)]
+            if len(columns_of_leg) > 1:
+                raise DatasetError(
+                    f"{self.path}, header: the readings of leg '{leg.name}' could not be decided: "
+                    "found the columns "
+                    f"{' and '.join(describe(header[i]) for i in columns_of_leg)}, needed one; "
+                    "remove the others."
+                )
+            joint_of_column |= dict.fromkeys(columns_of_leg, joint)
+        if len(joint_of_column) == len(self._joints):
+            return joint_of_column
+        numbered = {i: m for i in free if (m := _NUMBERED.fullmatch(split[i][0]))}
+        families: dict[tuple[str, str], dict[int, int]] = {}
+        for i, m in numbered.items():
+            families.setdefault((m[1], m[3]), {})[int(m[2])] = i
+        n = len(self._joints)
+        fits = [
+            [by_number[k] for k in sorted(by_number)]
+            for by_number in families.values()
+            if sorted(by_number) in (list(range(1, n + 1)), list(range(n)))
+        ]
+        if len(fits) == 1:
+            return dict(zip(fits[0], self._joints, strict=True))
+        missing = [leg.name for leg, joint in zip(self.motors, self._joints, strict=True)
+                   if joint not in joint_of_column.values()]  # fmt: skip
+        columns = few([describe(header[i]) for i in free]) or "none"
+        raise DatasetError(
+            f"{self.path}, header: the readings of {few(missing)} could not be found: found the "
+            f"columns {columns}, needed one for each of the {n} legs with an encoder, named after "
+            f"the leg ({self.motors[0].name}), its joint ({self._joints[0]}) or its number "
+            "(L1, q1, 1); rename the columns."
+        )
+
     def _units(
         self, option: str | None, lengths: bool
     ) -> tuple[tuple[ReadingUnit, ...], str, bool]:
@@ -219,114 +313,6 @@ class ReadingsSheet:
                 "The table could not be read: found --lengths and motors that move joints at A, "
                 "needed readings of these; leave out --lengths."
             )
-
-
-class _Headings:
-    """The meaning of the headings of a table of readings."""
-
-    def __init__(self, path: Path, motors: Sequence[Leg]) -> None:
-        self.path = path
-        self.motors = motors
-        self.joints = [column.name for column in reading_columns(motors)]
-        self.taken: dict[str, str] = {}  # meaning of each heading that is used
-        self.units: dict[str, str] = {}  # unit in the heading of each joint
-        self.notes: list[str] = []
-
-    def columns(self) -> list[Column]:
-        """Return the columns of the table once its headings are understood."""
-        texts = [Column(name, "text", required=False) for name in _COLUMNS]
-        return [*texts, *(Column(joint, what="reading") for joint in self.joints)]
-
-    def reshape(self, lines: Lines) -> Lines:
-        """Return the lines with columns renamed to our names; unknown columns are left out."""
-        number, header = lines[0]
-        if sum(is_number(text) and not text.isdecimal() for text in header) > 1:
-            raise DatasetError(
-                f"{self.path}: the readings could not be found: found numbers in the first line, "
-                f"needed headings that name the legs ({self.motors[0].name}) or number them (L1, "
-                "q1, 1); add a first line of headings."
-            )
-        split = [split_heading(text) for text in header]
-        known = (*LENGTH, *READING_ANGLES)
-        readings = [split_heading(x.replace("°", "deg"), known, others=True) for x in header]
-        meaning: dict[int, str] = {}
-        clock: dict[int, float] = {}  # seconds in a unit of a column of times
-        for i in sorted(range(len(header)), key=lambda i: _is_vague(header[i])):
-            key = split[i][0]
-            for name in _COLUMNS:
-                timed = _TIME.fullmatch(key) if name == "time" else None
-                if (_means(header[i]) == name or timed) and name not in meaning.values():
-                    meaning[i] = name
-                if timed and meaning.get(i) == name:
-                    clock = {i: _SECONDS[timed[1]]}
-        free = [i for i in range(len(header)) if i not in meaning]
-        meaning |= self._joints(free, readings, header)
-        for i, name in meaning.items():
-            self.taken[header[i]] = name
-            if name in self.joints:
-                self.units[name] = unit = readings[i][1] or _foreign(readings[i][0])
-                if unit and not _is_known(unit):
-                    raise DatasetError(
-                        f"{self.path}, header: the unit of {describe(header[i])} could not be "
-                        f"used: found '{unit}', needed one of {', '.join(known)}, or counts with "
-                        "their scale (80 counts/mm); convert the readings, or leave the unit out "
-                        "of the heading if it is none."
-                    )
-        unused = [text for i, text in enumerate(header) if i not in meaning and text]
-        if unused:
-            is_single = len(unused) == 1
-            self.notes.append(
-                f"Column{'' if is_single else 's'} {few([describe(text) for text in unused])} of "
-                f"{self.path} {'is' if is_single else 'are'} not used."
-            )
-        kept = sorted(meaning)
-        below = [
-            (line, [_dated(cells[i], clock.get(i)) for i in kept])
-            if len(cells) == len(header)
-            else (line, cells)
-            for line, cells in lines[1:]
-        ]
-        return [(number, [meaning[i] for i in kept]), *below]
-
-    def _joints(
-        self, free: Sequence[int], split: Sequence[tuple[str, str]], header: Sequence[str]
-    ) -> dict[int, str]:
-        """Return the joint of each column of readings, by names or else by numbers."""
-        joint_of_column: dict[int, str] = {}
-        for joint, leg in zip(self.joints, self.motors, strict=True):
-            words = {split_heading(joint)[0], split_heading(leg.name)[0]}
-            columns_of_leg = [i for i in free if any(_names(split[i][0], word) for word in words)]
-            if len(columns_of_leg) > 1:
-                raise DatasetError(
-                    f"{self.path}, header: the readings of leg '{leg.name}' could not be decided: "
-                    "found the columns "
-                    f"{' and '.join(describe(header[i]) for i in columns_of_leg)}, needed one; "
-                    "remove the others."
-                )
-            joint_of_column |= dict.fromkeys(columns_of_leg, joint)
-        if len(joint_of_column) == len(self.joints):
-            return joint_of_column
-        numbered = {i: m for i in free if (m := _NUMBERED.fullmatch(split[i][0]))}
-        families: dict[tuple[str, str], dict[int, int]] = {}
-        for i, m in numbered.items():
-            families.setdefault((m[1], m[3]), {})[int(m[2])] = i
-        n = len(self.joints)
-        fits = [
-            [by_number[k] for k in sorted(by_number)]
-            for by_number in families.values()
-            if sorted(by_number) in (list(range(1, n + 1)), list(range(n)))
-        ]
-        if len(fits) == 1:
-            return dict(zip(fits[0], self.joints, strict=True))
-        missing = [leg.name for leg, joint in zip(self.motors, self.joints, strict=True)
-                   if joint not in joint_of_column.values()]  # fmt: skip
-        columns = few([describe(header[i]) for i in free]) or "none"
-        raise DatasetError(
-            f"{self.path}, header: the readings of {few(missing)} could not be found: found the "
-            f"columns {columns}, needed one for each of the {n} legs with an encoder, named after "
-            f"the leg ({self.motors[0].name}), its joint ({self.joints[0]}) or its number "
-            "(L1, q1, 1); rename the columns."
-        )
 
 
 def _names(key: str, word: str) -> bool:

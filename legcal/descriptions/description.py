@@ -715,16 +715,12 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         elif not outside[1] and abs(other - chosen) > 1e-9:
             problems.append(
                 f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the right one in home_readings, or limit the "
-                f"travel to one side of the turning point of {_rods_in_words(rods)}."
+                f"{unit}, {needed} and not two; write the right one in home_readings, or limit "
+                "the travel to one side of the turning point of "
+                f"{legs_in_words([leg.name for leg in rods])}."
             )
     _refuse(problems)
     return readings
-
-
-def _rods_in_words(rods: Sequence[Leg]) -> str:
-    """Return rods in words."""
-    return legs_in_words([leg.name for leg in rods])
 
 
 def _project(described: Description, home: Home) -> Home:

@@ -20,8 +20,7 @@ import numpy as np
 from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
 from legcal.descriptions.table import BESIDE, described_machine, read_description
 from legcal.errors import LegcalError, Problem, UsageError
-from legcal.files.folder import new_files
-from legcal.files.published import with_schema
+from legcal.files.folder import new_files, with_schema
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import plain_name
 from legcal.geometry.lines import cross, normal_basis
@@ -331,7 +330,15 @@ def write_template(folder: Path, given: Dimensions, *, force: bool = False) -> l
     table = family_table(replace(given, family=family, name=name))
     tables = {f"{name}.yaml": with_schema("table", _yaml(table))}
     if "actuators" not in table:
-        tables[f"{name}.csv"] = _csv(table)
+        leg_type = table["type"].split("-")[-1]
+        lengths = [table.get("min_length", ""), table.get("max_length", "")]
+        radii = [table["radius"]["tube"], table["radius"]["rod"]]
+        lines = ["leg,type,bx,by,bz,px,py,pz,min_length,max_length,tube,rod,unit"]
+        joints = zip(table["base_joints"], table["platform_joints"], strict=True)
+        for j, (A, B) in enumerate(joints, start=1):
+            cells: Sequence[Any] = [f"leg{j}", leg_type, *A, *B, *lengths, *radii, table["unit"]]
+            lines.append(",".join(_flow(cell) for cell in cells))
+        tables[f"{name}.csv"] = "\n".join(lines) + "\n"
     with new_files(folder, "template", tables, force=force) as temporary:
         for file, content in tables.items():
             (temporary / file).write_bytes(content.encode())
@@ -348,18 +355,6 @@ def _yaml(table: dict[str, Any]) -> str:
     name = "delta.yaml" if motors else "hexapod.yaml"
     template = files("legcal.descriptions") / "templates" / name
     return Template(template.read_text(encoding="utf-8")).substitute(shown)
-
-
-def _csv(table: dict[str, Any]) -> str:
-    leg_type = table["type"].split("-")[-1]
-    lengths = [table.get("min_length", ""), table.get("max_length", "")]
-    radii = [table["radius"]["tube"], table["radius"]["rod"]]
-    lines = ["leg,type,bx,by,bz,px,py,pz,min_length,max_length,tube,rod,unit"]
-    joints = zip(table["base_joints"], table["platform_joints"], strict=True)
-    for j, (A, B) in enumerate(joints, start=1):
-        cells: Sequence[Any] = [f"leg{j}", leg_type, *A, *B, *lengths, *radii, table["unit"]]
-        lines.append(",".join(_flow(cell) for cell in cells))
-    return "\n".join(lines) + "\n"
 
 
 def _flow(value: Any) -> str:

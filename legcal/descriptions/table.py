@@ -389,7 +389,18 @@ def read_description(
             table["name"] = name
         if unit is not None:
             table.setdefault("unit", unit)
-    _refuse_twice(path, table, given)
+    options = {entry: f"--{option.replace('_', '-')}" for option, entry in BESIDE.items()}
+    twice = [
+        f"{options[key]} beside {key if key in table else other}"
+        for key in given
+        for other in (key, *("types" for _ in [0] if key == "type"))
+        if _is_given(table.get(other))
+    ]
+    if twice:
+        raise ModelError(
+            f"{path}: the model could not be read: found {' and '.join(twice)} of the table, "
+            "needed one of them; leave out the option."
+        )
     if unit is not None and table.get("unit", unit) != unit:
         raise ModelError(
             f"{path}: the unit could not be decided: found --unit {unit} and "
@@ -426,22 +437,6 @@ def described_machine(table: Mapping[str, Any], source: Path) -> Description:
         check_links(description, problems)
     problems.raise_if_any()
     return description
-
-
-def _refuse_twice(path: Path, table: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Refuse entries that are both in the table and on the command line."""
-    options = {entry: f"--{option.replace('_', '-')}" for option, entry in BESIDE.items()}
-    twice = [
-        f"{options[key]} beside {key if key in table else other}"
-        for key in given
-        for other in (key, *("types" for _ in [0] if key == "type"))
-        if _is_given(table.get(other))
-    ]
-    if twice:
-        raise ModelError(
-            f"{path}: the model could not be read: found {' and '.join(twice)} of the table, "
-            "needed one of them; leave out the option."
-        )
 
 
 def _is_given(value: Any) -> bool:
@@ -562,14 +557,6 @@ def _actuators(file: TableFile) -> dict[str, Actuator]:
     return actuators
 
 
-def _home_readings(file: TableFile) -> dict[str, float]:
-    """Return the stated readings of motors at home [m or rad]."""
-    return {
-        **{name: file.metres(q) for name, q in (file.home_readings or {}).items()},
-        **{name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
-    }
-
-
 def _check_home_readings(file: TableFile, problems: Problems) -> None:
     """Note home readings without a motor of their kind."""
     for key, turns in (("home_readings", False), ("home_readings_deg", True)):
@@ -675,7 +662,10 @@ def _description(file: TableFile, source: str) -> Description:
                     "Readings are assumed to be zero at the shortest length of a leg (min_length): "
                     "give offsets, the length at reading zero, if they are not."
                 ]
-            limits = [_decimal_difference(end, offset or 0.0) for end in (low, high)]
+            limits = [
+                float(Decimal(repr(float(end))) - Decimal(repr(float(offset or 0.0))))
+                for end in (low, high)
+            ]
         if kind is LegKind.PASSIVE and offset is None and _is_pair(file.travel):
             limits = None  # a single pair means readings
         tube, rod = (radius.tube, radius.rod) if isinstance(radius, Radii) else (radius, radius)
@@ -695,7 +685,8 @@ def _description(file: TableFile, source: str) -> Description:
     frame = None if file.base_frame is None else tuple(file.base_frame)
     described = Description(
         file.name, source, file.unit, tuple(legs), _home(file), frame, tuple(notes),
-        _home_readings(file),
+        {name: file.metres(q) for name, q in (file.home_readings or {}).items()}
+        | {name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
     )  # fmt: skip
     if file.home is not None and file.home.height is not None:
         has_turn = file.home.quat_xyzw is not None or file.home.rpy_deg is not None
@@ -704,10 +695,6 @@ def _description(file: TableFile, source: str) -> Description:
     if file.platform_in == "base":
         return joints_from_base(described)
     return described
-
-
-def _decimal_difference(minuend: float, subtrahend: float) -> float:
-    return float(Decimal(repr(float(minuend))) - Decimal(repr(float(subtrahend))))
 
 
 def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:

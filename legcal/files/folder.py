@@ -3,20 +3,25 @@
 A set of files is first written into a temporary folder beside its destination (inside it, if it is
 a separate file system) and moved there when it is complete. A run that stops before that leaves the
 destination as it was; temporary folders left behind by killed runs are ignored.
+
+The files in ``schemas`` are made from the models that read and write the formats, by
+``tests/format_schemas.py``. A YAML that legcal writes names its schema in its first line, relative
+to itself, and the schema is written beside it: editors find it offline, wherever the folder goes.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
-from legcal.files.published import SCHEMAS, write_schemas
 from legcal.files.reading import read_json
 from legcal.files.schema import read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
@@ -357,3 +362,44 @@ def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path
                     elif not (new / name).exists():
                         os.unlink(destination / name)
             raise
+
+
+SCHEMAS = ".schemas"  # folder of schemas beside a YAML
+_HEADER = "# yaml-language-server: $schema={}/{}.json\n"
+_NAMED = re.compile(re.escape(_HEADER).replace(r"\{\}", r"([\w.-]+)").encode())
+
+
+def schema_names() -> list[str]:
+    """Return the names of the formats that have a schema."""
+    file_names = (entry.name for entry in files("legcal.files").joinpath("schemas").iterdir())
+    return sorted(name.removesuffix(".json") for name in file_names)
+
+
+def schema_content(name: str) -> bytes:
+    """Return the content of the schema file of a format."""
+    return files("legcal.files").joinpath("schemas", f"{name}.json").read_bytes()
+
+
+def with_schema(name: str, text: str) -> str:
+    """Return the text of a YAML with a header that names its schema."""
+    return _HEADER.format(SCHEMAS, name) + text
+
+
+def schemas_beside(path: Path, content: bytes) -> dict[Path, bytes]:
+    """Return the schema that a YAML names, by its place beside *path*; none if it names none."""
+    named = _NAMED.match(content) if path.suffix == ".yaml" else None
+    if named is None or named[1].decode() != SCHEMAS or named[2].decode() not in schema_names():
+        return {}
+    name = named[2].decode()
+    return {path.parent / SCHEMAS / f"{name}.json": schema_content(name)}
+
+
+def write_schemas(path: Path) -> None:
+    """Write the schema that a YAML names beside it, or nothing where there is no place for it."""
+    with suppress(OSError):  # it only helps editors
+        with path.open("rb") as file:
+            named = schemas_beside(path, file.readline())
+        for place, content in named.items():
+            if not place.is_symlink() and not place.parent.is_symlink():
+                place.parent.mkdir(exist_ok=True)
+                place.write_bytes(content)

@@ -21,8 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from legcal.errors import BadValue
-from legcal.geometry.axes import axis_angles, axis_angles_slope, turned_axis
-from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.lines import axis_angles, axis_angles_slope, cross, normal_basis, turned_axis
 from legcal.geometry.motions import matrix_applied
 from legcal.geometry.types import Array
 

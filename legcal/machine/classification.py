@@ -72,7 +72,17 @@ def classify_leg(
             _check_rod_alone(steps, motors, leg)
             slider, (n_lower, ends) = None, _rod(axes[1:], leg, within, axes[0].name)
             chain = LegChain(tuple(steps), tuple(poses), n_lower + 1, slider, *ends, steps[0])
-            _check_moves(chain, axes[0], within)
+            axis = axes[0]
+            is_turning = chain.steps[0].connection.type == "revolute"
+            if is_turning and axis.distance(chain.A) < within:
+                raise OutOfClass(
+                    f"the leg of motor '{axis.name}' is not supported",
+                    "the joint at A on the axis of the motor, which turns the rod and does not "
+                    "move its joint",
+                    "an arm between them",
+                    "remove it from name_mot if it has no motor, otherwise this machine cannot be"
+                    " calibrated with legcal",
+                )
             return chain
         if len(sliders) > 1 or 0 in sliders:
             reason = (
@@ -125,20 +135,6 @@ def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> 
             f"the slider '{slider}' beyond the motor '{leg}' on the base",
             "a rod of constant length there",
             "this machine cannot be calibrated with legcal",
-        )
-
-
-def _check_moves(chain: LegChain, axis: Axis, within: float) -> None:
-    """Check that an actuator that turns moves the joint at A."""
-    turns = chain.steps[0].connection.type == "revolute"
-    if turns and axis.distance(chain.A) < within:
-        raise OutOfClass(
-            f"the leg of motor '{axis.name}' is not supported",
-            "the joint at A on the axis of the motor, which turns the rod and does not "
-            "move its joint",
-            "an arm between them",
-            "remove it from name_mot if it has no motor, otherwise this machine cannot be"
-            " calibrated with legcal",
         )
 
 
@@ -506,7 +502,20 @@ def _carrier(
 def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> LegEnds:
     """Return the ends of a rod, given the number of joints at the base."""
     lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
-    A, B = _on_rod(_pivot(lower, None, leg, within), _pivot(upper, None, leg, within))
+    # The joint centres, or the feet of the (common) perpendicular
+    base, platform = _pivot(lower, None, leg, within), _pivot(upper, None, leg, within)
+    A, B = base.centre, platform.centre
+    if A is None and B is None:
+        v, w = base.axes[0], platform.axes[0]
+        A, B = nearest(v, w)
+        if A is None or B is None:  # parallel: at the origin of the joint at the base
+            A, B = v.point, w.foot(v.point)
+    elif A is None and B is not None:
+        A = base.axes[0].foot(B)
+    elif B is None and A is not None:
+        B = platform.axes[0].foot(A)
+    if A is None or B is None:
+        raise ValueError("a rod without any joint has no centre")
     length = float(np.linalg.norm(B - A))
     if length < within:
         raise OutOfClass(
@@ -527,23 +536,6 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
         )
     _check_axes(base, platform, u, leg)
     return base, platform, A, B, u, idle_spins
-
-
-def _on_rod(base: Pivot, platform: Pivot) -> tuple[Array, Array]:
-    """Return A and B of a rod: the joint centres, or the feet of the (common) perpendicular."""
-    A, B = base.centre, platform.centre
-    if A is None and B is None:
-        v, w = base.axes[0], platform.axes[0]
-        A, B = nearest(v, w)
-        if A is None or B is None:  # parallel: at the origin of the joint at the base
-            A, B = v.point, w.foot(v.point)
-    elif A is None and B is not None:
-        A = base.axes[0].foot(B)
-    elif B is None and A is not None:
-        B = platform.axes[0].foot(A)
-    if A is None or B is None:
-        raise ValueError("a rod without any joint has no centre")
-    return A, B
 
 
 def _places(axes: Sequence[Axis], within: float) -> list[list[Axis]]:

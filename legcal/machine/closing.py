@@ -116,7 +116,7 @@ def close_at(
             equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True
         )
         configuration, left = solution.points[0], solution.values[0]
-    off = _pose_error(machine, T_base_platform, configuration)
+    off = pose_error(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
         gap = worst_closure(machine, metre * left)
         problem = f"{gap}, needed less than {metre * CLOSED:.0e} m"
@@ -157,7 +157,7 @@ def _placed(
             machine.platform,
             T_base_platform,
         )
-        off = _pose_error(machine, T_base_platform, configuration)
+        off = pose_error(machine, T_base_platform, configuration)
         if off[0] > tolerance[0] or off[1] > tolerance[1]:
             raise _not_closed(
                 machine,
@@ -199,7 +199,7 @@ def closure_equations(
     return equations, retract
 
 
-def _pose_error(
+def pose_error(
     machine: Machine, T_base_platform: RigidTransform, configuration: Array
 ) -> tuple[float, float]:
     """Return distance [m] and angle [rad] of the platform from its required pose."""
@@ -431,19 +431,12 @@ def generic_configurations(machine: Machine, count: int) -> list[Array]:
 
 def project(machine: Machine, configuration: Array) -> Array | None:
     """Return the closed configuration nearest to an almost closed one, None if there is none."""
-    chain = machine.chain
-    weights = chain.row_weights(machine.size)
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        return (weights * residual)[None], (weights[:, None] * jacobian)[None]
-
+    every = np.ones(machine.chain.nv, dtype=np.bool_)
     solution = solve(
-        equations,
-        lambda points, step: chain.integrate(points[0], step[0])[None],
+        *closure_equations(machine, None, machine.size, every),
         configuration[None],
         tolerance=0.01 * CLOSED,
-        unit=chain.column_units(machine.size),
+        unit=machine.chain.column_units(machine.size),
         steps=15,
     )
     return solution.points[0] if solution.worst[0] < CLOSED else None

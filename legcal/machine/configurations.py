@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, Problem
 from legcal.geometry.lines import segment_distance
 from legcal.geometry.motions import motion_of
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.closing import LOOSE, free_motions, project, singularities, singularity
 from legcal.machine.kinematics import follow, follow_poses
 from legcal.machine.model import (
@@ -280,11 +280,6 @@ _REMEDIES = {
 }
 
 
-def near_ends(end: IntArray, draws: Array) -> Array:
-    """Return positions in the travel near given ends of it; 0 is the shortest, 1 the longest."""
-    return np.asarray(np.abs(end - JITTER * draws))
-
-
 def motor_travel(machine: Machine) -> tuple[Array, Array]:
     """Return the lowest and the highest reading of the motors, (n_motors,) [m]."""
     lower, upper = np.array([machine.legs[j].travel for j in machine.motors]).reshape(-1, 2).T
@@ -419,19 +414,17 @@ class Feasibility:
             return Cause.COLLISION, f"legs '{first}' and '{second}' collide"
         return None
 
-    def led(
-        self, here: Array, readings: Array, parts: Sequence[float], *, on_the_chain: bool = False
-    ) -> Array | Obstacle:
+    def led(self, here: Array, readings: Array, parts: Sequence[float]) -> Array | Obstacle:
         """Return the configuration at readings (n_motors,) after a straight path, or its obstacle.
 
         Feasibility is checked at the fractions *parts* of the path from configuration *here* (the
-        last is 1); *on_the_chain* as in :func:`follow`.
+        last is 1).
         """
         first = here[slider_columns(self._machine, self._machine.motors)[0]]
         for part in parts:
             q = readings if part == 1.0 else first + part * (readings - first)
             try:
-                here = follow(self._machine, here, q, min_step=_SHORTEST, on_the_chain=on_the_chain)
+                here = follow(self._machine, here, q, min_step=_SHORTEST)
             except DidNotConverge:
                 return Cause.LENGTHS, Cause.LENGTHS.value
             obstacle = self.obstacle(here, of_motors=part == 1.0)
@@ -493,7 +486,8 @@ def _followed(
     def drawn(shrink: float) -> Array:
         part = rng.random(len(home))
         if extreme:
-            part = near_ends(rng.integers(0, 2, len(home)), part)
+            # 0 is the shortest, 1 the longest.
+            part = np.asarray(np.abs(rng.integers(0, 2, len(home)) - JITTER * part))
         q = determining_readings(machine, (lower + part * (upper - lower))[None])[0]
         return np.asarray(q if shrink == 1.0 else np.clip(home + shrink * (q - home), lower, upper))
 
@@ -503,7 +497,7 @@ def _followed(
             full = _FULL_EXTREME if extreme else _FULL
             readings = drawn(_NEARER ** max(0, draw + 1 - full))
             start = machine.home_configuration
-            result = feasibility.led(start, readings, _WAY, on_the_chain=True)
+            result = feasibility.led(start, readings, _WAY)
             if not isinstance(result, tuple):
                 last = draw
                 yield result

@@ -10,9 +10,8 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from legcal.errors import BadValue, Code, ModelError, Problem, Problems
-from legcal.files.folder import RESULT
+from legcal.files.folder import RESULT, with_schema
 from legcal.files.motions import MotionEntry
-from legcal.files.published import with_schema
 from legcal.files.schema import (
     FileSchema,
     Number,

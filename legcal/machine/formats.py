@@ -27,8 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
-from legcal.machine.bodies import frame_link, rigid_bodies
-from legcal.machine.chain import ClosedChain
+from legcal.machine.chain import ClosedChain, frame_link, rigid_bodies
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,
@@ -509,9 +508,14 @@ def closed_near(
     rng = np.random.default_rng(1965)
     best: tuple[float, Array] | None = None
     drawn = chain.turns(start, links[0], links)
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        return residual[None], jacobian[None]
+
     for trial in range(TRIALS):
         away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
-        closed = _close(chain, away, unit)
+        closed = _solved(chain, equations, away, unit)
         if closed is None:
             continue
         turned = _turned(drawn, chain.turns(closed, links[0], links))
@@ -526,16 +530,6 @@ def _turned(before: Array, after: Array) -> float:
     if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # degenerate or not finite
         return math.inf
     return float(Rotation.from_matrix(apart).magnitude().sum())
-
-
-def _close(chain: ClosedChain, configuration: Array, unit: Array) -> Array | None:
-    """Return a closed configuration near a given one, or None."""
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        residual, jacobian = chain.linearize(points[0])
-        return residual[None], jacobian[None]
-
-    return _solved(chain, equations, configuration, unit)
 
 
 def _shortened(step: Array, unit: Array) -> Array:

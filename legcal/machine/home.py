@@ -48,31 +48,17 @@ _MAX_OUTSIDE_OF_LEG = 0.01  # relative to the leg length at home, for sliders wi
 def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTransform, Array]:
     """Return the home pose, stated or searched for, and the closed configuration there.
 
+    It is the nearest pose that meets all constraints of legs and plane. Files state home with few
+    digits; sliders absorb the rounding, but rods, revolute axes and universal joints do not.
+
     Raises
     ------
     ModelError, DidNotConverge
-        As :func:`project_home`, :func:`home_at_mid_travel` and
-        :func:`legcal.machine.closing.close_at`.
+        If home is more than 1 % of a leg length away from any such pose; and as
+        :func:`home_at_mid_travel` and :func:`legcal.machine.closing.close_at`.
     """
     start = home_at_mid_travel(machine) if home is None else home
-    projected = project_home(machine, start)
-    configuration = close_at(machine, projected, exact=False)
-    constrained = is_constrained(machine)
-    return platform_pose(machine, configuration) if constrained else projected, configuration
-
-
-def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
-    """Return the pose nearest to home that meets all constraints of legs and plane.
-
-    Files state home with few digits; sliders absorb the rounding, but rods, revolute axes and
-    universal joints do not.
-
-    Raises
-    ------
-    ModelError
-        If home is more than 1 % of a leg length away from any such pose.
-    """
-    projected, problem = project_pose(machine, home)
+    projected, problem = project_pose(machine, start)
     if problem is not None:
         raise ModelError(
             f"{machine.urdf.wording.home} could not be used",
@@ -81,7 +67,9 @@ def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
             machine.urdf.wording.correct_home,
             machine.yaml_path,
         )
-    return projected
+    configuration = close_at(machine, projected, exact=False)
+    constrained = is_constrained(machine)
+    return platform_pose(machine, configuration) if constrained else projected, configuration
 
 
 def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None) -> RigidTransform:

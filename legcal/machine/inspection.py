@@ -221,7 +221,10 @@ def singularity_note(machine: Machine) -> str | None:
     measure = singularity(machine, machine.home)
     if measure > LOOSE:
         return None
-    motion = _free_motion(machine)
+    jacobian = dimensionless(machine, machine.home.as_matrix()[None])[0]
+    motion = np.linalg.svd(jacobian)[2][-1]
+    motion /= max(np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:]))
+    motion = np.concatenate([motion[:3], machine.size * motion[3:]])
     nearly = "nearly " if measure > _MIN_SINGULARITY else ""
     return (
         f"the mechanism is {nearly}singular at home: the platform can {nearly}"
@@ -230,18 +233,6 @@ def singularity_note(machine: Machine) -> str | None:
         f"{machine.urdf.wording.correct_home}{_good_home(machine, motion)}, or the joints if they "
         "make similar figures on base and platform."
     )
-
-
-def _free_motion(machine: Machine) -> Array:
-    """Return the motion (6,) that motors hold least at home, in the base link.
-
-    A rotation about the mean of the platform joints [rad] and a displacement [m] of it; the larger
-    one, in leg lengths, is one.
-    """
-    jacobian = dimensionless(machine, machine.home.as_matrix()[None])[0]
-    motion = np.linalg.svd(jacobian)[2][-1]
-    motion /= max(np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:]))
-    return np.concatenate([motion[:3], machine.size * motion[3:]])
 
 
 def _in_words(motion: Array, size: float) -> str:

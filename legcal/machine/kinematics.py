@@ -3,18 +3,18 @@
 Poses are solved from the equations of the legs, configurations from the closures of the URDF in
 Pinocchio; both use the same solver. Forward kinematics follows the closed chain from a known
 configuration in steps that cannot cross a singularity, so that the assembly mode is kept and no leg
-is flipped. If joints of the spanning tree obstruct the path, the pose alone is followed and the
-chain is closed at its end.
+is flipped: the pose is followed, and the chain is closed at its end.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
-from legcal.geometry.motions import matrix_of, motion_of, motions_of, product
+from legcal.geometry.motions import motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import (
     CLOSED,
@@ -26,6 +26,7 @@ from legcal.machine.closing import (
     excludes_singularity,
     is_on_same_side,
     leg_scale,
+    pose_error,
     project_pose,
 )
 from legcal.machine.equations import (
@@ -34,7 +35,6 @@ from legcal.machine.equations import (
     machine_equations_at,
     violated_constraint,
 )
-from legcal.machine.leg import LegKind
 from legcal.machine.model import (
     Machine,
     Pose,
@@ -45,7 +45,7 @@ from legcal.machine.model import (
     slider_columns,
 )
 from legcal.machine.redundancy import contradictions
-from legcal.machine.solver import Equations, newton, poses_after, solve, walk_in_steps
+from legcal.machine.solver import Equations, newton, poses_after, solve
 from legcal.machine.ties import machine_ties
 
 CONTRACTION = 0.5  # largest step relative to the one before; for the first, to 1 rad or leg length
@@ -56,6 +56,7 @@ FEW_RESTARTS = 2  # restarts of single legs that do not close
 MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit is wrong
 MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
 FEW_STEPS = 12  # largest number of Newton steps
+NEAR = 0.01  # largest distance of the pose at which a chain closes [leg lengths, rad]
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
 
@@ -441,55 +442,29 @@ def follow(
     readings: Array,
     which: str = "",
     min_step: float = MIN_STEP,
-    on_the_chain: bool = False,
 ) -> Array:
     """Return the closed configuration at readings (n_motors,), followed from a closed one.
 
-    It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. Steps are at least the
-    fraction *min_step* of the path. With *on_the_chain* following stops if joints of the chain do:
-    early, but at a point that depends on the spanning tree. *which* names the readings in messages.
-    With redundant motors the least-squares pose is followed, and sliders are set to it. Motors with
+    It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. The platform is
+    followed on the equations of the legs, in steps of at least the fraction *min_step* of the
+    path, and the chain is closed at the end. *which* names the readings in messages. With
+    redundant motors the least-squares pose is followed, and sliders are set to it. Motors with
     NaN readings are free; the others must determine the pose.
 
     Raises
     ------
     DidNotConverge
-        If even the smallest steps do not contract or reach a singularity.
+        If even the smallest steps do not contract or reach a singularity, or if joints of the chain
+        cannot be closed at the end.
     """
     given = np.isfinite(readings)
     is_redundant = machine.is_redundant and bool(given.all())
-    motors = [j for j, is_given in zip(machine.motors, given, strict=True) if is_given]
-    q_columns, v_columns = slider_columns(machine, motors)
+    q_columns, v_columns = slider_columns(machine, np.array(machine.motors)[given].tolist())
     free = np.delete(np.arange(machine.chain.nv), v_columns)
-    first, last = configuration[q_columns], readings[given]
-    last_jacobian = machine.chain.linearize(configuration)[1][:, free]
-
-    def attempt(part: float) -> bool:
-        nonlocal configuration, last_jacobian
-        trial = configuration.copy()
-        trial[q_columns] = last if part == 1.0 else first + part * (last - first)
-        reached, jacobian = _closed_from(machine, trial, free)
-        if reached is None or _is_flipped(machine, reached):
-            return False
-        if not excludes_singularity(last_jacobian, jacobian):
-            ends = [
-                matrix_of(*machine.chain.placement(c, machine.base, machine.platform))
-                for c in (configuration, reached)
-            ]
-            if not is_on_same_side(*dimensionless(machine, np.array(ends), motors)):
-                return False
-        configuration, last_jacobian = reached, jacobian
-        return True
-
-    done = 0.0 if is_redundant else walk_in_steps(attempt, min_step)
-    if done == 1.0:
-        return configuration
     T = platform_pose(machine, configuration)
-    part = 0.0
-    if is_redundant or not on_the_chain:
-        now = configuration[slider_columns(machine, machine.motors)[0]]
-        (pose,), (part,) = follow_poses(machine, T, now, readings[None], min_step)
-        T = motion_of(pose[:, :3], pose[:, 3])
+    now = configuration[slider_columns(machine, machine.motors)[0]]
+    (pose,), (part,) = follow_poses(machine, T, now, readings[None], min_step)
+    T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
         if is_redundant:
             failure = _disagreement(machine, _nearest(machine, T, readings), readings, which)
@@ -498,13 +473,13 @@ def follow(
         raise DidNotConverge(
             Problem(
                 f"the pose at the readings{which} could not be reached: at "
-                f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
+                f"{100 * part:.1f} % of the way from the starting pose the "
                 "legs no longer close or the mechanism is singular, needed a regular path; check "
                 f"the readings and {machine.urdf.wording.home}.",
                 file=str(machine.yaml_path),
             )
         )
-    sliders = dict(zip(q_columns, last.tolist(), strict=True)) if not is_redundant else {}
+    sliders = {} if is_redundant else dict(zip(q_columns, readings[given].tolist(), strict=True))
     closed = _closed_at(machine, T, configuration, sliders, free)
     if closed is None:
         raise DidNotConverge(
@@ -590,49 +565,39 @@ def follow_poses(
         step[rows] *= np.where(good, 2.0, 0.5)
 
 
-def _closed_from(
-    machine: Machine, configuration: Array, free: IntArray
-) -> tuple[Array | None, Array]:
-    """Return the configuration closed with the motors fixed, or None, and its Jacobian."""
-    equations, retract = closure_equations(machine, None, machine.size, free)
-    solution = newton(
-        equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
-    )
-    return solution.points[0] if solution.worst[0] < CLOSED else None, solution.jacobian[0]
-
-
 def _closed_at(
     machine: Machine, T: RigidTransform, start: Array, sliders: dict[int, float], free: IntArray
 ) -> Array | None:
     """Return the closed configuration at a pose with some columns set, None if joints forbid it.
 
-    The platform is free only if slightly inexact axes require it.
+    It is the one that Newton steps lead to from the start, if they lead to the pose. The platform
+    is free only if slightly inexact axes require it.
     """
-    rng = np.random.default_rng(1965)
-    angles = machine.chain.rotation_columns()
-    turns = np.zeros((1 + RANDOM_ANGLES, machine.chain.nv))
-    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, machine.chain.nv))[:, angles]
-    tries = [(turn, True) for turn in turns] + [(turns[0], False)] * is_constrained(machine)
-    for turn, exact in tries:
-        there = machine.chain.integrate(start, turn)
-        try:
-            trial = close_at(machine, T, there, FEW_RESTARTS, exact=exact)
-        except DidNotConverge:
-            continue
+    chain, rng = machine.chain, np.random.default_rng(1965)
+    angles = chain.rotation_columns()
+    turns = np.zeros((1 + RANDOM_ANGLES, chain.nv))
+    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, chain.nv))[:, angles]
+    tries = [(turns[0], True), *[(turns[0], False)] * is_constrained(machine)]
+    tries += [(turn, True) for turn in turns[1:]]
+
+    def trials() -> Iterator[Array]:
+        if sliders:
+            yield start.copy()
+        for turn, exact in tries:
+            with suppress(DidNotConverge):
+                yield close_at(machine, T, chain.integrate(start, turn), FEW_RESTARTS, exact=exact)
+
+    equations, retract = closure_equations(machine, None, machine.size, free)
+    for trial in trials():
         trial[list(sliders)] = list(sliders.values())
-        closed, _ = _closed_from(machine, trial, free)
-        if closed is not None:
+        solution = newton(
+            equations, retract, trial[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
+        )
+        closed: Array = solution.points[0]
+        shift, turn = pose_error(machine, T, closed)
+        if solution.worst[0] < CLOSED and shift < NEAR * machine.size and turn < NEAR:
             return closed
     return None
-
-
-def _is_flipped(machine: Machine, configuration: Array) -> bool:
-    """Return whether a leg without a motor has shrunk through its base joint."""
-    rows = [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.PASSIVE]
-    if not rows:
-        return False
-    q = configuration[slider_columns(machine, rows)[0]]
-    return bool(np.any(machine.lengths_at(q, rows) <= 0.0))
 
 
 def _is_reversed(machine: Machine, poses: Array) -> BoolArray:

@@ -21,7 +21,7 @@ from legcal.geometry.lines import cross, distance_to_line, normal_basis
 from legcal.geometry.motions import matrix_inverse
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
-from legcal.machine.bodies import Connection
+from legcal.machine.chain import Connection
 
 TRAVEL_MARGIN = 0.05  # tolerance of the travel, relative to it
 # Default standard deviations of readings and of measured lengths, in mean leg lengths.

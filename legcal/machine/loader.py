@@ -19,8 +19,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
-from legcal.machine.bodies import Bodies, rigid_bodies
-from legcal.machine.chain import ClosedChain, Closure
+from legcal.machine.chain import Bodies, ClosedChain, Closure, rigid_bodies
 from legcal.machine.classification import (
     PERPENDICULAR,
     actuator_of,
@@ -137,7 +136,11 @@ def load_mechanism(
 
 def _load(source: Source) -> Machine:
     file, urdf = source.file, source.urdf
-    _check_origins(urdf)
+    # Beyond, rounding would hide the relative position of joints.
+    for joint in urdf.joints.values():
+        words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
+        away = float(np.linalg.norm(joint.T_parent_origin.translation))
+        _check_length(away, words, MAX_ORIGIN, urdf.path)
     _check_names(file, urdf, source.path)
     closures = sorted(  # in a fixed order, since sums depend on it
         source.closures, key=lambda closure: (closure.frame_1, closure.frame_2, closure.kind)
@@ -671,14 +674,6 @@ def _check_length(length: float, words: str, most: float, path: Path) -> None:
             _METRES,
             path,
         )
-
-
-def _check_origins(urdf: Urdf) -> None:
-    """Check that no joint is so far away that rounding hides the relative position of joints."""
-    for joint in urdf.joints.values():
-        words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
-        away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        _check_length(away, words, MAX_ORIGIN, urdf.path)
 
 
 def _check_spread(machine: Machine) -> None:

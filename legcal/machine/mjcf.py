@@ -172,7 +172,12 @@ class MjcfReader:
             elif tag == "geom":
                 visuals += self._visual(part)
             elif tag == "site" and element.get("name"):
-                self._site(part)
+                site, site_name = part.element, str(part.element.get("name"))
+                attributes = self._attributes(part)
+                T_site, length = self._between(site, attributes)
+                if T_site is None or length == 0.0:
+                    T_site = self._pose(site, attributes)
+                self.sites[site_name] = part.body, part.T_body_frame * T_site
             elif isinstance(tag, str) and tag not in (*_LEFT_ALONE, *_NOT_READ):
                 self.problems.at(element, "is no element of a body", "correct or remove it")
         return joints, bodies, visuals
@@ -345,14 +350,6 @@ class MjcfReader:
         T = part.T_body_frame * self._pose(part.element, attributes) * T_file_mesh.inv()
         file = str(Path(self._mesh_folder) / stated.get("file", ""))
         return mesh_xml(origin_xml(T), file, np.ones(3) if scale is None else scale)
-
-    def _site(self, part: BodyElement) -> None:
-        element, name = part.element, str(part.element.get("name"))
-        attributes = self._attributes(part)
-        T, length = self._between(element, attributes)
-        if T is None or length == 0.0:
-            T = self._pose(element, attributes)
-        self.sites[name] = part.body, part.T_body_frame * T
 
     def _between(
         self, element: etree._Element, attributes: Attributes

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -42,6 +41,10 @@ ROUNDING = 1e-15  # displacement that counts as none [mean leg lengths]
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
     """Return the complete YAML of a mechanism."""
+    q = readings_at(machine, machine.home)
+    home = {str(machine.legs[j].prismatic): float(q[j]) for j in machine.motors
+            if machine.legs[j].actuator is not None}  # fmt: skip
+    stated = motor_entries(machine.actuators)
     return mechanism_yaml(
         [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures],
         [str(machine.legs[j].prismatic) for j in machine.motors],
@@ -52,21 +55,13 @@ def mechanism_text(machine: Machine, urdf: str) -> str:
             "platform_joint": machine.platform_joint,
             "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
             "home": motion_to_xyz_quat(machine.home),
-            **_actuators_in_words(machine),
+            **({"home_readings": home} if home else {}),
+            **({"motors": stated} if stated else {}),
             **machine.tolerance.entries,
             **({} if machine.spline_teeth is None else {"spline_teeth": machine.spline_teeth}),
             "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
         },
     )
-
-
-def _actuators_in_words(machine: Machine) -> dict[str, Any]:
-    """Return the YAML entries of actuators: readings at home, numbers with no place in a URDF."""
-    q = readings_at(machine, machine.home)
-    home = {str(machine.legs[j].prismatic): float(q[j]) for j in machine.motors
-            if machine.legs[j].actuator is not None}  # fmt: skip
-    stated = motor_entries(machine.actuators)
-    return ({"home_readings": home} if home else {}) | ({"motors": stated} if stated else {})
 
 
 def model_name(machine: Machine) -> str:

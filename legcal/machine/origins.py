@@ -22,8 +22,7 @@ from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm
-from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
-from legcal.machine.chain import Closure
+from legcal.machine.chain import Bodies, Closure, frame_link, rigid_bodies
 from legcal.machine.leg import Leg, LegChain, Step
 from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_links, twist_after

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.axes import axis_angles, turned_axis
-from legcal.geometry.lines import cross, normal_basis
+from legcal.geometry.lines import axis_angles, cross, normal_basis, turned_axis
 from legcal.geometry.motions import frame_on_points, matrix_applied
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -581,19 +580,14 @@ def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> 
     phrases = []
     for (kind, axes), owners in groups.items():
         noun = (_NOUN | _NOUN_OF_ACTUATOR)[kind][len(owners) > 1]
-        ordered = _labelled(owners, leg_names)
+        labels = leg_labels(leg_names)
+        legs = [labels[name] for name in leg_names if name in owners]
+        ordered = [*legs, *(owner for owner in owners if owner not in leg_names)]
         phrases.append(f"{axes + ' of ' if axes else ''}{noun} {list_in_words(ordered)}")
     if len(phrases) > _MAX_GROUPS:
         more = len(phrases) - _MAX_GROUPS + 1
         phrases = [*phrases[: _MAX_GROUPS - 1], f"{more} more such changes"]
     return list_in_words(phrases)
-
-
-def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
-    """Return the labels of legs, in their order, or of cameras."""
-    labels = leg_labels(leg_names)
-    legs = [labels[name] for name in leg_names if name in owners]
-    return [*legs, *(owner for owner in owners if owner not in leg_names)]
 
 
 def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:

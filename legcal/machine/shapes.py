@@ -34,7 +34,7 @@ from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_of, m
 from legcal.geometry.rotations import nearest_rotation, rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator, Arm, Line
-from legcal.machine.bodies import Bodies
+from legcal.machine.chain import Bodies
 from legcal.machine.classification import joint_tolerance
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.meshes import first_hits, mesh_file, mesh_of_file, ray_caster, read_mesh
@@ -552,7 +552,8 @@ class Occluder:
     @cached_property
     def planes(self) -> Array:
         """Planes (k, 4) of its faces: n x + d > 0 is outside."""
-        return planes_around(self.corners)
+        planes = ConvexHull(self.corners).equations
+        return np.unique(np.round(planes, 12), axis=0)
 
     @property
     def leg(self) -> int:
@@ -563,12 +564,6 @@ class Occluder:
     def turns(self) -> bool:
         """Whether it is the swept volume of a solid that can be anywhere around its leg."""
         return isinstance(self.carrier, LegHalf) and self.carrier.roll is None
-
-
-def planes_around(corners: Array) -> Array:
-    """Return planes (k, 4) of the faces of the convex hull of points (m, 3), each once."""
-    planes = ConvexHull(corners).equations
-    return np.unique(np.round(planes, 12), axis=0)
 
 
 @dataclass(frozen=True, eq=False)

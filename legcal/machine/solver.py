@@ -2,8 +2,7 @@
 
 One solver for platform poses and for configurations of the closed chain: minimum-norm Gauss-Newton
 steps, damped if they do not reduce the cost (Levenberg-Marquardt). If the solution must be the one
-connected to the start, steps are not damped but must contract; :func:`walk_in_steps` then divides
-the path.
+connected to the start, steps are not damped but must contract.
 """
 
 from collections.abc import Callable
@@ -124,24 +123,6 @@ def newton(
         )
         moving &= ~converged
     return Solved(points, values, jacobian, size, converged)
-
-
-def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
-    """Return the completed fraction of a path, walked in steps that are halved on failure.
-
-    ``attempt(part)`` tries to reach a fraction of the path from the end of the last success; no
-    step is shorter than the fraction *min_step*.
-    """
-    done, step = 0.0, 1.0
-    while done < 1.0:
-        wanted = min(done + step, 1.0)
-        if attempt(wanted):
-            done, step = wanted, 2.0 * step
-        else:
-            step *= 0.5
-            if step < min_step:
-                break
-    return done
 
 
 def poses_after(poses: Array, step: Array) -> Array:

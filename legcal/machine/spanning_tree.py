@@ -21,8 +21,7 @@ from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.bodies import frame_link
-from legcal.machine.chain import Closure
+from legcal.machine.chain import Closure, frame_link
 from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
 from legcal.machine.urdf import (
     LOOP_TAGS,
@@ -282,21 +281,19 @@ def close_loops(
             "give one mechanism",
             path,
         )
-    closures = [close_loop(loop, text) for loop in loops]
-    return [frames for frames, _ in closures], [kind for _, kind in closures]
-
-
-def close_loop(loop: Loop, text: UrdfBuilder) -> tuple[list[str], ClosureKind]:
-    """Add the frames of a loop to a tree and return the closure."""
-    ends = []
-    for number, (link, T_link_frame) in enumerate(
-        zip(loop.links, loop.T_link_frame, strict=True), start=1
-    ):
-        frame = text.unused(f"{loop.name}_{number}")
-        text.link(frame)
-        text.joint(text.unused(f"{frame}_frame"), "fixed", link, frame, T_link_frame)
-        ends.append(frame)
-    return ends, "3d" if loop.kind == "point" else "6d"
+    pairs, kinds = list[list[str]](), list[ClosureKind]()
+    for loop in loops:
+        ends = []
+        for number, (link, T_link_frame) in enumerate(
+            zip(loop.links, loop.T_link_frame, strict=True), start=1
+        ):
+            frame = text.unused(f"{loop.name}_{number}")
+            text.link(frame)
+            text.joint(text.unused(f"{frame}_frame"), "fixed", link, frame, T_link_frame)
+            ends.append(frame)
+        pairs.append(ends)
+        kinds.append("3d" if loop.kind == "point" else "6d")
+    return pairs, kinds
 
 
 _CLOSING = re.compile(r"closing_(.+)_([12])")
@@ -411,31 +408,21 @@ def _ends(
             )  # fmt: skip
     if links[0] == links[1]:
         problems.at(element, f"joins the link '{links[0]}' to itself", "name two links")
-    poses = [_pose(element, origin, problems) for origin in origins]
+    poses = []
+    for origin in origins:
+        parts = []
+        for key in ("xyz", "rpy"):
+            text = None if origin is None else origin.get(key)
+            numbers = [0.0] * 3 if text is None else number_list(text, 3)
+            if numbers is None:
+                mistake = f"has {key}={str(text)[:60]!r}, needed 3 finite numbers"
+                problems.at(element, mistake, "correct the value")
+            parts.append(np.array(numbers or [0.0] * 3))
+        rotation = Rotation.from_euler("xyz", parts[1])
+        poses.append(RigidTransform.from_components(parts[0], rotation))
     if len(problems) > n_before:
         return None
     return (links[0], poses[0]), (links[1], poses[1])
-
-
-def _pose(
-    element: etree._Element, origin: etree._Element | None, problems: XmlProblems
-) -> RigidTransform:
-    """Return the motion of ``xyz`` and ``rpy``, zero by default."""
-    xyz, rpy = (_three(element, origin, key, problems) for key in ("xyz", "rpy"))
-    return RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy))
-
-
-def _three(
-    element: etree._Element, part: etree._Element | None, key: str, problems: XmlProblems
-) -> Array:
-    """Return three numbers of an element of a loop; zero by default."""
-    text = None if part is None else part.get(key)
-    numbers = [0.0] * 3 if text is None else number_list(text, 3)
-    if numbers is None:
-        problems.at(
-            element, f"has {key}={str(text)[:60]!r}, needed 3 finite numbers", "correct the value"
-        )
-    return np.array(numbers or [0.0] * 3)
 
 
 def _motors(

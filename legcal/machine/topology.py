@@ -19,8 +19,7 @@ from legcal.errors import OutOfClass, Problem
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
-from legcal.machine.chain import Closure
+from legcal.machine.chain import Bodies, Closure, Connection, frame_link, rigid_bodies
 from legcal.machine.classification import (
     classify_leg,
     is_actuator,
@@ -452,42 +451,6 @@ def _several_bodies(
     From the body, without passing base or platform, a loop inside a leg leads to the base by one
     joint, a part of the platform by the joints of several legs.
     """
-    on_base, on_platform = _reached(bodies, body, ends)
-    if len(on_platform) != 1:
-        return None
-    if len(on_base) == 1:
-        return Problem(
-            "this machine is not supported",
-            f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
-            f"closed at link '{body}'",
-            "chains without loops that end on the platform itself",
-            "if these are the rods of a parallelogram on an arm or a carriage, close "
-            "each on the platform as a leg of its own, otherwise this machine cannot "
-            "be calibrated with legcal",
-            str(urdf.path),
-        )
-    if len(on_base) > 1:
-        return _platform_of_several_bodies(urdf, body, on_platform[0])
-    return None
-
-
-def _platform_of_several_bodies(urdf: Urdf, body: str, joint: Connection) -> Problem:
-    """Return the problem of a platform that carries a body on which legs end."""
-    return Problem(
-        "this machine is not supported",
-        "a platform of several bodies (as of an H4 or I4), because legs end on "
-        f"link '{body}', which {_name(joint)} connects to the platform",
-        "legs that end on one rigid platform",
-        f"make {_name(joint)} fixed if it does not move, otherwise this machine "
-        "cannot be calibrated with legcal",
-        str(urdf.path),
-    )
-
-
-def _reached(
-    bodies: Bodies, body: str, ends: tuple[str, str]
-) -> tuple[list[Connection], list[Connection]]:
-    """Return the joints on base and on platform that are connected with a body."""
     base, platform = ends
     reached, new = {body}, [body]
     on_base, on_platform = list[Connection](), list[Connection]()
@@ -504,7 +467,31 @@ def _reached(
             elif there not in reached:
                 reached.add(there)
                 new.append(there)
-    return on_base, on_platform
+    if len(on_platform) != 1:
+        return None
+    if len(on_base) == 1:
+        return Problem(
+            "this machine is not supported",
+            f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
+            f"closed at link '{body}'",
+            "chains without loops that end on the platform itself",
+            "if these are the rods of a parallelogram on an arm or a carriage, close "
+            "each on the platform as a leg of its own, otherwise this machine cannot "
+            "be calibrated with legcal",
+            str(urdf.path),
+        )
+    if len(on_base) > 1:
+        joint = on_platform[0]
+        return Problem(
+            "this machine is not supported",
+            "a platform of several bodies (as of an H4 or I4), because legs end on "
+            f"link '{body}', which {_name(joint)} connects to the platform",
+            "legs that end on one rigid platform",
+            f"make {_name(joint)} fixed if it does not move, otherwise this machine "
+            "cannot be calibrated with legcal",
+            str(urdf.path),
+        )
+    return None
 
 
 def _not_a_chain(

@@ -193,28 +193,6 @@ def check_tree(
             continue
         parent_joint[child] = joint.get("name", "")
         children.setdefault(ends["parent"], []).append(child)
-    return _root(links, parent_joint, children, problems)
-
-
-def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
-    """Check that every element has a name of its own."""
-    for element in elements:
-        name = element.get("name", "")
-        if not name.strip():
-            problems.at(element, "has no name", "name it")
-        elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
-            mistake = f"has a name that cannot be used, needed {NAME_NEEDED}"
-            problems.at(element, mistake, "rename it")
-    problems.check_unique(elements)
-
-
-def _root(
-    links: list[etree._Element],
-    parent_joint: dict[str, str],
-    children: dict[str, list[str]],
-    problems: XmlProblems,
-) -> str:
-    """Return the one link without a parent, the root of all others."""
     roots = [e for e in links if e.get("name", "") not in parent_joint]
     if not links:
         problems.add(
@@ -225,10 +203,10 @@ def _root(
         )
         return ""
     if len(roots) > 1:
-        names = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
+        named = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
         problems.add(
             "the URDF could not be used",
-            f"{len(roots)} links without a parent ({names})",
+            f"{len(roots)} links without a parent ({named})",
             "one",
             "join them with joints, a platform by a floating one",
         )
@@ -242,14 +220,26 @@ def _root(
             pending.extend(children.get(link, ()))
     cyclic = [e.get("name", "") for e in links if e.get("name", "") not in reached]
     if cyclic:
-        names = ", ".join(repr(name) for name in cyclic[:6])
+        named = ", ".join(repr(name) for name in cyclic[:6])
         problems.add(
-            f"the URDF could not be used: the links {names} hang from each other in a cycle",
+            f"the URDF could not be used: the links {named} hang from each other in a cycle",
             "",
             "a tree",
             "cut the loop and close it in closed_loop of the mechanism YAML",
         )
     return root
+
+
+def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
+    """Check that every element has a name of its own."""
+    for element in elements:
+        name = element.get("name", "")
+        if not name.strip():
+            problems.at(element, "has no name", "name it")
+        elif not is_name(name) and (element.tag == "joint" or not name.isprintable()):
+            mistake = f"has a name that cannot be used, needed {NAME_NEEDED}"
+            problems.at(element, mistake, "rename it")
+    problems.check_unique(elements)
 
 
 def _short(text: str) -> str:

@@ -9,7 +9,7 @@ Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted f
 have no branches and no square root. It is the chart of ``Frames``, except that a small w is half of
 a rotation vector, and that steps begin with the translation. An unknown axis is turned about its
 normal basis e1, e2 by two turns, w = (turn_1 e1 + turn_2 e2) / 2: its
-:func:`~legcal.geometry.axes.axis_angles` but for a factor near one (:func:`gibbs_of`).
+:func:`~legcal.geometry.lines.axis_angles` but for a factor near one (:func:`gibbs_of`).
 
 An observed direction is u + e1 alpha1 + e2 alpha2, its normal basis E being e1, e2 as rows. An
 error of a pose is a step of :func:`~legcal.paper.equations.moved_points`.
@@ -26,8 +26,7 @@ from math import comb
 import casadi as ca
 import numpy as np
 
-from legcal.geometry.axes import turned_axis
-from legcal.geometry.lines import normal_basis
+from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.rotations import turned
 from legcal.geometry.types import Array
 from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
+from legcal.data.outlines import LegAxes
 from legcal.machine.leg import KinematicParameters, Leg
 from legcal.paper.criteria import Criteria
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base

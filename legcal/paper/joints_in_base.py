@@ -89,14 +89,22 @@ def locate_joints_in_base(
         problem, held = hold_at_nominal(problem, machine, unknowns, weighted=True)
     x = solve_least_squares(problem, weighted=weighted).x
     located = replace(machine, legs=unknowns.legs(x, machine.legs))
-    cameras = register_views(located, joints)
+    found = list[RigidTransform | None]()
+    for v, with_axis in enumerate(joints.axis_located):
+        A_Rb, A_camera = points_in_both(located, joints, v)
+        v_Rb, v_camera = located.base_normals[with_axis], joints.v[v, with_axis]
+        poses, is_all = candidate_camera_poses(A_Rb, v_Rb, A_camera, v_camera)
+        found.append(poses[0] if is_all and len(poses) == 1 else None)
+    cameras = tuple(found)
     if machine.spatial and any(T is not None for T in cameras):
         if weighted:
             located, cameras, shown = _joints_on_rays(located, unknowns, joints, cameras)
             joints = _joints_of_base(located, joints, cameras, measurements)
             held = np.setdiff1d(held, shown)
         else:
-            cameras = _cameras_on_rays(located, joints, cameras, weighted=weighted)
+            points, start, placed = _points_on_rays(located, joints, cameras)
+            R, t, _ = poses_on_rays(points, start, weighted=weighted)
+            cameras = _placed(cameras, placed, R, t)
     left = left_near_nominal("Step 2", machine, unknowns, held)
     return JointsInBase(located, cameras, joints, (*joints.diagnostics, *left))
 
@@ -174,27 +182,7 @@ def _products_seen(
     return np.einsum("vmi,vmi->vm", Vp, Vq), np.sqrt(variance)
 
 
-def register_views(machine: NominalMachine, joints: JointsInCamera) -> Cameras:
-    """Return T_Rb_camera of each view with sufficient joints, in closed form, unweighted."""
-    cameras = list[RigidTransform | None]()
-    for v, with_axis in enumerate(joints.axis_located):
-        A_Rb, A_camera = points_in_both(machine, joints, v)
-        v_Rb, v_camera = machine.base_normals[with_axis], joints.v[v, with_axis]
-        poses, is_all = candidate_camera_poses(A_Rb, v_Rb, A_camera, v_camera)
-        cameras.append(poses[0] if is_all and len(poses) == 1 else None)
-    return tuple(cameras)
-
-
 # Cameras, and joints with them
-
-
-def _cameras_on_rays(
-    machine: NominalMachine, joints: JointsInCamera, cameras: Cameras, *, weighted: bool
-) -> Cameras:
-    """Return the cameras by (18) of the base joints that they see."""
-    points, start, placed = _points_on_rays(machine, joints, cameras)
-    R, t, _ = poses_on_rays(points, start, weighted=weighted)
-    return _placed(cameras, placed, R, t)
 
 
 def _joints_on_rays(

@@ -21,11 +21,10 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.axes import LegAxes
 from legcal.data.measurements import Measurements
+from legcal.data.outlines import LegAxes
 from legcal.errors import NotIdentifiable
-from legcal.geometry.axes import turned_axis
-from legcal.geometry.lines import cross
+from legcal.geometry.lines import cross, turned_axis
 from legcal.geometry.motions import register_points
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.paper.equations import (
@@ -335,7 +334,9 @@ def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
         A_Rb, A_camera = points_in_both(machine, joints, v)
         poses, _ = candidate_camera_poses(A_Rb, nominal, A_camera, v_seen)
         if poses:
-            v_camera[v, with_axis] *= signs_seen(nominal, v_seen, poses[0])[:, None]
+            predicted = poses[0].rotation.inv().apply(nominal)
+            is_opposite = np.sum(predicted * v_seen, axis=1, keepdims=True) < 0.0
+            v_camera[v, with_axis] *= np.where(is_opposite, -1.0, 1.0)
     return replace(joints, v=v_camera)
 
 
@@ -387,12 +388,6 @@ def candidate_camera_poses(
         about = RigidTransform.from_components(middle - rotation.apply(middle), rotation)
         poses.append((about * T_camera_Rb).inv())
     return poses, True
-
-
-def signs_seen(v_Rb: Array, v_camera: Array, T_Rb_camera: RigidTransform) -> Array:
-    """Return +1 or -1 for each axis (r, 3): with it, v_camera points to the side of v_Rb."""
-    predicted = T_Rb_camera.rotation.inv().apply(v_Rb)
-    return np.where(np.sum(predicted * v_camera, axis=1) < 0.0, -1.0, 1.0)
 
 
 def _laid_along(A_Rb: Array, line: Array, A_camera: Array) -> RigidTransform:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry.axes import turned_axis
+from legcal.geometry.lines import turned_axis
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import EquationKind, JointType, Leg, LegColumns, LegKind
@@ -269,12 +269,30 @@ def _with_axis_and_end(seen_legs: _SeenLegs, unknowns: Unknowns, j: int, leg: Le
     name = machine.leg_names[j]
     rows = np.flatnonzero((directions.leg == j) & (seen_legs.poses.pose >= 0))
     if nominal is not None and EquationKind.PLATFORM_AXIS in leg.equations:
-        leg = replace(leg, platform_axis=_revolute_axis(seen_legs, name, rows, nominal))
+        across, n = seen_legs.across(rows), len(rows)
+        if not n or np.linalg.eigvalsh(across.scatter[0])[1] <= _SAME_DIRECTION * n:
+            actual = f"one direction in {n} pose{'s' * (n != 1)}"
+            raise NotIdentifiable(
+                f"The revolute axis of leg {name} on the platform could not be identified: found "
+                f"{actual if n else 'no pose that shows its direction'} in the frame of the "
+                "platform, needed two different ones; add poses between which the leg turns about "
+                "it."
+            )
+        v, turns, _ = across.solve(weighted=seen_legs.weighted)
+        axis = turned_axis(v[0], angles_of(turns[0]))
+        leg = replace(leg, platform_axis=(axis if axis @ nominal > 0.0 else -axis))
     elif nominal is not None and leg.is_fixed_to_platform:
         u = np.einsum(
             "nij,ni->nj", seen_legs.poses.R[seen_legs.poses.pose[rows]], directions.u[rows]
         )
-        fixed = replace(leg, platform_axis=fixed_direction(name, u))
+        if not len(u):
+            raise NotIdentifiable(
+                f"The direction of leg {name} in the platform could not be identified: found no "
+                "pose that shows it together with three legs of known length, needed one; add "
+                "images that show several legs at once."
+            )
+        total = u.sum(axis=0)
+        fixed = replace(leg, platform_axis=np.asarray(total / np.linalg.norm(total)))
         twist = None if leg.twist is None else tied_twist(fixed, leg, leg.twist)
         leg = replace(fixed, twist=twist)
     if leg.kind is LegKind.PASSIVE:
@@ -283,39 +301,6 @@ def _with_axis_and_end(seen_legs: _SeenLegs, unknowns: Unknowns, j: int, leg: Le
             free = np.arange(3 if machine.spatial else 2)
         leg = replace(leg, B=_passive_end(seen_legs, name, rows, leg.B, free))
     return leg
-
-
-def _revolute_axis(seen_legs: _SeenLegs, name: str, rows: IntArray, nominal: Array) -> Array:
-    """Return a revolute axis in R_e (3,) by (7), with the sign of the nominal axis.
-
-    Raises NotIdentifiable if the leg has fewer than two directions in the platform.
-    """
-    across, n = seen_legs.across(rows), len(rows)
-    if not n or np.linalg.eigvalsh(across.scatter[0])[1] <= _SAME_DIRECTION * n:
-        actual = f"one direction in {n} pose{'s' * (n != 1)}"
-        raise NotIdentifiable(
-            f"The revolute axis of leg {name} on the platform could not be identified: found "
-            f"{actual if n else 'no pose that shows its direction'} in the frame of the "
-            "platform, needed two different ones; add poses between which the leg turns about it."
-        )
-    v, turns, _ = across.solve(weighted=seen_legs.weighted)
-    axis = turned_axis(v[0], angles_of(turns[0]))
-    return axis if axis @ nominal > 0.0 else -axis
-
-
-def fixed_direction(name: str, u: Array) -> Array:
-    """Return the direction in R_e of a leg that is fixed to the platform: the mean of u (n, 3).
-
-    Raises NotIdentifiable if no pose shows it.
-    """
-    if not len(u):
-        raise NotIdentifiable(
-            f"The direction of leg {name} in the platform could not be identified: found no pose "
-            "that shows it together with three legs of known length, needed one; add images that "
-            "show several legs at once."
-        )
-    total = u.sum(axis=0)
-    return np.asarray(total / np.linalg.norm(total))
 
 
 def _passive_end(

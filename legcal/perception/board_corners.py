@@ -20,9 +20,16 @@ from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.perception.corner_lattice import Print, expected, find_lattice, measured
+from legcal.perception.corner_lattice import (
+    Print,
+    Saddles,
+    expected,
+    find_lattice,
+    fit_saddles,
+    measured,
+    near_saddles,
+)
 from legcal.perception.placement import Load
-from legcal.perception.saddles import Saddles, fit_saddles, near_saddles
 from legcal.progress import Report
 from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, charuco_board, dictionary
 from legcal.vision.image_file import Grey, possible_scale, quiet_opencv, reduced, rescaled
@@ -257,27 +264,6 @@ def _tags_and_corners(
     board_print = _print(board)
     best: tuple[IntArray, Saddles] | None = None
     most: tuple[IntArray, Array] = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
-    for scale, is_blurred, windows in _marker_searches(grey):
-        tags, places = _search_tags(board, grey, scale, is_blurred=is_blurred, windows=windows)
-        if len(tags) > len(most[0]):
-            most = tags, places.mean(axis=1)
-        xy, px = _anchors(board, tags, places)
-        if not len(xy):
-            continue
-        ij = _near_anchors(board_print, xy)
-        at, _ = expected(xy, px, board_print.xy(ij), board_print.pitch)
-        saddles = _measured_twice(grey, board_print, ij, (at + 0.5) * scale - 0.5, scale)
-        if best is None or len(saddles[0]) > len(best[0]):
-            best = saddles
-        if len(best[0]) >= MIN_CORNERS:
-            break
-    if best is None:
-        best = measured(grey, board_print, np.zeros((0, 2), np.intp), np.zeros((0, 2)))
-    return best, most
-
-
-def _marker_searches(grey: Grey) -> list[tuple[float, bool, tuple[int, int]]]:
-    """Return the settings by which markers are searched in turn: scale, sharpening, windows."""
     wanted = (
         (1.0, _MARKERS_SEARCHED, False, _WINDOW),
         (1.0, _MARKERS_SEARCHED, True, _BLURRED_WINDOW),
@@ -290,7 +276,28 @@ def _marker_searches(grey: Grey) -> list[tuple[float, bool, tuple[int, int]]]:
         (possible_scale(grey, scale, pixels), is_blurred, windows)
         for scale, pixels, is_blurred, windows in wanted
     ]
-    return list(dict.fromkeys(ways))
+    for scale, is_blurred, windows in list(dict.fromkeys(ways)):
+        tags, places = _search_tags(board, grey, scale, is_blurred=is_blurred, windows=windows)
+        if len(tags) > len(most[0]):
+            most = tags, places.mean(axis=1)
+        xy, px = _anchors(board, tags, places)
+        if not len(xy):
+            continue
+        assert board_print.x is not None
+        assert board_print.y is not None
+        j, i = np.indices((len(board_print.y), len(board_print.x)))
+        ij = np.column_stack([i.ravel(), j.ravel()]).astype(np.intp)
+        gap = np.abs(board_print.xy(ij)[:, None] - xy[None]).max(axis=2).min(axis=1)
+        ij = np.asarray(ij[gap < 0.75 * board_print.pitch])
+        at, _ = expected(xy, px, board_print.xy(ij), board_print.pitch)
+        saddles = _measured_twice(grey, board_print, ij, (at + 0.5) * scale - 0.5, scale)
+        if best is None or len(saddles[0]) > len(best[0]):
+            best = saddles
+        if len(best[0]) >= MIN_CORNERS:
+            break
+    if best is None:
+        best = measured(grey, board_print, np.zeros((0, 2), np.intp), np.zeros((0, 2)))
+    return best, most
 
 
 def _anchors(board: Board, tags: IntArray, places: Array) -> tuple[Array, Array]:
@@ -320,16 +327,6 @@ def _anchors(board: Board, tags: IntArray, places: Array) -> tuple[Array, Array]
             agree = np.repeat(np.all(agree.reshape(-1, 4) > 0, axis=1), 4)
             xy, px = xy[agree], px[agree]
     return xy, px
-
-
-def _near_anchors(board: Print, xy: Array) -> IntArray:
-    """Return columns and rows of the corners within a pitch of places on the board."""
-    assert board.x is not None
-    assert board.y is not None
-    j, i = np.indices((len(board.y), len(board.x)))
-    ij = np.column_stack([i.ravel(), j.ravel()]).astype(np.intp)
-    gap = np.abs(board.xy(ij)[:, None] - xy[None]).max(axis=2).min(axis=1)
-    return np.asarray(ij[gap < 0.75 * board.pitch])
 
 
 def _search_tags(

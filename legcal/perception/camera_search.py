@@ -18,10 +18,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
-from legcal.perception.edge_maps import EdgeMaps
 from legcal.perception.pair_matching import (
     MAX_WIDTH_SIGMAS,
     CameraPoses,
+    EdgeMaps,
     LegSegments,
     PairMatches,
     Picture,
@@ -199,9 +199,9 @@ def place_camera(
         some = Pictures.of(best_first[: max(SOME_PICTURES, done)])
         score = scores(some, poses, SEARCHING[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
-        poses = CameraPoses.joined(
-            [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
-        )
+        # From far a flat machine looks alike with near and far exchanged.
+        ahead, ends = poses.take(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
+        poses = CameraPoses.joined([poses, depth_reversed(ahead, ends) if len(ends) else ahead])
         poses = refined(some, poses, SEARCHING[3:], JOINT_ERROR)
         score = scores(some, poses, SEARCHING[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
@@ -237,12 +237,6 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
         score = scores(pictures, around, POLISH[-1])
         polished.append(around.take(_best(score, 1)))
     return CameraPoses.joined([*polished, poses.take(np.zeros(0, dtype=np.intp))])
-
-
-def _reversed(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
-    """Return the poses that show a flat machine alike from far: near and far exchanged."""
-    ends = pictures.all_ends
-    return depth_reversed(poses, ends) if len(ends) else poses
 
 
 def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:

@@ -101,16 +101,13 @@ def still_picture(pictures: Sequence[Grey]) -> Still | None:
     return Still(middle, float(np.median(away)))
 
 
-def _differs(picture: Grey, still: Still) -> BoolArray:
-    """Return the mask of pixels of an image that differ from the background."""
-    least = max(NOISE_FACTOR * still.noise, DIFFERS * float(still.picture.max()))
-    return np.asarray(np.abs(picture - still.picture) > least)
-
-
 def moving_pixels(picture: Grey, still: Still) -> Image:
     """Return 1 near pixels of an image that differ from the static background, else 0."""
     size = np.ones((2 * NEAR_MOVING + 1, 2 * NEAR_MOVING + 1), dtype=np.uint8)
-    return np.asarray(cv2.dilate(_differs(picture, still).astype(np.uint8), size))
+    least = max(NOISE_FACTOR * still.noise, DIFFERS * float(still.picture.max()))
+    return np.asarray(
+        cv2.dilate(np.asarray(np.abs(picture - still.picture) > least).astype(np.uint8), size)
+    )
 
 
 def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
@@ -301,21 +298,17 @@ def _stretched(small: Grey) -> NDArray[np.uint8]:
 
     What is darker than ``DARK`` of the brightest is mostly noise and keeps its distances.
     """
-    top = max(_quantile(small[::4, ::4], 0.995), 1.0)
+    values = small[::4, ::4]
+    k, share = divmod(0.995 * (values.size - 1), 1.0)
+    near = int(k), min(int(k) + 1, values.size - 1)
+    low, high = np.partition(values, near, axis=None)[list(near)].tolist()
+    top = max(float(low + share * (high - low)), 1.0)
     light = np.clip(small, 0.0, np.float32(top))
     light /= np.float32(DARK * top)
     light += 1.0
     cv2.log(light, dst=light)
     light *= 255.0 / math.log1p(1.0 / DARK)
     return light.astype(np.uint8)
-
-
-def _quantile(values: Image, part: float) -> float:
-    """Return the value that a part of values of any shape is below, between neighbours."""
-    k, share = divmod(part * (values.size - 1), 1.0)
-    near = int(k), min(int(k) + 1, values.size - 1)
-    low, high = np.partition(values, near, axis=None)[list(near)].tolist()
-    return float(low + share * (high - low))
 
 
 def _join(ends: Array) -> tuple[Array, Array]:

@@ -261,7 +261,14 @@ def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
     """Draw a curve; predictions are dashed, axes thin."""
     colour = COLOURS[mark.kind]
     if mark.kind == "predicted":
-        for dash in _dashes(mark.points, width):
+        steps = np.linalg.norm(np.diff(mark.points, axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        starts = np.arange(0.0, along[-1], (_DASH + _GAP) * width)
+        dashes = []
+        for start in starts:
+            at = np.linspace(start, min(start + _DASH * width, along[-1]), 4)
+            dashes.append(np.column_stack([np.interp(at, along, c) for c in mark.points.T]))
+        for dash in dashes:
             _polyline(picture, dash, colour, width)
     elif mark.kind in ("axis", "pair"):
         _polyline(picture, mark.points, colour, max(1, width // 2))
@@ -272,18 +279,6 @@ def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
 def _polyline(picture: Canvas, points: Array, colour: tuple[int, int, int], width: int) -> None:
     fixed = np.rint(points * 2**_FRACTION_BITS).astype(np.int32)
     cv2.polylines(picture, [fixed], False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
-
-
-def _dashes(points: Array, width: int) -> list[Array]:
-    """Return the dashes of a curve, (n, 2) each."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    starts = np.arange(0.0, along[-1], (_DASH + _GAP) * width)
-    dashes = []
-    for start in starts:
-        at = np.linspace(start, min(start + _DASH * width, along[-1]), 4)
-        dashes.append(np.column_stack([np.interp(at, along, c) for c in points.T]))
-    return dashes
 
 
 def _label(

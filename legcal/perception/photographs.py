@@ -253,15 +253,15 @@ def place_and_measure(
     )
     outlines = reject_images(outlines, reasons)
     seen_poses = {pose: choices[0] for pose, choices in free_poses.items()}
-    blur_of_views = _blur_of_views(photographs.measurements, blur)
-    return MeasuredImages(photographs, placement, outlines, reasons, blur_of_views, seen_poses)
-
-
-def _blur_of_views(measurements: Measurements, blur: Array) -> tuple[float, ...]:
-    """Return the usual blur of each view by that of all rows (n_rows,) [px]; NaN of none."""
     known = ~np.isnan(blur)
-    of_views = [blur[known & (measurements.view == v)] for v in range(len(measurements.views))]
-    return tuple(float(np.median(of_view)) if len(of_view) else np.nan for of_view in of_views)
+    of_views = [
+        blur[known & (photographs.measurements.view == v)]
+        for v in range(len(photographs.measurements.views))
+    ]
+    blur_of_views = tuple(
+        float(np.median(of_view)) if len(of_view) else np.nan for of_view in of_views
+    )
+    return MeasuredImages(photographs, placement, outlines, reasons, blur_of_views, seen_poses)
 
 
 def _with_other_radii(

@@ -31,8 +31,7 @@ from legcal.perception.candidate_pairs import (
     reduction,
     segments_of_reduced,
 )
-from legcal.perception.edge_maps import EdgeMaps
-from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
+from legcal.perception.pair_matching import EdgeMaps, LegSegments, Picture, leg_segments
 from legcal.perception.tuning import WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey, shrink

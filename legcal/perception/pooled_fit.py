@@ -143,13 +143,6 @@ def fit_pooled(blocks: Blocks, share: Array, blur: float, depth: float) -> Poole
     return PooledLines(at.line @ at_ends.T, of_lines, float(np.exp(even)), by_gamma, polish)
 
 
-def _with_blur(covariance: Array, precision: float) -> Array:
-    """Return covariances (n_edges, k, k) of unknowns once the blur is known to more precision."""
-    of_blur = covariance[:, :, BLUR]
-    gain = precision / (1.0 + precision * of_blur[:, BLUR])
-    return covariance - gain[:, None, None] * of_blur[:, :, None] * of_blur[:, None, :]
-
-
 def _common_blur(log_blur: Array, variance: Array, seen: BoolArray) -> tuple[float, float]:
     """Return the logarithm of the blur that most outlines of an image agree on.
 
@@ -424,7 +417,10 @@ class _Pool:
             alone = at.log_blur + np.clip(alone, -MAX_STEP[1], MAX_STEP[1])
             shared = _common_blur(alone, apart[:, BLUR, BLUR], self.seen)
         even, known = shared[0], shared[1] ** -2
-        covariance = _with_blur(apart, known - PRIOR_BLUR**-2)
+        more = known - PRIOR_BLUR**-2
+        of_blur = apart[:, :, BLUR]
+        gain = more / (1.0 + more * of_blur[:, BLUR])
+        covariance = apart - gain[:, None, None] * of_blur[:, :, None] * of_blur[:, None, :]
         step = solved(covariance, even, known).reshape(target.shape)
         largest = MAX_STEP[0] * np.exp(at.log_blur)[:, None]
         move = np.clip(step[:, :2, SHIFT], -largest, largest)

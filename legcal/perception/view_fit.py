@@ -357,13 +357,6 @@ def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
     return sigma
 
 
-def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) -> RigidTransform:
-    """Return the pose at which a flat machine looks alike from far: near and far exchanged."""
-    X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
-    pose = CameraPoses.one(T_base_group, np.zeros((search.n_legs, 2, 3)))
-    return depth_reversed(pose, X).T_base_camera()
-
-
 @dataclass(frozen=True, eq=False)
 class _Lines:
     """Outlines to fit, by item: a leg in an image."""
@@ -537,7 +530,9 @@ def _fits_or_reversed(
     for g, (group, fit) in enumerate(zip(groups, fits, strict=True)):
         if fit is None or len(group.views) > 1 or fit.is_good:
             continue
-        other = reversed_pose(search, group, fit.T_base_group)
+        X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
+        pose = CameraPoses.one(fit.T_base_group, np.zeros((search.n_legs, 2, 3)))
+        other = depth_reversed(pose, X).T_base_camera()
         over = fit_view(search, group, other, np.zeros_like(fit.shift), outlines)
         if over is not None and over.evidence > fit.evidence:
             fits[g] = over

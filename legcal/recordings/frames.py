@@ -2,12 +2,15 @@
 
 Bags are those of ROS 1 and 2, and MCAP files: images of one topic, and joint states. For a bag of
 several cameras, append the topic of one: ``run.mcap:/left/image_raw``.
+
+Photographs may also arrive one by one: in a watched folder, or from a camera at this machine.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import tempfile
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +18,7 @@ from datetime import UTC, datetime
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 
 import cv2
@@ -24,12 +28,19 @@ from numpy.typing import NDArray
 from legcal.data.measurements import reading_columns
 from legcal.data.photograph_matching import Photograph, find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import describe
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
-from legcal.vision.image_file import quiet_opencv
+from legcal.vision.image_file import (
+    COPY_AGAIN,
+    HEIC_SUFFIXES,
+    SUFFIXES,
+    BadImage,
+    image_size,
+    quiet_opencv,
+)
 
 # The decoder of OpenCV reads it once: quiet (AV_LOG_QUIET), since damage is reported in a sentence.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -89,15 +100,6 @@ class Recording:
         return None
 
 
-def _reader() -> int:
-    """Return the id of FFmpeg if OpenCV has it.
-
-    Other backends, which OpenCV tries on files that FFmpeg cannot read, print damage to stderr.
-    """
-    has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
-    return cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
-
-
 class Video(Recording):
     """A video file, read with OpenCV."""
 
@@ -108,7 +110,10 @@ class Video(Recording):
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames; a video without any is refused."""
         with quiet_opencv():
-            video = cv2.VideoCapture(str(self.path), _reader())
+            # Other backends, which OpenCV tries if FFmpeg cannot read a file, print to stderr.
+            has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
+            reader = cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY
+            video = cv2.VideoCapture(str(self.path), reader)
             video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as in the calibration of its camera
             promised = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
             rate = video.get(cv2.CAP_PROP_FPS) if video.isOpened() else 0
@@ -468,3 +473,137 @@ def _no_time(text: str, path: Path) -> DatasetError:
         f"{path}, column time: the time could not be read: found {describe(text)}, needed seconds, "
         "Unix times or dates such as 2026-11-23T10:15:00.125, one form in all rows; correct it."
     )
+
+
+AGREE = 4.0  # largest difference of two frames at rest, means of squares of 8 px [grey levels]
+_SQUARE = 8
+PATIENCE = 10.0  # longest wait for frames that agree [s]
+_PAUSE = 0.2  # between two frames [s]
+
+
+class WatchedFolder:
+    """New photographs in a folder; those that are there already are left alone.
+
+    A file counts once its size stands still and its end has arrived, so that a half-copied one is
+    waited for.
+    """
+
+    asks = "photograph it"  # what the owner does for the next one
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise UsageError(
+                f"{self.folder}: the folder could not be watched: found no such folder, needed the "
+                "one where new photographs appear; correct --watch."
+            )
+        self._seen = self._files()
+        self._last: dict[Path, tuple[int, int]] = {}
+        self.incomplete: set[str] = set()  # names of new files that are not complete yet
+
+    def poll(self, *, wanted: bool = True) -> Path | None:
+        """Return the oldest new photograph that is complete; each once."""
+        files = {
+            path: state for path, state in self._files().items() if state != self._seen.get(path)
+        }
+        before, self._last, self.incomplete = self._last, files, set()
+        for path, state in sorted(files.items(), key=lambda entry: (entry[1][1], entry[0])):
+            if before.get(path) != state or _is_cut_off(path):
+                self.incomplete.add(path.name)
+                continue
+            self._seen[path] = state
+            return path
+        return None
+
+    def _files(self) -> dict[Path, tuple[int, int]]:
+        """Return size and time of change [ns] of the photographs in the folder."""
+        files = {}
+        for path in self.folder.iterdir():
+            if path.suffix.lower() in (*SUFFIXES, *HEIC_SUFFIXES) and not path.name.startswith("."):
+                try:
+                    file = path.stat()
+                except FileNotFoundError:  # renamed meanwhile
+                    continue
+                files[path] = file.st_size, file.st_mtime_ns
+        return files
+
+
+def _is_cut_off(path: Path) -> bool:
+    """Return whether more of a file may still arrive; other problems are those of its check."""
+    try:
+        image_size(read_bytes(path, MAX_IMAGE))
+    except BadImage as error:
+        return error.remedy == COPY_AGAIN
+    except OSError:
+        return True
+    return False
+
+
+class LiveCamera:
+    """A camera at this machine, by OpenCV: a photograph is taken when two frames agree."""
+
+    asks = "press Enter"
+
+    def __init__(
+        self,
+        number: int,
+        width: int,  # of the calibrated images [px]
+        height: int,
+        opened: Callable[[int], Any] = cv2.VideoCapture,
+    ) -> None:
+        with quiet_opencv():
+            self._camera = opened(number)
+        if not self._camera.isOpened():
+            raise UsageError(
+                f"The camera {number} could not be opened: found none of that number, or one in "
+                "use by another program, needed one that is free; close that, or give another "
+                "--camera."
+            )
+        self._camera.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+        self._camera.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+        self.incomplete: set[str] = set()  # frames are complete
+        self._folder = tempfile.TemporaryDirectory()
+        self._n = 0
+
+    def poll(self, *, wanted: bool = False) -> Path | None:
+        """Return a photograph once two frames agree, if one is wanted.
+
+        Raises OutOfResources if the camera gives no frames, or frames that never agree.
+        """
+        if not wanted:
+            return None
+        begin, before = monotonic(), None
+        while monotonic() < begin + PATIENCE:
+            is_read, frame = self._camera.read()
+            if not is_read:
+                break
+            if before is not None and agree(before, frame):
+                self._n += 1
+                path = Path(self._folder.name) / f"frame{self._n}.png"
+                cv2.imwrite(str(path), frame)
+                return path
+            before = frame
+            sleep(_PAUSE)
+        found = "no frame" if before is None else f"frames that still change after {PATIENCE:g} s"
+        raise OutOfResources(
+            f"No photograph could be taken: found {found}, needed two that agree; wait until the "
+            "machine stands still, see that its light does not flicker, and press Enter again."
+        )
+
+    def close(self) -> None:
+        """Let go of the camera, and remove its photographs."""
+        self._camera.release()
+        self._folder.cleanup()
+
+
+def agree(first: Array, second: Array) -> bool:
+    """Return whether two frames show the same, but for noise and a change of all light."""
+    if first.shape != second.shape:
+        return False
+    size = max(1, first.shape[1] // _SQUARE), max(1, first.shape[0] // _SQUARE)
+    small = [
+        cv2.resize(frame, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        for frame in (first, second)
+    ]
+    change = small[1] - small[0]
+    return bool(np.abs(change - np.median(change)).max() < AGREE)

@@ -285,7 +285,14 @@ def _view(
                 "with pauses of different length; give the right table, or how far the clock of "
                 "the camera is ahead, --offset SECONDS."
             ) from error
-    _check_overlap(times - apart.seconds, series, start)
+    clock = times - apart.seconds
+    first, last = float(series.times.min()), float(series.times.max())
+    if clock[0] > last or clock[-1] < first:
+        raise DatasetError(
+            f"{start} found its frames from {clock[0]:.1f} to {clock[-1]:.1f} s by the clock of "
+            f"the readings, and these from {first:.1f} to {last:.1f} s ({series.source}), needed "
+            "times that overlap; give the right table, or correct --offset SECONDS."
+        )
     stills, kept = still_frames(times, frames_move, series.times, moves, apart, LEAST_STILL)
     if not kept:
         reasons = few([f"{s.why_not} from {s.begin_s:.1f} s" for s in stills]) or "no rest"
@@ -309,17 +316,6 @@ def _view(
         notes=[*recording.notes(), *series.notes],
     )
     return View(name, recording, q, scatter, series.unit, block)
-
-
-def _check_overlap(times: Array, series: Series, start: str) -> None:
-    """Refuse frames at *times* [s] by the clock of the readings, if none of them has readings."""
-    first, last = float(series.times.min()), float(series.times.max())
-    if times[0] > last or times[-1] < first:
-        raise DatasetError(
-            f"{start} found its frames from {times[0]:.1f} to {times[-1]:.1f} s by the clock of "
-            f"the readings, and these from {first:.1f} to {last:.1f} s ({series.source}), needed "
-            "times that overlap; give the right table, or correct --offset SECONDS."
-        )
 
 
 def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, Array]:

@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.types import Array, BoolArray
+from legcal.simulation.observe import BORDER_PX, NEAREST
 from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid, triangles
-from legcal.simulation.visibility import pixels_in_image
 from legcal.vision.board import (
     APRIL_TAGS,
     Board,
@@ -29,6 +29,7 @@ from legcal.vision.board import (
     read_board_file,
 )
 from legcal.vision.camera import Camera
+from legcal.vision.visibility import in_picture
 
 INK = 0.06  # reflectance of black, in units of white
 TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it
@@ -204,7 +205,7 @@ class PlacedBoard:
         eye = self.T_base_board.inv().apply(centre)
         sight = eye - points
         cosine = self.board.towards_viewer * sight[..., 2] / np.linalg.norm(sight, axis=-1)
-        _, inside = pixels_in_image(camera, T_base_camera.inv().apply(base))
+        inside = in_picture(camera, T_base_camera.inv().apply(base), NEAREST, BORDER_PX)
         free = (inside & (cosine.ravel() > _MIN_COSINE)).copy()
         margin = np.full(int(free.sum()), _IN_FRONT * self.plate_size[2])
         if free.any():

@@ -9,6 +9,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +25,12 @@ from legcal.machine.model import Machine
 from legcal.planning.places import feet
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
+from legcal.simulation.observe import (
+    Viewpoint,
+    legs_in_image,
+)
 from legcal.simulation.rendering.rays import in_view, surrounding_points
 from legcal.simulation.solids import PosedMachine
-from legcal.simulation.visibility import (
-    Viewpoint,
-    field_of_view,
-    legs_in_image,
-    longest_in_images,
-)
 from legcal.vision.board import Board, Link, facing_board
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
@@ -264,14 +264,7 @@ def _best(
 
     Places are left out that could not reach it even if nothing were hidden.
     """
-    T = np.array([place.as_matrix() for place in places])
-    most = np.mean(
-        [
-            longest_in_images(machine.legs, posed, camera, T, samples=_SAMPLES).mean(axis=1)
-            for posed in posed_machines
-        ],
-        axis=0,
-    )
+    most = np.array([_length(machine, posed_machines, camera, T, True) for T in places])
     most *= 1.0 + _ROUNDING
     scores = np.full(len(places), -1.0)
     for k in np.argsort(-most, kind="stable").tolist():
@@ -300,12 +293,34 @@ def _score(
         share *= float(np.mean(shown))
         if np.mean(shown) < _MIN_BOARD_SHARE:
             return 0.0
-    lengths = [
-        leg.length_px if leg.is_seen else 0.0
+    return share * _length(machine, posed_machines, camera, T, False)
+
+
+def _length(
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    camera: Camera,
+    T: RigidTransform,
+    nothing_hides: bool,
+) -> float:
+    """Return the mean length in the image [px] of all legs, zero for those that are not seen."""
+    seen = [
+        legs_in_image(machine.legs, posed, camera, T, samples=_SAMPLES, nothing_hides=nothing_hides)
         for posed in posed_machines
-        for leg in legs_in_image(machine.legs, posed, camera, T, samples=_SAMPLES)
     ]
-    return share * float(np.mean(lengths))
+    total = sum(float(view.length_px[~view.is_arm].sum()) for view in seen)
+    return total / (len(seen) * machine.n_legs)
+
+
+@lru_cache(maxsize=64)  # the same at every candidate place of a camera
+def field_of_view(camera: Camera) -> tuple[Array, Array]:
+    """Return the least and the largest (x, y) of the sensor plane on the image's border."""
+    x, y = camera.width - 1.0, camera.height - 1.0
+    t = np.linspace(0.0, 1.0, 9)[:, None]
+    corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y], [0.0, 0.0]])
+    border = np.concatenate([a + t * (b - a) for a, b in pairwise(corners)])
+    xy = camera.undistort(border)
+    return xy.min(axis=0), xy.max(axis=0)
 
 
 def _lying(

@@ -36,7 +36,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model
 from legcal.planning.session import rough_view
-from legcal.progress import Progress, Report, shown_progress
+from legcal.progress import Progress, shown_progress
 from legcal.simulation.board import documents
 from legcal.simulation.observe import (
     EVERY_PIXEL,
@@ -44,10 +44,9 @@ from legcal.simulation.observe import (
     edges_of_bodies,
     outlines_of,
 )
-from legcal.simulation.poses import are_extreme
 from legcal.simulation.session import (
     SimulatedSession,
-    Streams,
+    are_extreme,
     photographs,
     simulate_session,
     streams,
@@ -146,7 +145,12 @@ def simulate(
         )
     check_dataset_destination(destination)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
-    _check_readings(nominal, settings)
+    for leg in (nominal.legs[j] for j in nominal.motors):
+        if too_large := sigma_too_large(settings.reading_errors(leg).sigma, leg):
+            raise UsageError(
+                "The readings could not be simulated: found a standard deviation of "
+                f"{too_large[0]}, needed {too_large[1]}; give errors with the unit that is meant."
+            )
     rngs = streams(settings.seed)
     with shown_progress(progress) as report, result_folder(destination, SIMULATED) as folder:
         yaml_path, _ = write_model(nominal, folder)
@@ -175,12 +179,19 @@ def simulate(
                 corners = corners_in_images(*of_boards, settings.sigma_px, rngs["corners"])
                 write_corners(folder / CORNERS_NAME, corners, m)
         if not has_tables:
-            _write_photographs(folder, session, settings, rngs, workers, report)
+            names = session.measurements.image
+            (folder / "images").mkdir()
+            report("Photographs", 0, len(names))
+            rendered = photographs(session, settings.appearance, rngs["photographs"], workers)
+            with closing(rendered):
+                for done, (row, png) in enumerate(rendered, 1):
+                    (folder / names[row]).write_bytes(png)
+                    report("Photographs", done, len(names))
         if settings.plan is not None:
             plan = read_bytes(Path(settings.plan) / PLAN_NAME, MAX_DOCUMENT)
             (folder / PLAN_NAME).write_bytes(plan)
         write_truth(folder / TRUTH_NAME, session, settings)
-    seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
+    shown = session.scene.images.shown
     readings = session.poses.readings[np.unique(session.scene.images.pose)]
     rod = truth.rod_for_scale(has_length=bool(measured or session.boards))
     return SimulatedDataset(
@@ -190,7 +201,7 @@ def simulate(
         truth=truth,
         truth_path=destination / TRUTH / "models" / truth.yaml_path.name,
         measurements=m,
-        seen=np.array(seen),
+        seen=np.concatenate([view.visible_legs(1, truth.n_legs) for view in shown]),
         left_out=session.left_out,
         n_extreme=int(np.sum(are_extreme(truth, readings))),
         to_measure="" if rod is None else rod[1],
@@ -211,35 +222,6 @@ def _measured(
             )
         lengths_in_words[name] = f"{1e3 * (true + sigma * rng.normal()):.6f}+-{1e3 * sigma:g}mm"
     return lengths_in_words
-
-
-def _write_photographs(
-    folder: Path,
-    session: SimulatedSession,
-    settings: SimulationSettings,
-    rngs: Streams,
-    workers: Workers,
-    progress: Report,
-) -> None:
-    """Write the photograph of every row."""
-    names = session.measurements.image
-    (folder / "images").mkdir()
-    progress("Photographs", 0, len(names))
-    rendered = photographs(session, settings.appearance, rngs["photographs"], workers)
-    with closing(rendered):
-        for done, (row, png) in enumerate(rendered, 1):
-            (folder / names[row]).write_bytes(png)
-            progress("Photographs", done, len(names))
-
-
-def _check_readings(nominal: Machine, settings: SimulationSettings) -> None:
-    """Refuse errors of readings that no dataset may state."""
-    for leg in (nominal.legs[j] for j in nominal.motors):
-        if too_large := sigma_too_large(settings.reading_errors(leg).sigma, leg):
-            raise UsageError(
-                "The readings could not be simulated: found a standard deviation of "
-                f"{too_large[0]}, needed {too_large[1]}; give errors with the unit that is meant."
-            )
 
 
 class ViewSummary(Document):

@@ -1,30 +1,193 @@
 """Simulated observations of a machine in its poses: outlines, axes, corners, exact or noisy.
 
-A :class:`Scene` is the truth of a session: the joints, and the visible legs in each image
-(:func:`legcal.simulation.visibility.take_images`).
+A :class:`Scene` is the truth of a session: the joints, and the visible legs in each image. Legs are
+seen as the method sees them, but rays at solids say what hides them (:func:`take_images`); the
+method predicts that from a model, in another way (:mod:`legcal.vision.visibility`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.outlines import Outlines, join_outlines, unmeasured
 from legcal.data.reasons import USED
-from legcal.errors import NotVisible
+from legcal.errors import NotVisible, UsageError
 from legcal.geometry.lines import cross
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.motions import matrix_applied
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import Leg, cylinder_of_arm
 from legcal.machine.shapes import Occluder
 from legcal.perception.body_edges import predicted_edges
+from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
-from legcal.simulation.visibility import Images, Viewpoint
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
+from legcal.vision.visibility import Bodies, Seen, in_picture, least_length, visible_parts
+
+MIN_SHARE = 0.4  # minimum share of a leg's length that is visible
+SAMPLES = 96  # points along a part
+BORDER_PX = 2.0  # width of the image border where nothing counts as seen
+_BESIDE = 0.01  # distance of tested points outside the outline, in radii
+_IN_FRONT = 0.1  # minimum distance in front of an outline, in radii, of a hit that hides it
+NEAREST = 1e-6  # [m] before a camera
+
+
+def legs_in_image(
+    legs: Sequence[Leg],
+    posed: PosedMachine,
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    *,
+    samples: int = SAMPLES,
+    least: float = MIN_SHARE,
+    nothing_hides: bool = False,
+) -> Seen:
+    """Return the visible segments of legs and arms of which at least a share is visible."""
+    T = T_base_camera.as_matrix()
+    arms = {j: leg.arm for j, leg in enumerate(legs) if leg.arm is not None and j in posed.arms}
+    A, B = (
+        np.concatenate([ends, *(posed.arms[j][None, k] for j in arms)])
+        for k, ends in enumerate((posed.A, posed.B))
+    )
+    bodies = Bodies(
+        A[None],
+        B[None],
+        (*(leg.cylinders for leg in legs), *([cylinder_of_arm(arm)] for arm in arms.values())),
+        np.array([*range(len(legs)), *arms], dtype=np.intp),
+        np.zeros(len(legs), dtype=np.bool_),
+        NEAREST,
+        (),
+    )
+
+    def are_clear(radius: Array, axis: Array, steps: Array) -> BoolArray:
+        free = in_picture(camera, axis[:, :, None] + steps[:, None], NEAREST, BORDER_PX)
+        if not nothing_hides:
+            beside = matrix_applied(T, (axis[:, :, None] + (1.0 + _BESIDE) * steps[:, None])[free])
+            margin = np.broadcast_to(_IN_FRONT * radius[:, None, None], free.shape)[free]
+            free[free] = ~posed.hidden(T[:3, 3], beside, margin)
+        return np.asarray(free.all(axis=-1))
+
+    seen = visible_parts(camera, T_base_camera, bodies, are_clear=are_clear, n_along=samples)
+    return seen.chosen(shares(seen, len(legs))[seen.is_arm.astype(np.intp), seen.leg] >= least)
+
+
+def shares(seen: Seen, n_legs: int) -> Array:
+    """Return the visible parts of legs and arms, relative to their lengths, (2, n_legs)."""
+    share = np.zeros((2, n_legs))
+    np.add.at(share, (seen.is_arm.astype(np.intp), seen.leg), np.diff(seen.span)[:, 0])
+    return share
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A simulated camera and its pose."""
+
+    name: str
+    camera: Camera  # its intrinsics
+    T_base_camera: RigidTransform  # its true pose in the base link
+    legs: tuple[str, ...] | None = None  # measured in its images; None for all visible legs
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The images of a dataset, in the order of its rows."""
+
+    # view, pose, repeat: (n_rows,) indices; ``repeat`` counts the images of one pose in one view
+    view: IntArray
+    pose: IntArray
+    repeat: IntArray
+    # visible legs and arms by row; equal for all images of one pose in one view
+    shown: tuple[Seen, ...]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def seen(self, row: int) -> list[int]:
+        """Return the legs that are measurable in an image."""
+        seen = self.shown[row]
+        return sorted({*seen.leg[~seen.is_arm].tolist()})
+
+    def seen_in_view(self, view: int, least: float = 0.0) -> list[int]:
+        """Return the legs that more than a fraction *least* of the images of a view show."""
+        rows = np.flatnonzero(self.view == view).tolist()
+        counts = Counter(j for row in rows for j in self.seen(row))
+        return sorted(j for j, n in counts.items() if n > least * len(rows))
+
+    def chosen(self, rows: Sequence[int]) -> Images:
+        """Return some of the images."""
+        index = np.asarray(rows, dtype=np.intp)
+        shown = tuple(self.shown[row] for row in rows)
+        return Images(self.view[index], self.pose[index], self.repeat[index], shown)
+
+
+def take_images(
+    legs: Sequence[Leg],
+    posed_machines: Sequence[PosedMachine],
+    viewpoints: Sequence[Viewpoint],
+    poses_of: Sequence[Sequence[int]],  # poses that each view sees
+    n_images: int,  # of each pose in each view
+    progress: Report = no_progress,
+    *,
+    all_views: bool = True,  # whether each view must show a leg, or only one of them
+) -> Images:
+    """Return the images that cameras take of a machine in its poses."""
+    rows: list[tuple[int, int, int]] = []
+    shown: list[Seen] = []
+    problems = []
+    for v, (viewpoint, poses) in enumerate(zip(viewpoints, poses_of, strict=True)):
+        progress("Views", v, len(viewpoints))
+        camera, T = viewpoint.camera, viewpoint.T_base_camera
+        _refuse_inside(viewpoint, [posed_machines[p] for p in poses])
+        views = [legs_in_image(legs, posed_machines[p], camera, T) for p in poses]
+        if viewpoint.legs is not None:
+            named = np.array([leg.name in viewpoint.legs for leg in legs])
+            views = [view.chosen(named[view.leg]) for view in views]
+        if all(view.is_arm.all() for view in views):
+            problems.append(_sees_nothing(viewpoint.name, legs))
+        for p, view in zip(poses, views, strict=True):
+            rows += [(v, p, k) for k in range(n_images)]
+            shown += [view] * n_images
+    progress("Views", len(viewpoints), len(viewpoints))
+    if problems and (all_views or len(problems) == len(viewpoints)):
+        raise NotVisible(problems)
+    view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T
+    return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
+
+
+def _refuse_inside(viewpoint: Viewpoint, posed_machines: Sequence[PosedMachine]) -> None:
+    """Raise UsageError if a camera is inside the machine in one of the poses."""
+    centre = viewpoint.T_base_camera.translation
+    if any(posed.encloses(centre) for posed in posed_machines):
+        x, y, z = centre
+        raise UsageError(
+            f"view {viewpoint.name}: its camera could not be placed: found it inside the machine, "
+            f"at ({x:.3f}, {y:.3f}, {z:.3f}) m in the base link, needed a place outside in all "
+            "poses; move the camera."
+        )
+
+
+def _sees_nothing(name: str, legs: Sequence[Leg]) -> str:
+    """Return the problem of a view without a leg."""
+    start = f"view {name}: its images could not be simulated: found"
+    if not any(leg.cylinders for leg in legs):
+        return (
+            f"{start} no leg with a visible cylinder in the model, needed URDF visuals that are "
+            "cylinders coaxial with the legs; add them, or write a model with: legcal "
+            "inspect FILE --leg-radius MM --write DIR."
+        )
+    return (
+        f"{start} that no image shows a leg, needed {100.0 * MIN_SHARE:.0f} % of one unhidden and "
+        f"at least {least_length(0.0):g} px long in them; turn or move the camera (its place is in "
+        "metres), or give it a longer focal length."
+    )
+
 
 EXACT_PX = 1e-3  # stated standard deviation of outlines and corners without noise
 _MIN_UPRIGHT_AXIS = 1e-3  # component along the image y axis below which a leg has no point M_LS
@@ -39,8 +202,6 @@ class Scene:
     B: Array  # (n_poses, n_legs, 3) platform joint centres in L [m]
     views: tuple[Viewpoint, ...]  # with T_L_camera
     images: Images
-    # (n_poses, 2, 3) ends of arms in L, by the legs that have them as parts [m]
-    arms: Mapping[int, Array] = field(default_factory=dict)
 
     def leg_in_camera(self, row: int, leg: int) -> tuple[Array, Array]:
         """Return direction u (3,) and base joint A (3,) [m] of a leg in the camera of an image."""
@@ -74,47 +235,30 @@ EVERY_PIXEL = OutlineNoise(n_points=None)
 def outlines_of(
     scene: Scene, noise: OutlineNoise = EVERY_PIXEL, rng: np.random.Generator | None = None
 ) -> Outlines:
-    """Return the outlines of all visible stretches by row, leg and edge; exact without *rng*.
+    """Return the outlines of all visible segments by row, leg and edge; exact without *rng*.
 
-    Outlines of an arm follow the outlines of its leg. They carry the covariance of the noise in
+    Outlines of arms follow the outlines of legs. They carry the covariance of the noise in
     either case.
     """
     claimed = replace(noise, sigma_px=max(noise.sigma_px, EXACT_PX))
     images = scene.images
-    rows, stretches, h, ends, covariances = [], [], [], [], []
-    for row in range(len(images)):
-        view = scene.views[images.view[row]]
-        T = view.T_base_camera.inv()
-        pose = images.pose[row]
-        for leg, shown in enumerate(images.shown[row]):
-            of_leg = shown.stretches if shown.is_seen else ()
-            of_arm = () if shown.arm is None else (shown.arm,)
-            for stretch in (*of_leg, *of_arm):
-                A, B = (
-                    scene.arms[leg][pose]
-                    if of_arm and stretch is shown.arm
-                    else (scene.A[pose, leg], scene.B[pose, leg])
-                )
-                u = (B - A) / np.linalg.norm(B - A)
-                axis = T.apply(A + np.array([[stretch.start], [stretch.end]]) * u)
-                line = outlines_of_axis(T.as_matrix()[:3, :3] @ u, axis[0], stretch.radius)
-                steps = steps_to_outlines(line, stretch.radius)
-                pixels = view.camera.project(axis[None] + steps[:, None])
-                length = float(np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1).mean())
-                covariance = claimed.covariance(length)
-                if rng is not None and noise.sigma_px > 0.0:
-                    errors = rng.multivariate_normal(np.zeros(2), covariance, size=2)
-                    line, pixels = shifted_outlines(view.camera, line, pixels, errors)
-                rows.append(row)
-                stretches.append(stretch)
-                h.append(line)
-                ends.append(pixels)
-                covariances.append(covariance)
-    n = 2 * len(rows)
+    rows, h, ends, covariances = [], list[Array](), list[Array](), []
+    for row, seen in enumerate(images.shown):
+        camera = scene.views[images.view[row]].camera
+        for line, pixels, length in zip(seen.h, seen.ends, seen.length_px.tolist(), strict=True):
+            covariance = claimed.covariance(length)
+            if rng is not None and noise.sigma_px > 0.0:
+                errors = rng.multivariate_normal(np.zeros(2), covariance, size=2)
+                line, pixels = shifted_outlines(camera, line, pixels, errors)
+            rows.append(row)
+            h.append(line)
+            ends.append(pixels)
+            covariances.append(covariance)
+    n, no_legs = 2 * len(rows), np.zeros(0, dtype=np.intp)
     return Outlines(
         row=np.repeat(np.array(rows, dtype=np.intp), 2),
-        leg=np.repeat(np.array([s.leg for s in stretches], dtype=np.intp), 2),
-        part=tuple(s.part for s in stretches for _ in range(2)),
+        leg=np.repeat(np.concatenate([no_legs, *(seen.leg for seen in images.shown)]), 2),
+        part=tuple(part for seen in images.shown for part in seen.part for _ in range(2)),
         edge=np.tile(np.array([1, 2], dtype=np.intp), len(rows)),
         h=np.array(h).reshape(n, 3),
         ends=np.array(ends).reshape(n, 2, 2),

@@ -2,10 +2,15 @@
 
 The session simulator makes the measurements; here are the machine, the cameras and the numbers of
 the paper, and its estimators.
+
+:func:`run_study` makes many independent runs of one experiment: run i has child i of the study's
+seed, whatever the number of runs and of processes.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -13,29 +18,36 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.axes import LegAxes, axes_of_table
-from legcal.errors import DidNotConverge, LegcalError
-from legcal.files.schema import Document, Number
+from legcal.data.outlines import LegAxes, axes_of_table
+from legcal.errors import DidNotConverge, LegcalError, UsageError
+from legcal.files.folder import OutputKind, check_destination, result_folder
+from legcal.files.schema import Document, Number, SparseDocument
 from legcal.geometry.motions import look_at
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import BoolArray
 from legcal.machine.closing import solve_poses
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, parameters_of_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
-from legcal.pages.svg import Bars, Canvas, log_bars, stacked
+from legcal.pages.svg import Bars, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
-from legcal.simulation.observe import TableNoise, axes_in_images
-from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import SimulatedSession, Streams, simulate_session, streams
+from legcal.progress import Progress, shown_progress
+from legcal.simulation.observe import TableNoise, Viewpoint, axes_in_images
+from legcal.simulation.session import (
+    SimulatedSession,
+    Streams,
+    draw_poses,
+    simulate_session,
+    streams,
+)
 from legcal.simulation.settings import (
     Level,
     ParameterErrors,
@@ -43,10 +55,9 @@ from legcal.simulation.settings import (
     SimulationSettings,
     Spread,
 )
-from legcal.simulation.study import Record, failure_of
 from legcal.simulation.truth import draw_errors, write_model_with
-from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera, sample_camera
+from legcal.workers import Workers, is_number, processors, worker_pool
 
 MACHINES = ("coplanar", "noncoplanar")
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs in each view
@@ -147,9 +158,9 @@ class PaperStudy:
             for name, child in zip(MACHINES, seeds, strict=True)
         }
 
-    def summary(self, records: Iterable[Record]) -> PaperSummary:
+    def summary(self, records: Iterable[Record]) -> PaperDocument:
         """Return the means over all runs."""
-        return PaperSummary.of(records, in_radians=self.noise == TableNoise.in_radians())
+        return PaperDocument.of(records, in_radians=self.noise == TableNoise.in_radians())
 
     def session(
         self, truth: Machine, views: Sequence[Viewpoint], rngs: Streams
@@ -213,7 +224,7 @@ def _errors(truth: Machine, legs: Sequence[Leg], checked: RigidTransform) -> Rec
         errors = platform_errors(truth, legs, checked)
     except LegcalError as error:
         return {"failure": failure_of(error)}
-    return {**asdict(errors), "parameters": np.abs(estimated - true).tolist()}
+    return asdict(errors) | {"parameters": np.abs(estimated - true).tolist()}
 
 
 # Errors of the platform, eq (20)
@@ -322,124 +333,9 @@ _DRAWN = {"literal": "steps as printed", "default": "weighted steps"}
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
 
 
-@dataclass(frozen=True, eq=False)
-class Means:
-    """Means of one estimator's errors over the runs without failure."""
-
-    machine: str
-    estimator: str
-    scalars: Array  # (n, 3): dX [m], dE and the angle [rad] of each run
-    errors: Array  # (n_parameters,) mean absolute error of every parameter [m]
-    failures: dict[str, int]  # the other runs, by kind of error
-
-    @classmethod
-    def of(cls, machine: str, estimator: str, records: Sequence[Record]) -> Means:
-        """Return the means over the records of an estimator on a machine."""
-        good = [record for record in records if "failure" not in record]
-        failures = Counter(r["failure"]["kind"] for r in records if "failure" in r)
-        return cls(
-            machine,
-            estimator,
-            np.array([[record[name] for name in SCALARS] for record in good]).reshape(-1, 3),
-            np.mean([record["parameters"] for record in good], axis=0) if good else np.zeros(0),
-            dict(sorted(failures.items())),
-        )
-
-    def row(self) -> EstimatorRow:
-        """Return a row of ``--json``; null where every run failed."""
-        n = len(self.scalars)
-        figures = dict[str, Any].fromkeys(_FIGURES)
-        if n:
-            mean = self.scalars.mean(axis=0)
-            sigma = self.scalars.std(axis=0, ddof=min(n - 1, 1)) / np.sqrt(n)
-            values = np.append(mean, sigma[:2])
-            figures = dict(zip(_FIGURES, (_SCALES * values).tolist(), strict=True))
-        return EstimatorRow(
-            estimator=self.estimator,
-            coplanar=self.machine == "coplanar",
-            parameters_mm=(1e3 * self.errors).tolist(),
-            **figures,
-            runs=n,
-            failed=sum(self.failures.values()),
-            failures=self.failures,
-        )
-
-
 _FIGURES = ("dX_mm", "dE_deg", "angle_deg", "dX_mean_sigma_mm", "dE_mean_sigma_deg")
 _DEGREES = float(np.degrees(1.0))
 _SCALES = np.array([1e3, _DEGREES, _DEGREES, 1e3, _DEGREES])
-
-
-@dataclass(frozen=True, eq=False)
-class PaperSummary:
-    """The paper's evaluation: errors before and after calibration, of every estimator."""
-
-    means: tuple[Means, ...]  # by machine, and then: initial, the estimators
-    in_radians: bool  # whether Table 1 was read in radians
-
-    @classmethod
-    def of(cls, records: Iterable[Record], *, in_radians: bool) -> PaperSummary:
-        """Return the means over records."""
-        by_key: dict[tuple[str, str], list[Record]] = {}
-        for record in records:
-            for machine, errors_by_estimator in record.items():
-                for estimator, errors in errors_by_estimator.items():
-                    by_key.setdefault((machine, estimator), []).append(errors)
-        return cls(tuple(Means.of(*key, some) for key, some in by_key.items()), in_radians)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        first = paper_machine(MACHINES[0])
-        return parametrize(first.leg_names, geometries(first), first.frame_legs).names
-
-    @property
-    def truths(self) -> dict[str, Array]:
-        """True values (n_parameters,) of each machine [m]."""
-        machines = {name: paper_machine(name) for name in MACHINES}
-        return {name: to_vector(m.parameters, m.frame_legs) for name, m in machines.items()}
-
-    def document(self) -> dict[str, Any]:
-        """Return the document of ``--json``."""
-        return PaperDocument(
-            rows=[means.row() for means in self.means if means.estimator != INITIAL],
-            initial=[means.row() for means in self.means if means.estimator == INITIAL],
-            names=list(self.names),
-            true_values_mm={name: (1e3 * xi).tolist() for name, xi in self.truths.items()},
-            as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
-            readings=[IN_RADIANS if self.in_radians else IN_DEGREES, *READINGS],
-        ).document()
-
-    def files(self) -> dict[str, bytes]:
-        """Return figure 4."""
-        return {"fig4.svg": self._figure().markup().encode()}
-
-    def _figure(self) -> Canvas:
-        """Draw figure 4: a row for each estimator, a column for each machine."""
-        means = {(m.machine, m.estimator): m for m in self.means}
-        labels = []
-        for name in self.names:  # A2x for leg2.base.x
-            leg, parameter, *axis = name.split(".")
-            labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
-        charts = []
-        for (estimator, words), machine in product(_DRAWN.items(), self.truths):
-            if (machine, estimator) not in means:
-                continue
-            shown = means[machine, estimator]
-            errors = [
-                Bars(label, (1e3 * means[machine, name].errors).tolist() or [None] * len(labels))
-                for label, name in (
-                    ("initial model", INITIAL),
-                    (words, estimator),
-                )
-            ]
-            n_failed = sum(shown.failures.values())
-            failed = f", {n_failed} of {len(shown.scalars) + n_failed} runs failed" * bool(n_failed)
-            title = f"{words}, {JOINTS[machine]} joints{failed}"
-            charts.append(log_bars(title, "mm", labels, *errors))
-        n_runs = len(self.means[0].scalars) + sum(self.means[0].failures.values())
-        title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
-        return stacked(title, charts, len(self.truths))
 
 
 class EstimatorRow(Document):
@@ -457,6 +353,28 @@ class EstimatorRow(Document):
     failed: int
     failures: dict[str, int]  # by kind of error
 
+    @classmethod
+    def of(cls, machine: str, estimator: str, records: Sequence[Record]) -> EstimatorRow:
+        """Return the means over the records of an estimator on a machine."""
+        good = [record for record in records if "failure" not in record]
+        failures = Counter(r["failure"]["kind"] for r in records if "failure" in r)
+        n, figures, parameters = len(good), dict[str, Any].fromkeys(_FIGURES), list[float]()
+        if n:
+            scalars = np.array([[record[name] for name in SCALARS] for record in good])
+            mean, sigma = scalars.mean(axis=0), scalars.std(axis=0, ddof=min(n - 1, 1)) / np.sqrt(n)
+            values = np.append(mean, sigma[:2])
+            figures = dict(zip(_FIGURES, (_SCALES * values).tolist(), strict=True))
+            parameters = (1e3 * np.mean([r["parameters"] for r in good], axis=0)).tolist()
+        return cls(
+            estimator=estimator,
+            coplanar=machine == "coplanar",
+            parameters_mm=parameters,
+            **figures,
+            runs=n,
+            failed=failures.total(),
+            failures=dict(sorted(failures.items())),
+        )
+
 
 class PaperDocument(Document):
     """The combined result of the runs of ``legcal study paper``."""
@@ -467,3 +385,231 @@ class PaperDocument(Document):
     true_values_mm: dict[str, list[Number]]  # by machine
     as_printed: dict[str, dict[str, Any] | str]  # in the paper
     readings: list[str]  # interpretations of the paper where its text leaves a choice
+
+    @classmethod
+    def of(cls, records: Iterable[Record], *, in_radians: bool) -> PaperDocument:
+        """Return the means over the records of runs."""
+        by_key: dict[tuple[str, str], list[Record]] = {}
+        for record in records:
+            for machine, errors_by_estimator in record.items():
+                for estimator, errors in errors_by_estimator.items():
+                    by_key.setdefault((machine, estimator), []).append(errors)
+        rows = [EstimatorRow.of(*key, some) for key, some in by_key.items()]
+        machines = {name: paper_machine(name) for name in MACHINES}
+        first = machines[MACHINES[0]]
+        return cls(
+            rows=[row for row in rows if row.estimator != INITIAL],
+            initial=[row for row in rows if row.estimator == INITIAL],
+            names=list(parametrize(first.leg_names, geometries(first), first.frame_legs).names),
+            true_values_mm={
+                name: (1e3 * to_vector(m.parameters, m.frame_legs)).tolist()
+                for name, m in machines.items()
+            },
+            as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
+            readings=[IN_RADIANS if in_radians else IN_DEGREES, *READINGS],
+        )
+
+    def files(self) -> dict[str, bytes]:
+        """Return figure 4: a row for each estimator, a column for each machine."""
+        by_key = {(row.coplanar, row.estimator): row for row in (*self.initial, *self.rows)}
+        labels = []
+        for name in self.names:  # A2x for leg2.base.x
+            leg, parameter, *axis = name.split(".")
+            labels.append(f"{_LETTERS[parameter]}{leg.removeprefix('leg')}{''.join(axis)}")
+        charts = []
+        for (estimator, words), machine in product(_DRAWN.items(), MACHINES):
+            is_coplanar = machine == "coplanar"
+            shown = by_key.get((is_coplanar, estimator))
+            if shown is None:
+                continue
+            errors = [
+                Bars(label, by_key[is_coplanar, name].parameters_mm or [None] * len(labels))
+                for label, name in (
+                    ("initial model", INITIAL),
+                    (words, estimator),
+                )
+            ]
+            n_runs = shown.runs + shown.failed
+            failed = f", {shown.failed} of {n_runs} runs failed" * bool(shown.failed)
+            title = f"{words}, {JOINTS[machine]} joints{failed}"
+            charts.append(log_bars(title, "mm", labels, *errors))
+        n_runs = self.rows[0].runs + self.rows[0].failed
+        title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
+        return {"fig4.svg": stacked(title, charts, len(MACHINES)).markup().encode()}
+
+
+# The Monte Carlo runner
+
+
+DOCUMENT_NAME = "study.json"
+_STUDY = OutputKind("result of the study", DOCUMENT_NAME, "study")
+_MOST_RUNS = 1_000_000
+_PROCESSES = 4  # maximum number of processes for each core; more only wait for each other
+
+Record = dict[str, Any]
+"""The result of one run as a JSON document: numbers, texts, lists, null; never NaN."""
+
+
+class Summary(Protocol):
+    """The combined result of all runs of a study."""
+
+    def document(self) -> dict[str, Any]:
+        """Return it as a JSON document."""
+
+    def files(self) -> dict[str, bytes]:
+        """Return the files that belong to it, such as figures, by name."""
+
+
+class Study(Protocol):
+    """A Monte Carlo study: many independent runs of one experiment.
+
+    It is sent to worker processes: it must pickle, and keep nothing from one run to the next that
+    changes a result.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its name on the command line."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Everything that decides a run beside its seed, as a JSON document."""
+
+    def one_run(self, seed: np.random.SeedSequence) -> Record:
+        """Return the record of one run; a LegcalError is recorded as a failed run."""
+
+    def summary(self, records: Iterable[Record]) -> Summary:
+        """Summarise the records of all runs that did not fail, read once and in order."""
+
+
+class StudyHeading(SparseDocument):
+    """The part of a study's document that is common to all studies."""
+
+    study: str
+    settings: dict[str, Any]
+    seed: int
+    runs: int
+    failures: dict[str, int]  # runs that failed as a whole, by kind of error
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResult:
+    """A finished study."""
+
+    heading: StudyHeading
+    summary: Summary  # result of the runs that did not fail
+
+    def document(self) -> dict[str, Any]:
+        """Return the document that ``legcal study --json`` prints."""
+        return self.summary.document() | self.heading.document()
+
+
+def run_study(
+    study: Study,
+    n_runs: int,
+    *,
+    seed: int = 0,
+    workers: Workers = 1,
+    output: Path | None = None,
+    progress: Progress = False,
+    beside: Callable[[StudyResult, Path], None] | None = None,
+) -> StudyResult:
+    """Run a study.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    n_runs : int
+        Number of runs.
+    seed : int
+        Seed of the study.
+    workers : int, str or executor
+        Number of processes, limited to a few for each core, or a cluster, as for
+        :func:`legcal.calibrate`.
+    output : Path, optional
+        Folder for the document and the figures.
+    progress : bool or callable
+        True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
+    beside : callable, optional
+        Called as ``beside(result, folder)`` with the figures in the folder; files that it writes
+        there appear in the output with them.
+
+    Returns
+    -------
+    StudyResult
+
+    Raises
+    ------
+    UsageError
+        If a number is out of range, or the folder has other content than a study.
+    DidNotConverge
+        If every run failed.
+    OutOfResources
+        If a file cannot be written or a process is ended from outside.
+    """
+    _check_numbers(n_runs, seed, workers)
+    if output is not None:
+        check_destination(output, _STUDY)
+    stage, outcomes = f"Study {study.name}", dict[int, Record | LegcalError]()
+    with shown_progress(progress) as report:
+        report(stage, 0, n_runs)
+        if is_number(workers):
+            workers = min(workers, n_runs, _PROCESSES * processors())
+        with worker_pool(workers, "The study could not be finished", in_order=False) as run:
+            for number, outcome in run(partial(_outcome, study, seed), range(n_runs)):
+                outcomes[number] = outcome
+                report(stage, len(outcomes), n_runs)
+    in_order = [outcomes[number] for number in range(n_runs)]
+    failures = [outcome for outcome in in_order if isinstance(outcome, LegcalError)]
+    if len(failures) == n_runs:
+        raise DidNotConverge(
+            f"The study {study.name} found nothing: all of its {n_runs} runs failed, needed "
+            f"one that does not; the first one says: {failures[0]}"
+        )
+    heading = StudyHeading(
+        study=study.name,
+        settings=study.settings,
+        seed=seed,
+        runs=n_runs,
+        failures=dict(Counter(type(failure).__name__ for failure in failures)),
+    )
+    records = (outcome for outcome in in_order if not isinstance(outcome, LegcalError))
+    result = StudyResult(heading, study.summary(records))
+    if output is not None:
+        document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
+        with result_folder(output, _STUDY) as folder:
+            for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
+                (folder / name).write_bytes(content)
+            if beside is not None:
+                beside(result, folder)
+    return result
+
+
+def _outcome(study: Study, seed: int, number: int) -> tuple[int, Record | LegcalError]:
+    """Return the number of a run, and its record or its failure."""
+    try:
+        return number, study.one_run(np.random.SeedSequence(seed, spawn_key=(number,)))
+    except LegcalError as error:
+        return number, error
+
+
+def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
+    """Refuse numbers out of range."""
+    processes = workers if is_number(workers) else 1
+    for name, number, least, most in (
+        ("runs", n_runs, 1, _MOST_RUNS),
+        ("seed", seed, 0, math.inf),
+        ("workers", processes, 1, math.inf),
+    ):
+        if not least <= number <= most:
+            needed = f"{least} or more" if number < least else f"{most} at most"
+            raise UsageError(
+                f"The study could not be run: found {name} = {number}, needed {needed}; give "
+                "another number."
+            )
+
+
+def failure_of(error: LegcalError) -> dict[str, str]:
+    """Return a failure as a record."""
+    return {"kind": type(error).__name__, "message": str(error)}

@@ -20,8 +20,8 @@ from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
+from legcal.simulation.observe import Viewpoint
 from legcal.simulation.rendering.appearance import CAMERAS, Appearance
-from legcal.simulation.visibility import Viewpoint
 from legcal.vision.board import Board
 
 MAX_SIZE = 1.0  # maximum size of errors [m] or [rad]

@@ -71,57 +71,41 @@ class Mesh:
 Shape = SolidCylinder | Sphere | Box | Mesh
 
 
-def _check(urdf_path: Path, element: etree._Element) -> None:
-    """Check a shape; ValueError has the actual and the needed content."""
-    tag = str(element.tag)
+def _shape_of(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransform]:
+    """Return the shape of a visual and T_link_shape; the vertices of a mesh are in the link.
+
+    ValueError has the actual and the needed content.
+    """
+    element = visual.find("geometry")[0]  # type: ignore[index]
+    tag, numbers = str(element.tag), list[float]()
     if tag == "mesh":
-        _check_mesh(urdf_path, element)
-    elif tag not in _SIZES:
+        name, scale = element.get("filename", ""), element.get("scale", "1 1 1")
+        if mesh_file(urdf_path, name) is None:
+            raise ValueError(
+                f"found no mesh file '{name}', needed it beside the URDF; copy it, correct the "
+                "name, or simulate with --level outlines, which draws no meshes"
+            )
+        factors = number_list(scale, 3)
+        if factors is None or min(abs(factor) for factor in factors) == 0.0:
+            raise ValueError(
+                f'found <mesh scale="{scale}">, needed 3 numbers other than zero; correct it'
+            )
+        return Mesh(*read_mesh(urdf_path, visual)), RigidTransform.identity()
+    if tag not in _SIZES:
         raise ValueError(
             f"found <{tag}>, needed a cylinder, sphere, box or mesh; write one of them"
         )
-    for name in _SIZES.get(tag, ()):
+    for name in _SIZES[tag]:
         text, count = element.get(name, ""), 3 if name == "size" else 1
-        numbers = number_list(text, count)
-        if numbers is None or min(numbers) <= 0.0:
+        sizes = number_list(text, count)
+        if sizes is None or min(sizes) <= 0.0:
             needed = "a positive number" if count == 1 else f"{count} positive numbers"
             raise ValueError(f'found <{tag} {name}="{text}">, needed {needed}; write it [m]')
-
-
-def _is_empty(element: etree._Element) -> bool:
-    """Return whether a shape is a box without a size."""
-    sizes = number_list(element.get("size", ""), 3) if element.tag == "box" else None
-    return sizes is not None and not any(sizes)
-
-
-def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
-    """Check that a mesh has a file and a size."""
-    name, scale = element.get("filename", ""), element.get("scale", "1 1 1")
-    if mesh_file(urdf_path, name) is None:
-        raise ValueError(
-            f"found no mesh file '{name}', needed it beside the URDF; copy it, correct the name, "
-            "or simulate with --level outlines, which draws no meshes"
-        )
-    factors = number_list(scale, 3)
-    if factors is None or min(abs(factor) for factor in factors) == 0.0:
-        raise ValueError(
-            f'found <mesh scale="{scale}">, needed 3 numbers other than zero; correct it'
-        )
-
-
-def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransform]:
-    """Return the shape of a visual and T_link_shape; the vertices of a mesh are in the link.
-
-    ValueError has the actual and the needed content where the file of a mesh holds none.
-    """
-    shape = visual.find("geometry")[0]  # type: ignore[index]
-    if shape.tag == "mesh":
-        return Mesh(*read_mesh(urdf_path, visual)), RigidTransform.identity()
-    numbers = [float(x) for name in _SIZES[str(shape.tag)] for x in shape.get(name, "").split()]
+        numbers += sizes
     T = RigidTransform(origins_of([visual])[0], normalize=False, copy=False)
-    if shape.tag == "cylinder":
+    if tag == "cylinder":
         return SolidCylinder(*numbers), T
-    if shape.tag == "sphere":
+    if tag == "sphere":
         return Sphere(*numbers), T
     x, y, z = numbers
     return Box((x, y, z)), T
@@ -207,11 +191,13 @@ def solids_of(machine: Machine, *, meshes_needed: bool = True) -> tuple[Solid, .
         link, number = element.get("name", ""), 0
         for visual in element.findall("visual"):
             geometry = visual.find("geometry")
-            if geometry is None or len(geometry) == 0 or _is_empty(geometry[0]):
+            if geometry is None or len(geometry) == 0:
+                continue
+            size = number_list(geometry[0].get("size", ""), 3) if geometry[0].tag == "box" else None
+            if size is not None and not any(size):
                 continue
             try:
-                _check(urdf.path, geometry[0])
-                shape, T = _shown(urdf.path, visual)
+                shape, T = _shape_of(urdf.path, visual)
             except ValueError as error:
                 if geometry[0].tag == "mesh" and not meshes_needed:
                     continue

@@ -99,17 +99,7 @@ def draw_radii(
                 radii[place] = solid.shape.radius
                 tube = solid.leg, round(solid.shape.radius / _ALIKE)
                 tubes.setdefault(tube, []).append(place)
-    _check_radii(spread, min(radii.values(), default=np.inf))
-    uniform, normal = rng.uniform(-1.0, 1.0, len(tubes)), rng.normal(size=len(tubes))
-    unit = normal if spread.distribution == Distribution.NORMAL else uniform
-    for step, places in zip((spread.size * unit).tolist(), tubes.values(), strict=True):
-        for place in places:
-            radii[place] += step
-    return radii
-
-
-def _check_radii(spread: Spread, thinnest: float) -> None:
-    """Refuse errors as large as the thinnest radius."""
+    thinnest = min(radii.values(), default=np.inf)
     most = _MAX_RADIUS_ERROR[Distribution(spread.distribution)] * thinnest
     if not spread.size <= most:
         raise UsageError(
@@ -117,6 +107,12 @@ def _check_radii(spread: Spread, thinnest: float) -> None:
             f"needed at most {1e3 * most:.3g} mm ({spread.distribution}) for cylinders as thin as "
             f"{1e3 * thinnest:g} mm; make it smaller."
         )
+    uniform, normal = rng.uniform(-1.0, 1.0, len(tubes)), rng.normal(size=len(tubes))
+    unit = normal if spread.distribution == Distribution.NORMAL else uniform
+    for step, places in zip((spread.size * unit).tolist(), tubes.values(), strict=True):
+        for place in places:
+            radii[place] += step
+    return radii
 
 
 def write_true_model(

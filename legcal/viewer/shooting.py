@@ -12,7 +12,7 @@ from legcal.errors import LegcalError, printable
 from legcal.pages.document import Dialogue as DialogueBlock
 from legcal.pages.document import Page, Section, page_html
 from legcal.planning.shooting import Asked, Checked, GuidedSession
-from legcal.recordings.arrivals import LiveCamera, WatchedFolder
+from legcal.recordings.frames import LiveCamera, WatchedFolder
 from legcal.viewer.server import HTML, LOCAL, Address, PageServer
 
 WORDS = "keep (take the refused one), skip (leave the pose out), undo (take the last one out), quit"

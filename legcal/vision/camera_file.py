@@ -21,8 +21,7 @@ import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import BadValue, DatasetError, UsageError
-from legcal.files.folder import OutputFile
-from legcal.files.published import with_schema
+from legcal.files.folder import OutputFile, with_schema
 from legcal.files.schema import FileSchema, content_of, describe, parse_yaml, validate
 from legcal.geometry.types import Array
 from legcal.vision.camera import (

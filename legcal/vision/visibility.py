@@ -12,7 +12,7 @@ somebody states which legs a camera shows, nothing hides them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -430,18 +430,25 @@ class Seen:
     part: tuple[str, ...]  # the URDF link of the cylinder
     h: Array  # (n, 2, 3) both outlines, eq (3)
     ends: Array  # (n, 2, 2, 2) of both outlines, both ends [px], the first nearer to the base joint
+    span: Array  # (n, 2) where it starts and ends, from A, as parts of the length of leg or arm
     length_px: Array  # (n,)
 
     def only(self, image: int) -> Seen:
         """Select the segments of one image."""
-        selected = np.flatnonzero(self.image == image)
+        seen = self.chosen(self.image == image)
+        return replace(seen, image=np.zeros_like(seen.image))
+
+    def chosen(self, mask: BoolArray) -> Seen:
+        """Select some of the segments."""
+        selected = np.flatnonzero(mask)
         return Seen(
-            np.zeros(len(selected), dtype=np.intp),
+            self.image[selected],
             self.leg[selected],
             self.is_arm[selected],
             tuple(self.part[i] for i in selected),
             self.h[selected],
             self.ends[selected],
+            self.span[selected],
             self.length_px[selected],
         )
 
@@ -458,23 +465,34 @@ def visible_parts(
     bodies: Bodies,
     margin_px: float = 0.0,  # free margin at the border of the picture
     stated: BoolArray | None = None,  # (n_legs,) the legs that the camera shows, if somebody says
+    are_clear: Callable[[Array, Array, Array], BoolArray] | None = None,
+    n_along: int = N_ALONG_PART,
 ) -> Seen:
-    """Return the visible segments of legs and arms in images of one camera."""
+    """Return the visible segments of legs and arms in images of one camera.
+
+    *are_clear* says what is in sight in place of the bodies: of parts with radii (k,) and points
+    (k, n_along, 3) of their axes, from which steps (k, 2, 3) lead to both outlines, (k, n_along).
+    """
     bodies = bodies.before(T_base_camera)
     A, (u, length) = bodies.A, bodies.axes
     body, link, radius, start, end = _parts(bodies.cylinders, length)
-    share = np.linspace(0.0, 1.0, N_ALONG_PART)
+    share = np.linspace(0.0, 1.0, n_along)
     s = start[..., None] + (end - start)[..., None] * share
     u_part = u[:, body]
-    P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, N_ALONG_PART, 3)
+    P = A[:, body, None] + s[..., None] * u_part[:, :, None]  # (n_images, n_parts, n_along, 3)
     margin_px = margin_px if stated is None else -np.inf
     is_visible = (end > start)[..., None] & in_picture(camera, P, bodies.nearest, margin_px)
     foot = A[:, body] - u_part * np.sum(u_part * A[:, body], axis=-1, keepdims=True)
     is_visible &= (np.linalg.norm(foot, axis=-1) > _OUTSIDE * radius)[..., None]
-    if stated is None:
+    if stated is not None:
+        is_visible &= stated[bodies.leg[body]][:, None]
+    elif are_clear is None:
         is_visible &= ~_hidden(bodies, P, body, radius)
     else:
-        is_visible &= stated[bodies.leg[body]][:, None]
+        shown = np.nonzero(is_visible.any(axis=-1))
+        R, axis = radius[shown[1]], P[shown]
+        steps = steps_to_outlines(outlines_of_axis(u_part[shown], axis[:, 0], R), R)
+        is_visible[shown] &= are_clear(R, axis, steps)
     first, last = longest_runs(is_visible)
     image, part = np.nonzero(last > first)
     first_end, last_end = (s[image, part, k[image, part]] for k in (first, last))
@@ -493,6 +511,7 @@ def visible_parts(
         tuple(link[k] for k in parts),
         h[is_long],
         ends[is_long],
+        (np.stack([first_end, last_end], axis=1) / length[image, body[part]][:, None])[is_long],
         length_px[is_long],
     )
 

@@ -25,7 +25,7 @@ from legcal.calibration.tuning import (
 from legcal.data.measurements import Measurements
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import EstimationProblem, Frames, Tangent
-from legcal.geometry.axes import axis_angles_slope
+from legcal.geometry.lines import axis_angles_slope
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.closing import solve_poses, solve_postures

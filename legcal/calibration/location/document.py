@@ -18,9 +18,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.errors import ModelError, UsageError
-from legcal.files.folder import OutputFile
+from legcal.files.folder import OutputFile, with_schema
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
-from legcal.files.published import with_schema
 from legcal.files.schema import FileSchema, Number, Version
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
