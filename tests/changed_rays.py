@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from legcal.data.dataset import Dataset
 from legcal.geometry.types import Array, BoolArray
-from legcal.simulation.observe import Scene, outlines_of
+from legcal.simulation.observe import Scene, shifted_outlines
+from legcal.vision.cylinder import outlines_of_axis
 
 
 def turned(angle: float) -> Callable[[Array], Array]:
@@ -63,17 +64,14 @@ def with_moved_joint(
 
         found = least_squares(error, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
         B[k] = platform(found.x)
-    before, after = outlines_of(scene), outlines_of(replace(scene, A=A, B=B))
-    at, place = (
-        [
-            (int(table.row[i]), int(table.leg[i]), table.part[i], int(table.edge[i]))
-            for i in range(len(table))
-        ]
-        for table in (o, before)
-    )
-    index = [place.index(key) for key in at]
-    moves = (later[o.row])[:, None, None]
-    ends = o.ends + np.where(moves, (after.ends - before.ends)[index], 0.0)
-    h = o.h + np.where(moves[..., 0], (after.h - before.h)[index], 0.0)
-    h /= np.linalg.norm(h, axis=1, keepdims=True)
+    moved, m = replace(scene, A=A, B=B), dataset.measurements
+    h, ends = o.h.copy(), o.ends.copy()
+    for i in np.flatnonzero(later[o.row]).tolist():
+        row, leg, side = int(o.row[i]), int(o.leg[i]), int(o.edge[i]) - 1
+        camera = m.views[m.view[row]].camera
+        radius = dataset.machine.legs[leg].radius_of_part[o.part[i]]
+        xy = camera.undistort(ends[i])
+        lines = (outlines_of_axis(*s.leg_in_camera(row, leg), radius) for s in (scene, moved))
+        was, now = (camera.line_offset(line[side][None], xy) for line in lines)
+        h[[i]], ends[[i]] = shifted_outlines(camera, h[[i]], ends[[i]], (was - now)[None])
     return replace(dataset, observations=replace(o, h=h, ends=ends))
