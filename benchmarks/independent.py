@@ -4,8 +4,9 @@
         [--worst 12] [--overlays FOLDER] [--lines FILE]
 
 Datasets in the formats of the documentation; beside each FOLDER stands FOLDER-truth with
-``models/`` and ``truth.json``: of every image the legs' true contours in the camera frame. Each is
-calibrated as it lies there or otherwise:
+``models/`` and ``truth.json``: of every image the legs' true contours in the camera frame. Where
+readings are angles, the first rod is measured as well (true length, 0.05 mm). Each is calibrated as
+it lies there or otherwise:
 
     none       without the rough poses and the lists of legs of its views
     rough      with them
@@ -53,6 +54,7 @@ from legcal.machine.parameters import geometries, vector_of
 
 VARIANTS = "none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii", "clicks"
 CLICK_PX = 3.0  # noise of clicks
+OF_RADIUS = 0.3  # part of a radius within which a part is the rod whose contours are known
 VISIBLE = 0.5  # share of a leg above which it ought to be used
 HEADER = (
     f"{'set':18}{'as':8}{'views':>6}{'legs':>6}{'used':>10}{'median':>8}{'90 %':>7}{'>1 px':>7}"
@@ -167,9 +169,12 @@ def outcome(folder: Path, variant: str, overlays: Path | None, worst: int) -> Ou
         varied(folder, variant, copy)
         into = None if overlays is None else overlays / f"{folder.name}-{variant}"
         begin = time.perf_counter()
+        lengths = json.loads((truth / "truth.json").read_text()).get("rod_lengths")
+        needed = not load_dataset(copy, check_images=False).machine.readings_carry_length
         try:
             calibration = calibrate(
                 copy,
+                priors=[f"leg1.base:leg1.platform={lengths[0]:.3f}+-0.05mm"] if needed else (),
                 output=into,
                 overlays=overlays is not None,
                 use_cache=False,
@@ -205,8 +210,9 @@ def judged(
     errors, described, used = [], [], set[tuple[int, int]]()
     for i in np.flatnonzero(o.used).tolist():
         row, leg = int(o.row[i]), int(o.leg[i])
-        if leg >= len(machine.leg_names):
-            continue
+        radius = machine.legs[leg].radius_of_part.get(o.part[i]) if leg < machine.n_legs else None
+        if radius is None or abs(radius - 1e-3 * file["leg_radius"]) > OF_RADIUS * radius:
+            continue  # an arm, or a body that is thicker than the rod
         camera = m.views[m.view[row]].camera
         true = of_image[Path(m.image[row]).stem]["legs"][leg]
         h = np.array(true[f"h{o.edge[i]}"])

@@ -6,15 +6,17 @@ thread; if a library swallows it, nothing is recorded any more (:func:`raise_if_
 second signal ends the process unconditionally.
 """
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import current_thread, main_thread
+from threading import Timer, current_thread, main_thread
 from types import FrameType
 
 INTERRUPTED = 130  # exit code of a command stopped by a signal
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # SIGHUP does not exist on every system
 _NUMBERS = [signal.Signals[name] for name in _NAMES if hasattr(signal, name)]
+_AGAIN = 0.01  # [s]
 _heard: list[int] = []  # signals that stopped the command
 _waiting: list[list[int]] = []  # signals that wait for the end of each block
 
@@ -29,7 +31,12 @@ def stopped_by_signals() -> Iterator[None]:
     before = {n: signal.getsignal(n) for n in _NUMBERS}
     heard = [n for n in _NUMBERS if before[n] is not signal.SIG_IGN]
 
-    def stop(number: int, _frame: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
+        code = None if frame is None else frame.f_code
+        if code and (code.co_filename, code.co_name) == ("<frozen importlib._bootstrap>", "cb"):
+            # Python drops what this callback of an import raises: the signal comes again.
+            Timer(_AGAIN, os.kill, (os.getpid(), number)).start()
+            return
         for heard_number in heard:  # by the system, as Python may be kept from answering
             signal.signal(heard_number, signal.SIG_DFL)
         _heard.append(number)

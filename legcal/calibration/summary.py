@@ -6,21 +6,10 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from legcal.calibration.documents import (
-    BoardBlock,
-    FrameMark,
-    Holdout,
-    NoSteps,
-    Observations,
-    PlatformBlock,
-    ReadingResiduals,
-    Result,
-    WorkspaceAccuracy,
-)
 from legcal.data.reasons import reason_in_words
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.leg import ParameterId
@@ -28,7 +17,20 @@ from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import AT_ZERO
 from legcal.pages.document import Number, Table
 from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
-from legcal.vision.board import Link
+
+if TYPE_CHECKING:
+    from legcal.calibration.documents import (
+        BoardBlock,
+        FrameMark,
+        Holdout,
+        NoSteps,
+        Observations,
+        PlatformBlock,
+        ReadingResiduals,
+        Result,
+        WorkspaceAccuracy,
+    )
+    from legcal.vision.board import Link
 
 FRAMES: dict[str, str] = {"base": "R_b", "platform": "R_e"}
 DIGITS = {"mm": 4, "deg": 4, "px": 3, "": 6}  # decimals by unit

@@ -34,6 +34,7 @@ _FIRST_DAMPING = 1e-6
 _MIN_DAMPING = 1e-10
 _MAX_DAMPING = 1e8
 COST_TOLERANCE = 1e-12  # predicted decrease of the cost at convergence, in squared sigmas
+_LAST_TOLERANCE = 1e-6  # the same after the last step: steps of a thousandth of a sigma
 _ROUNDING = 1e-13  # relative rounding error of the cost
 _WIDTH_IN_MEDIANS = 5.0  # width of the loss in median residuals, while these exceed the final width
 _SLOW_FALL = 0.5  # relative decrease of the cost, below which the loss follows the median
@@ -106,7 +107,8 @@ def minimise(
     Raises
     ------
     DidNotConverge
-        If no step decreases the cost before convergence, or after *max_iterations* steps.
+        If no step decreases the cost before convergence, or if the cost still falls by more than
+        1e-6 a step after *max_iterations* steps.
     """
     start, state = state, problem.projected(state)
     linear = linearize(problem, state, computed_rows if state is start else None)
@@ -150,7 +152,7 @@ def minimise(
         if converged or expected < max(smallest, tolerance):
             return Minimum(state, linear, cost, iteration, rate)
         fall_before = predicted
-    if not must_converge:
+    if not must_converge or (iteration == max_iterations and predicted < _LAST_TOLERANCE):
         return Minimum(state, linear, cost, iteration)
     raise DidNotConverge(
         f"The {problem.name} did not converge: after {iteration} steps, the cost still falls by "
