@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         BoardBlock,
         FrameMark,
         Holdout,
-        NoSteps,
         Observations,
         PlatformBlock,
         ReadingResiduals,
@@ -434,6 +433,8 @@ def _of_board(link: Link, board: BoardBlock | None) -> list[str]:
 
 def _steps_lines(result: Result) -> list[str]:
     steps = result.stages.staged
+    from legcal.calibration.documents import NoSteps  # it loads OpenCV, which exports do without
+
     if isinstance(steps, NoSteps):
         if result.observations.total == 0:
             return ["The four steps need legs in sight: there is no staged.yaml."]
