@@ -71,7 +71,7 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
     ]  # fmt: skip
     kinematic = Kinematic(names=list(found.names), covariance=covariance.tolist(), held=[])
     axes = nominal_axes(machine.leg_names, legs)
-    blocks = joints_in_links(machine, rows, kinematic, axes)
+    blocks = joints_in_links(machine, rows, kinematic)
 
     def joints_with(step: Array) -> Array:
         """Return all base joints and all platform joints in their links (2, n_legs, 3)."""
