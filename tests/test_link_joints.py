@@ -12,6 +12,7 @@ from legcal.calibration.documents import Kinematic, ParameterRow
 from legcal.calibration.result import joints_in_links
 from legcal.calibration.verification import possible_changes
 from legcal.geometry.types import Array
+from legcal.machine.leg import LINKS
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
@@ -22,7 +23,6 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.vision.board import LINKS
 
 OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg
 

@@ -7,7 +7,7 @@ an earlier result is read (docs/formats.md).
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +20,6 @@ from pydantic import (
     model_serializer,
 )
 
-from legcal.data.measurements import Measurements, row_names
 from legcal.data.reasons import Rejection
 from legcal.errors import DatasetError
 from legcal.files.motions import Pose
@@ -36,8 +35,7 @@ from legcal.files.schema import (
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.inspection import ActuatorBlock
-from legcal.machine.leg import ParameterId
-from legcal.vision.board import Link
+from legcal.machine.leg import Link, ParameterId
 
 AxesByLeg = dict[str, Triple]  # unit vectors
 Matrix = list[list[Number]]
@@ -253,14 +251,18 @@ class LeftOut(Document):
     images: list[NamedImage]
 
 
-def left_out_blocks(measurements: Measurements, why: Mapping[int, Rejection]) -> list[LeftOut]:
-    """Return images that were left out, by row, a block a reason with its detail."""
-    names = row_names(measurements)
+def left_out_blocks(
+    places: Sequence[tuple[str, str]], why: Mapping[int, Rejection]
+) -> list[LeftOut]:
+    """Return images that were left out, a block a reason with its detail.
+
+    *places* are the view and the image of each row.
+    """
     images: dict[tuple[str, str], list[NamedImage]] = {}
     for row, rejection in sorted(why.items()):
-        view = measurements.views[int(measurements.view[row])].name
+        view, image = places[row]
         alike = images.setdefault((str(rejection.reason), str(rejection)), [])
-        alike.append(NamedImage(view=view, image=names[row]))
+        alike.append(NamedImage(view=view, image=image))
     return [LeftOut(reason=code, why=text, images=named) for (code, text), named in images.items()]
 
 
@@ -401,6 +403,13 @@ class Overlay(Document):
     view: str
     image: str
     file: str
+
+
+def overlay_blocks(places: Sequence[tuple[str, str]], files: Mapping[int, str]) -> list[Overlay]:
+    """Return the overlays of rows; *places* are the view and the image of each row."""
+    return [
+        Overlay(view=places[row][0], image=places[row][1], file=file) for row, file in files.items()
+    ]
 
 
 class MotorZero(Document):

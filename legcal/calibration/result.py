@@ -27,7 +27,6 @@ from legcal.calibration.documents import (
     LinkBlock,
     NoSteps,
     Observations,
-    Overlay,
     ParameterRow,
     PlatformBlock,
     PlatformBoardPose,
@@ -42,6 +41,7 @@ from legcal.calibration.documents import (
     WeakInLinks,
     WorkspaceAccuracy,
     left_out_blocks,
+    overlay_blocks,
 )
 from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
@@ -55,14 +55,14 @@ from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import canonical_order
-from legcal.data.measurements import row_names
+from legcal.data.measurements import places
 from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
 from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences
-from legcal.machine.leg import Leg, LegColumns, LegKind
+from legcal.machine.leg import LINKS, Leg, LegColumns, LegKind, Link
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     SHOWN,
@@ -74,7 +74,6 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
-from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import camera_numbers, shared_cameras
 
 REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
@@ -260,7 +259,7 @@ def _result_of(calibration: Calibration) -> Result:
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
         only=None if calibration.group is None else calibration.group.group,
         zeros=None if calibration.group is None else calibration.group.zeros,
-        overlays=_overlays(calibration),
+        overlays=overlay_blocks(places(measurements), calibration.overlays) or None,
     )
 
 
@@ -333,7 +332,7 @@ def _staged(calibration: Calibration) -> Staged | NoSteps:
 
 def _observations(calibration: Calibration) -> Observations:
     """Return what the fit was made from."""
-    outlines = calibration.solution.outlines
+    outlines, measurements = calibration.solution.outlines, calibration.dataset.measurements
     reasons = Counter(
         str(why.reason)
         for why, used in zip(outlines.reason, outlines.used, strict=True)
@@ -342,20 +341,10 @@ def _observations(calibration: Calibration) -> Observations:
     return Observations(
         used=int(outlines.used.sum()),
         total=len(outlines),
-        images=calibration.dataset.measurements.n_rows,
+        images=measurements.n_rows,
         rejected=dict(reasons.most_common()),
-        left_out=left_out_blocks(calibration.dataset.measurements, images_left_out(outlines)),
+        left_out=left_out_blocks(places(measurements), images_left_out(outlines)),
     )
-
-
-def _overlays(calibration: Calibration) -> list[Overlay] | None:
-    """Return where each image is drawn with its outlines; None without overlays."""
-    measurements = calibration.dataset.measurements
-    views, names = [view.name for view in measurements.views], row_names(measurements)
-    return [
-        Overlay(view=views[measurements.view[row]], image=names[row], file=file)
-        for row, file in calibration.overlays.items()
-    ] or None
 
 
 def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:

@@ -51,7 +51,7 @@ from legcal.geometry.types import Array
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.files import DATASET_YAML
 from legcal.machine.inspection import singularity_note
-from legcal.machine.leg import ARMS, JointType, LegColumns, ParameterId
+from legcal.machine.leg import ARMS, JointType, LegColumns, Link, ParameterId
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
@@ -73,7 +73,6 @@ from legcal.paper.conditions import (
     two_directions,
 )
 from legcal.perception.body_edges import bodies_of
-from legcal.vision.board import Link
 
 _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction

@@ -40,7 +40,7 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, radius_name
+from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, Link, radius_name
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -59,7 +59,7 @@ from legcal.machine.rods import (
 from legcal.machine.shapes import Occluder
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
 from legcal.perception.body_edges import bodies_of, predicted_edges
-from legcal.vision.board import Board, FixedBoard, Link, facing_board
+from legcal.vision.board import Board, FixedBoard, facing_board
 from legcal.vision.camera import sample_camera
 from legcal.vision.visibility import Bodies, visible_parts
 

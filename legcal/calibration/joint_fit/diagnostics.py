@@ -29,10 +29,9 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Leg, ParameterId, radius_name
+from legcal.machine.leg import LINKS, Leg, ParameterId, radius_name
 from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import actuators_of
-from legcal.vision.board import LINKS
 from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements

@@ -29,9 +29,9 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
-from legcal.machine.leg import LegColumns, LegKind
+from legcal.machine.leg import LINKS, LegColumns, LegKind, Link
 from legcal.machine.rods import actuator_index, first_rods
-from legcal.vision.board import LINKS, FixedBoard, Link
+from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
 from legcal.vision.cylinder import EPSILON
 

@@ -69,11 +69,10 @@ from legcal.estimation.problem import (
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms
-from legcal.machine.leg import Leg, ParameterId, radius_name
+from legcal.machine.leg import LINKS, Leg, ParameterId, radius_name
 from legcal.machine.parameters import Parametrization, is_held_by_default
 from legcal.machine.rods import reading_legs, readings_of_rods
 from legcal.machine.ties import wholly_tied
-from legcal.vision.board import LINKS
 from legcal.vision.camera import (
     Camera,
     intrinsic_names,

@@ -52,12 +52,12 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import (
     KinematicParameters,
     Leg,
+    Link,
     parameters_of_legs,
     radius_name,
     with_platform_points,
 )
 from legcal.machine.parameters import Parametrization, geometries, parametrize, vector_of
-from legcal.vision.board import Link
 from legcal.vision.camera import Camera
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
