@@ -227,11 +227,11 @@ class PoseNoise:
     # whether each was stated; otherwise it is estimated
     stated: tuple[bool, bool]
 
-    def whitening(self, oriented: BoolArray) -> Array:
-        """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero if not measured."""
-        W = np.tile(np.diag(np.repeat(1.0 / self.sigma, 3)), (len(oriented), 1, 1))
-        W[~oriented, 3:] = 0.0
-        return W
+    def weights(self, oriented: BoolArray) -> Array:
+        """Return the inverse standard deviations (n, 6); zero for what was not measured."""
+        weights = np.tile(np.repeat(1.0 / self.sigma, 3), (len(oriented), 1))
+        weights[~oriented, 3:] = 0.0
+        return weights
 
 
 @dataclass(frozen=True, eq=False)
