@@ -30,7 +30,8 @@ from legcal import (
     simulate,
 )
 from legcal.calibration import doubts, verdict
-from legcal.calibration.doubts import Doubt, model_error
+from legcal.calibration.documents import Doubt
+from legcal.calibration.doubts import model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
 from legcal.calibration.result import Calibration

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,7 @@ from pydantic import (
     StrictStr,
     model_serializer,
 )
+from pydantic.json_schema import SkipJsonSchema
 
 from legcal.data.reasons import Rejection
 from legcal.errors import DatasetError
@@ -376,14 +378,35 @@ class DiagnosisBlock(Document):
     remedy: str
 
 
-class DoubtBlock(Document):
-    """What speaks against a result; effects are null where they cannot be computed."""
+@dataclass(frozen=True)
+class Doubt:
+    """Something that speaks against a result; effects are null where they cannot be computed.
+
+    Attributes
+    ----------
+    code : str
+        What was tested; codes do not change.
+    what : str
+        What was found, as a clause.
+    remedy : str
+        What to do, as a clause.
+    sigma_dX_m, sigma_dE_rad : float or None
+        How far the platform would be displaced and turned if it were true [m, rad].
+    is_grave : bool
+        The result is not to be loaded; no part of the document.
+    """
 
     code: str
     what: str
-    sigma_dX_m: float | None
-    sigma_dE_rad: float | None
     remedy: str
+    sigma_dX_m: float | None = None
+    sigma_dE_rad: float | None = None
+    is_grave: Annotated[bool, Field(exclude=True), SkipJsonSchema()] = False
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do."""
+        return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
 
 
 class Heading(Document):
@@ -393,7 +416,7 @@ class Heading(Document):
     status: Literal["converged"]
     verdict: str
     trustworthy: bool
-    doubts: list[DoubtBlock]
+    doubts: list[Doubt]
     legs: list[str]  # the order of what follows
 
 

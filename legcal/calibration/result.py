@@ -18,7 +18,7 @@ from legcal.calibration.documents import (
     BoardPose,
     CoordinateStatus,
     Distance,
-    DoubtBlock,
+    Doubt,
     FrameMark,
     Gamma,
     Holdout,
@@ -43,7 +43,6 @@ from legcal.calibration.documents import (
     left_out_blocks,
     overlay_blocks,
 )
-from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
@@ -218,7 +217,7 @@ def _result_of(calibration: Calibration) -> Result:
         status="converged",
         verdict=calibration.verdict.sentence,
         trustworthy=calibration.verdict.trustworthy,
-        doubts=[DoubtBlock.model_validate(doubt) for doubt in calibration.doubts],
+        doubts=list(calibration.doubts),
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=turned_from,
