@@ -39,7 +39,7 @@ from legcal.calibration.joint_fit.free_poses import (
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, robust_noise
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
@@ -54,7 +54,7 @@ from legcal.data.outlines import Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Residuals, linearize
-from legcal.estimation.solver import Minimum, information, minimise
+from legcal.estimation.solver import Minimum, NormalEquations, information, minimise
 from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
@@ -356,36 +356,44 @@ def _refine_minimum(
     normal = information(problem, first.state, first.linear, problem.loss)
     held = undetermined_directions(problem, first.state, normal)
     refuse_contradicted_board(problem, first.state, normal)
-    without_held, state = problem, first.state
     while True:
+        within, at = problem, first.state
+        if len(held.basis):
+            within, at = held_at_nominal(problem, at, held)
         try:
-            if len(held.basis):
-                problem, state = held_at_nominal(without_held, state, held)
-                continued = first_minimum(problem, state)
-                state = continued.state
-                first = dataclasses.replace(
-                    continued, iterations=first.iterations + continued.iterations
-                )
-            fit = fit_in_rounds(problem, first)
-            normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-            refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
-            _refuse_other_radii(problem, fit.state)
+            fit, normal = _fit_holding(held, within, at, first)
             break
         except (DidNotConverge, NotIdentifiable) as failure:
-            more = _open_farther_on(without_held, problem, state, len(held.basis))
-            if more is not None:
-                held = more
-                continue
-            refuse_contradicted_values(without_held, start, state, with_priors=True)
-            _refuse_contradicted(without_held, state)
-            _refuse_undetermined(without_held, state)
-            if isinstance(failure, DidNotConverge):
-                raise blaming_stated_values(without_held, failure) from None
-            raise
+            more = _open_farther_on(problem, within, at, len(held.basis))
+            if more is None:
+                refuse_contradicted_values(problem, start, at, with_priors=True)
+                _refuse_contradicted(problem, at)
+                _refuse_undetermined(problem, at)
+                if isinstance(failure, DidNotConverge):
+                    raise blaming_stated_values(problem, failure) from None
+                raise
+            held = more
     if rejected_notes(fit.problem, fit.accepted):
-        refuse_contradicted_values(without_held, start, state, with_priors=True)
+        refuse_contradicted_values(problem, start, at, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
+
+
+def _fit_holding(
+    held: HeldDirections, problem: FitProblem, begin: State, first: Minimum[State]
+) -> tuple[Fit, NormalEquations]:
+    """Fit in rounds, with directions held in the problem; return the information at the minimum.
+
+    *first* is the first minimum without held directions; with them, another begins at *begin*.
+    """
+    if len(held.basis):
+        continued = first_minimum(problem, begin)
+        first = dataclasses.replace(continued, iterations=first.iterations + continued.iterations)
+    fit = fit_in_rounds(problem, first)
+    normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
+    refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
+    _refuse_other_radii(problem, fit.state)
+    return fit, normal
 
 
 def _open_farther_on(
