@@ -10,7 +10,6 @@ too small on average.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -48,7 +47,7 @@ from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
 from legcal.data.measurements import few
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
-from legcal.estimation.problem import GaussianPrior, Residuals, linearize
+from legcal.estimation.problem import GaussianPrior, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
 from legcal.estimation.uncertainty import leverage, response, score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -118,19 +117,14 @@ class Fit:
 
 
 def first_minimum(
-    problem: FitProblem,
-    begin: State,
-    computed_rows: Mapping[str, Residuals] | None = None,
-    *,
-    must_converge: bool = True,
+    problem: FitProblem, begin: State, *, must_converge: bool = True
 ) -> Minimum[State]:
     """Solve with all observations and claimed covariances, regularised towards the nominal model.
 
     Steps along open directions are free and would not stop: axes of a translational 3-UPU end half
     a radian off, where other directions look determined. Nominal models are not wrong by a large
-    part of a leg. The returned cost and derivatives are without this prior. *computed_rows* are
-    rows of factors at *begin*, with claimed covariances. Without *must_converge*, the best state
-    is returned if the steps do not converge.
+    part of a leg. The returned cost and derivatives are without this prior. Without
+    *must_converge*, the best state is returned if the steps do not converge.
     """
     original, all_outlines = problem, np.ones(len(problem.outlines), dtype=np.bool_)
     is_rough = problem.legs.is_redundant
@@ -153,13 +147,11 @@ def first_minimum(
         max_iterations=problem.settings.max_iterations,
         tolerance=_INTERMEDIATE_TOLERANCE,
         relative_tolerance=_REJECTION_TOLERANCE,
-        computed_rows=computed_rows if chosen.all() and not is_rough else None,
         must_converge=must_converge,
     )
     determined = of_determined_poses(claimed, minimum.state, all_outlines)
     problem = original.weighted(NoiseModel(), determined)
-    same = bool(np.array_equal(determined, chosen)) and not is_rough
-    linear = linearize(problem, minimum.state, minimum.linear.rows if same else None)
+    linear = linearize(problem, minimum.state)
     cost = robust_cost(problem, linear, loss)
     if is_rough:  # one wrong reading would outweigh all else
         rough = with_inflated_reading_noise(problem)
@@ -197,14 +189,10 @@ def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     all_weights = np.ones(len(problem.outlines))
     begin = Fit(problem, first, NoiseModel(), none, all_weights).with_edge_biases(none)
     fit, changes = _with_estimated_errors(_without_outliers(begin), possible, least)
-    computed_rows: Mapping[str, Residuals] | None = fit.minimum.linear.rows
     if fit.edge_biases.are_shown:
         scores = _scores_of_biases(fit, possible)
         fit = fit.with_edge_biases(expected_biases(possible, *scores, fit.edge_biases, least))
-        computed_rows = None
-    fit = replace(
-        fit, minimum=_minimise_near(fit.problem, fit.minimum, computed_rows=computed_rows)
-    )
+    fit = replace(fit, minimum=_minimise_near(fit.problem, fit.minimum))
     _refuse_disagreement(fit)
     return replace(
         fit,
