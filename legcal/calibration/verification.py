@@ -32,6 +32,7 @@ from legcal.calibration.evaluation import machine_difference
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.part_errors import with_zeros
+from legcal.calibration.joint_fit.platform import expected_error, moved_by
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import State
@@ -619,14 +620,9 @@ def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> MovedPlatf
     # Priors shrink the estimate towards the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.sigma**2
     spread = G @ covariance + G @ prior.covariance @ G.T
-    shift = J @ (values - prior.old)
-    variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
-    return MovedPlatform(
-        dX_m=_rms(shift[:, 3:] ** 2),
-        dE_rad=_rms(shift[:, :3] ** 2),
-        sigma_dX_m=_rms(variance[:, 3:]),
-        sigma_dE_rad=_rms(variance[:, :3]),
-    )
+    dX_m, dE_rad = moved_by(J, (values - prior.old)[:, None]).rms
+    sigma_dX_m, sigma_dE_rad = expected_error(J, spread).rms
+    return MovedPlatform(dX_m=dX_m, dE_rad=dE_rad, sigma_dX_m=sigma_dX_m, sigma_dE_rad=sigma_dE_rad)
 
 
 def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
@@ -651,8 +647,3 @@ def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametri
         tuple(parametrization.units[i] for i in columns),
         place,
     )
-
-
-def _rms(squares: Array) -> float:
-    """Return the root mean square over poses of vectors with squared components (k, 3)."""
-    return float(np.sqrt(np.mean(squares.sum(axis=1))))

@@ -51,6 +51,12 @@ class PlatformError:
         return float(self.rotation.mean())
 
     @property
+    def rms(self) -> tuple[float, float]:
+        """Root mean squares over the poses: displacement [m], rotation [rad]."""
+        displacement, rotation = (x @ x / len(x) for x in (self.displacement, self.rotation))
+        return float(np.sqrt(displacement)), float(np.sqrt(rotation))
+
+    @property
     def max_displacement(self) -> float:
         """Largest of all poses [m]."""
         return float(self.displacement.max())
