@@ -127,7 +127,6 @@ PUBLIC: dict[str, set[str]] = {
         "joint_fit.outline_errors",
         "joint_fit.parameter_choices",
         "joint_fit.part_errors",
-        "workspace_errors",
         "joint_fit.platform",
         "joint_fit.sensitivity",
         "joint_fit.predicted",

@@ -16,8 +16,8 @@ from lxml import html
 from scipy.spatial.transform import RigidTransform
 
 import legcal
+from legcal.calibration.joint_fit.platform import platform_map
 from legcal.calibration.result_folder import with_overlays, write_result
-from legcal.calibration.workspace_errors import platform_map
 from legcal.errors import OutOfResources, UsageError
 from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.pages.document import page_html
@@ -150,7 +150,7 @@ def test_the_worst_outlines_are_shown_and_points_lead_to_them(example_run: Run, 
 
 def test_the_map_of_the_workspace_agrees_with_the_models(example_run: Run) -> None:
     calibration = example_run.calibration
-    found = platform_map(calibration)
+    found = platform_map(calibration.dataset.machine, calibration.solution)
     assert found is not None
     nominal = calibration.dataset.machine
     calibrated = legcal.load_mechanism(example_run.output / "calibrated.yaml")
