@@ -562,11 +562,9 @@ def rejection_reasons(
     # Every rejected outline, assigned to every edge.
     outline, edge = np.repeat(rejected, len(edges)), np.tile(np.arange(len(edges)), len(rejected))
     as_others = o.at(outline)
-    constants = as_others.constants.copy()
-    constants[:, 8] = np.tile(EPSILON, len(o.parts))[edge]
     legs = np.array([leg for leg, _ in o.parts], dtype=np.intp)
-    radius = part[edge]
-    as_others = replace(as_others, leg=legs[radius], radius=radius, constants=constants)
+    radius, epsilon = part[edge], np.tile(EPSILON, len(o.parts))[edge]
+    as_others = replace(as_others, leg=legs[radius], radius=radius, epsilon=epsilon)
     distances_to_edges = np.abs(as_others.offsets(problem.keys, state)).max(axis=1, initial=0.0)
     for i, distances in enumerate(distances_to_edges.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
