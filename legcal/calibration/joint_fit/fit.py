@@ -347,13 +347,11 @@ def _refine_minimum(
     held = undetermined_directions(problem, first.state, normal)
     refuse_contradicted_board(problem, first.state, normal)
     while True:
-        within, at = problem, first.state
-        if len(held.basis):
-            within, at = held_at_nominal(problem, at, held)
         try:
-            fit, normal = _fit_holding(held, within, at, first)
+            fit, normal = _fit_holding(problem, held, first)
             break
         except (DidNotConverge, NotIdentifiable) as failure:
+            within, at = held_at_nominal(problem, first.state, held)
             more = _open_farther_on(problem, within, at, len(held.basis))
             if more is None:
                 refuse_contradicted_values(problem, start, at, with_priors=True)
@@ -364,22 +362,16 @@ def _refine_minimum(
                 raise
             held = more
     if rejected_notes(fit.problem, fit.accepted):
-        refuse_contradicted_values(problem, start, at, with_priors=True)
+        refuse_contradicted_values(problem, start, first.state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
 
 
 def _fit_holding(
-    held: HeldDirections, problem: FitProblem, begin: State, first: Minimum[State]
+    problem: FitProblem, held: HeldDirections, first: Minimum[State]
 ) -> tuple[Fit, NormalEquations]:
-    """Fit in rounds, with directions held in the problem; return the information at the minimum.
-
-    *first* is the first minimum without held directions; with them, another begins at *begin*.
-    """
-    if len(held.basis):
-        continued = first_minimum(problem, begin)
-        first = dataclasses.replace(continued, iterations=first.iterations + continued.iterations)
-    fit = fit_in_rounds(problem, first)
+    """Fit with held directions; also return the information, which must determine all others."""
+    fit = fit_in_rounds(problem, first, held)
     normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
     refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
     _refuse_other_radii(problem, fit.state)

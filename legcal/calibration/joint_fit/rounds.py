@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from legcal.calibration.joint_fit.determinacy import HeldDirections, held_at_nominal
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outlier_readings import (
     reject_outlier_readings,
@@ -159,10 +160,11 @@ def first_minimum(
     return Minimum(minimum.state, linear, cost, minimum.iterations)
 
 
-def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
+def fit_in_rounds(problem: FitProblem, first: Minimum[State], held: HeldDirections) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
-    *first* is the result of :func:`first_minimum`. Readings of redundant motors that contradict
+    *first* is the result of :func:`first_minimum`, where the directions to be held are open: with
+    them at nominal, there is another one. Readings of redundant motors that contradict
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
 
@@ -171,6 +173,10 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     DidNotConverge
         If a minimisation fails, most outlines are outliers, or the rounds do not converge.
     """
+    if len(held.basis):
+        problem, state = held_at_nominal(problem, first.state, held)
+        continued = first_minimum(problem, state)
+        first = replace(continued, iterations=first.iterations + continued.iterations)
     try:
         return _fit_in_rounds(problem, first)
     except DidNotConverge:
@@ -377,10 +383,8 @@ def _with_edge_noise(fit: Fit) -> Fit:
     linear = fit.minimum.linear
     normal = information(fit.problem, fit.state, linear, fit.problem.loss)
     share = leverage(fit.problem, linear, normal, "edges")[:, 0, 0]
-    redundancy = max(1.0 - float(np.mean(share)), _MIN_REDUNDANCY)
     offsets = edges.rows(fit.problem.keys, fit.state).r[:, 0] / edges.sigma
-    variance = float(np.median(offsets**2)) / MEDIAN_OF_1 / redundancy
-    scale = max(float(np.sqrt(variance)), _MIN_SCALE)
+    scale = _scale_by_median(offsets**2, MEDIAN_OF_1, share)
     agrees = np.abs(offsets) <= settings.rejection * scale
     whitening = (agrees / (scale * edges.sigma))[:, None, None]
     factor = replace(fit.problem.factor("edges"), whitening=whitening)
@@ -427,20 +431,15 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
         if not len(board):
             continue
         rows, share = linear[board.name], leverage(problem, linear, normal, board.name)
-        redundancies = 1.0 - 0.5 * np.einsum("nqq->n", share)
         norms = rows.squared_norms
-        redundancy = max(float(np.mean(redundancies)), _MIN_REDUNDANCY)
-        variance = float(np.median(norms)) / MEDIAN_OF_2 / redundancy
-        scale = max(float(np.sqrt(variance)), _MIN_SCALE)
+        scale = _scale_by_median(norms, MEDIAN_OF_2, 0.5 * np.einsum("nqq->n", share))
         agrees = norms <= (scale * settings.rejection) ** 2
         judged = judged.with_corners(board.chosen(agrees, scale), board.keys(~agrees))
         rms = float(np.sqrt(np.mean((rows.r * board.sigma[:, None]) ** 2)))
         is_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
         on_base = board.link == "base"
-        rejected_of_board = [
-            pose for _, pose, _ in judged.rejected_corners if (pose < 0) == on_base
-        ]
-        if len(rejected_of_board) > int(agrees.sum()) or is_far:
+        n_rejected = sum((pose < 0) == on_base for _, pose, _ in judged.rejected_corners)
+        if n_rejected > int(agrees.sum()) or is_far:
             board_name = "" if board.link == "base" else f" on the {board.link}"
             raise DidNotConverge(
                 f"The joint fit ended with an error of {rms:.1f} px (rms) of the corners of the "
@@ -449,6 +448,15 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
                 "its dimensions, and the camera files."
             )
     return judged
+
+
+def _scale_by_median(squares: Array, of_unit: float, explained: Array) -> float:
+    """Return the factor on standard deviations by the median of squares, *of_unit* for right ones.
+
+    *explained* (n,) are the shares of the errors that the fit absorbs.
+    """
+    redundancy = max(1.0 - float(np.mean(explained)), _MIN_REDUNDANCY)
+    return max(float(np.sqrt(np.median(squares) / of_unit / redundancy)), _MIN_SCALE)
 
 
 def corner_notes(problem: FitProblem) -> tuple[str, ...]:
