@@ -378,8 +378,14 @@ def _build_problem(
 def _kinematic(
     legs: FittedLegs, outlines: ObservedOutlines, settings: RefinementSettings, choices: Choices
 ) -> tuple[LegParameters, Variables]:
-    """Estimated kinematic parameters, and their block."""
-    names, arms = legs.parametrization.names, _arm_priors(legs, outlines, choices, settings)
+    """Estimated kinematic parameters, and their block.
+
+    The lines of visible arms have default priors; parameters with a choice have none.
+    """
+    names, chosen = legs.parametrization.names, {*choices.fixed, *choices.free, *choices.priors}
+    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
+    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
+    arms = {name: sigma for name, sigma in sigmas.items() if name not in chosen}
     free = np.array(
         [not choices.holds(n, by_default=is_held_by_default(n) and n not in arms) for n in names],
         dtype=np.bool_,
@@ -408,19 +414,6 @@ def _kinematic(
         prior=prior,
     )
     return parameters, block
-
-
-def _arm_priors(
-    legs: FittedLegs, outlines: ObservedOutlines, choices: Choices, settings: RefinementSettings
-) -> dict[str, float]:
-    """Default priors of the lines of visible arms, by parameter [rad, m].
-
-    Parameters with a choice have no default prior.
-    """
-    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
-    chosen = {*choices.fixed, *choices.free, *choices.priors}
-    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
-    return {name: sigma for name, sigma in sigmas.items() if name not in chosen}
 
 
 def arm_sigmas(
