@@ -335,7 +335,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
-    ({"noise": __file__}, UsageError, "found no JSON document"),
+    ({"noise": __file__}, UsageError, "found no JSON"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"encoder_sigma": "2"}, UsageError, "without a unit"),
     ({"setting": Setting(0.05, 2e-3, draws=0)}, UsageError, "0 draws"),
