@@ -285,9 +285,11 @@ class NormalEquations:
     @cached_property
     def _kept_covariance(self) -> Array:
         if len(self.held_directions) == 0:
-            return inverse_on_range(self._reduced)
-        N = null_space(self.held_directions)
-        return np.asarray(N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T)
+            covariance = inverse_on_range(self._reduced)
+        else:
+            N = null_space(self.held_directions)
+            covariance = N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T
+        return np.asarray(0.5 * (covariance + covariance.T))  # rounding grows with the condition
 
     def moved_by(self, columns: Array) -> Array:
         """Multiply columns (n_kept, c) by the covariance of the kept unknowns."""
