@@ -106,6 +106,13 @@ def _model(folder: Path) -> None:
         shutil.copy(ROOT / name, folder / name)
 
 
+def _delta(folder: Path) -> None:
+    """Copy the files of the shipped Delta beside each other."""
+    model = (ROOT / "models/delta.yaml").read_text()
+    (folder / "delta.yaml").write_text(model.replace("../urdf/", ""))
+    shutil.copy(ROOT / "urdf/delta.urdf", folder)
+
+
 def _tables(folder: Path) -> None:
     """Copy the tables of all shipped models, and write one as CSV."""
     for path in (ROOT / "models/tables").glob("[!.]*"):
@@ -211,6 +218,7 @@ def _written(style: str) -> Callable[[Path], None]:
 MAKERS: dict[str, Callable[[Path], None]] = {
     "plain": _plain,
     "model": _model,
+    "delta": _delta,
     "tables": _tables,
     "tool-poses": _tool_poses,
     "result": _result,

@@ -280,19 +280,6 @@ def test_the_file_is_as_documented(folder: Folder) -> None:
     assert plan_dataset(again, "abcd").notes == ()
 
 
-def test_a_folder_that_cannot_be_written_to_is_a_note(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: Any, **__: Any) -> str:
-        raise PermissionError(13, "Permission denied")
-
-    dataset = load_dataset(folder.path)
-    monkeypatch.setattr("tempfile.mkdtemp", refuse)
-    note = store_outlines(dataset, _hexapod_outlines(), "abc", _mask(()))
-    assert note is not None
-    assert "found 'Permission denied', needed a folder that can be written to" in note
-
-
 def test_a_photograph_that_is_gone_is_noted_where_its_outlines_are_cached(folder: Folder) -> None:
     _store(folder)
     assert note_on_missing_photographs(load_dataset(folder.path)) == []

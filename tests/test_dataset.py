@@ -25,13 +25,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
-from legcal.errors import DatasetError, LegcalError, Place
+from legcal.errors import DatasetError, LegcalError
 from legcal.geometry.types import Image
 from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import (
     BadImage,
-    decode_image,
     image_size,
     inspect_image,
     read_image,
@@ -114,25 +113,6 @@ def test_mechanism_is_a_path_before_it_is_a_shipped_name(
     assert loaded[2] == folder.path / "../elsewhere/model.yaml"
 
 
-def test_problems_of_cameras_and_legs_are_listed_at_once(folder: Folder) -> None:
-    folder.entry["views"]["c1"]["camera"] = "none.yaml"
-    folder.entry["views"]["c2"]["legs"] = ["leg9", "leg8"]
-    folder.write()
-    with pytest.raises(DatasetError) as refusal:
-        load_dataset(folder.path)
-    problems = refusal.value.problems
-    assert all(
-        word in problem
-        for problem, word in zip(problems, ("none.yaml", "leg9", "leg8"), strict=True)
-    )
-
-
-@pytest.mark.parametrize("name", ["none", "images", "images/c1_1.png"])
-def test_what_is_no_dataset_is_refused(folder: Folder, name: str) -> None:
-    with pytest.raises(DatasetError, match="the dataset could not be read: found no"):
-        load_dataset(folder.path / name)
-
-
 # --- measurements.csv
 
 
@@ -201,13 +181,6 @@ def test_links_are_followed_inside_the_folder_and_not_out_of_it(folder: Folder) 
         read(folder)
 
 
-@pytest.mark.parametrize("image", ["../set/images/c1_1.png", "images/a\0b.png"])
-def test_paths_that_leave_the_folder_or_cannot_be_are_refused(folder: Folder, image: str) -> None:
-    folder.rows[2]["image"] = image
-    with pytest.raises(DatasetError, match=r"row 3 .*found (it also in|a path that cannot)"):
-        read(folder)
-
-
 def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folder) -> None:
     path = folder.path / "images/c1_2.png"
     path.write_bytes(path.read_bytes()[:-30])
@@ -217,31 +190,6 @@ def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folde
     for row, words in ((1, r"image .*c1_2\.png could not be read"), (3, "found an empty cell")):
         with pytest.raises(DatasetError, match=f"row {row + 1}: .*{words}"):
             dataset.image_reader([row])(0)
-
-
-def test_an_image_is_decoded_once_until_its_file_changes(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decoded = list[Path]()
-
-    def decode(path: Path, camera: Camera, named: Place) -> object:
-        decoded.append(path)
-        return decode_image(path, camera, named)
-
-    monkeypatch.setattr("legcal.data.dataset.decode_image", decode)
-    read = load_dataset(folder.write()).image_reader([0, 1])
-    first = [read(k) for k in (0, 1)]
-    again = [read(k) for k in (0, 1)]
-    assert len(decoded) == 2
-    assert all(one.dtype == np.float32 for one in again)
-    np.testing.assert_array_equal(again, first)
-    again[0][:] = 0.0
-    np.testing.assert_array_equal(read(0), first[0])
-    decoded[0].write_bytes(decoded[1].read_bytes())
-    np.testing.assert_array_equal(read(0), first[1])
-    decoded[0].unlink()
-    with pytest.raises(DatasetError, match="needed the file there"):
-        read(0)
 
 
 # --- image files
