@@ -11,10 +11,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from command_outcomes import run
+from dataset_folder import small_folder
 from model_formats import write_format
 from scipy.spatial.transform import Rotation
 from simulated import simulated
@@ -23,8 +23,6 @@ from legcal.machine.loader import load_mechanism
 
 ROOT = Path(__file__).resolve().parents[1]
 SIMULATED = ("3-rpr-outlines", "hexapod-outlines")  # by machine and level
-JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
-SIZE = (64, 48)  # of pictures that nobody looks at
 
 
 @cache
@@ -37,22 +35,6 @@ def remove_inputs() -> None:
     shutil.rmtree(_top(), ignore_errors=True)
     for made in (_top, made_input):
         made.cache_clear()
-
-
-def camera_file(path: Path, width: int, height: int) -> Path:
-    """Write the file of a camera that sees 43 degrees."""
-    focal = 0.5 * width / math.tan(math.radians(21.5))
-    K = [focal, 0.0, 0.5 * (width - 1), 0.0, focal, 0.5 * (height - 1), 0.0, 0.0, 1.0]
-    content = {
-        "image_width": width,
-        "image_height": height,
-        "camera_name": "small",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": K},
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
-    }
-    path.write_text(yaml.safe_dump(content))
-    return path
 
 
 @cache
@@ -75,28 +57,9 @@ def copy_of(name: str, folder: Path) -> Path:
 
 def _plain(folder: Path) -> None:
     """Write two views with two small pictures of nothing each, of the shipped hexapod."""
-    (folder / "images").mkdir()
-    lines = [",".join(["view", "image", *JOINTS])]
-    for seed, name in enumerate(["c1_1", "c1_2", "c2_1", "c2_2"]):
-        chance = np.random.default_rng(seed)
-        picture = chance.integers(0, 255, SIZE[::-1], dtype=np.uint8)
-        cv2.imwrite(str(folder / f"images/{name}.png"), picture)
-        readings = [repr(round(float(q), 7)) for q in chance.uniform(0.0, 0.14, 6)]
-        lines.append(",".join([name[:2], f"images/{name}.png", *readings]))
-    (folder / "measurements.csv").write_text("\n".join(lines) + "\n")
-    camera_file(folder / "camera_info.yaml", *SIZE)
-    pose = {"xyz": [0.9, 0.1, 0.2], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
-    entry = {
-        "legcal_dataset": 1,
-        "mechanism": "hexapod",
-        "measurements": "measurements.csv",
-        "encoder_sigma": 2e-6,
-        "views": {
-            "c1": {"camera": "camera_info.yaml", "T_base_camera": pose},
-            "c2": {"camera": "camera_info.yaml", "legs": ["leg1", "leg4"]},
-        },
-    }
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(entry, sort_keys=False))
+    made = small_folder(folder)
+    made.entry["mechanism"] = "hexapod"
+    made.write()
 
 
 def _model(folder: Path) -> None:

@@ -23,9 +23,9 @@ import numpy as np
 import yaml
 from clicked_joints import camera_beside, seen_from, write_clicks
 from command_outcomes import run, words_of
-from dataset_folder import SERVOS, dataset_of_readings
+from dataset_folder import JOINTS, SERVOS, dataset_of_readings
 from machines import TRIPOD
-from made_inputs import JOINTS, ROOT, copy_of
+from made_inputs import ROOT, copy_of
 from outside_machines import OUTSIDE
 
 Edit = Callable[[Path], None]
