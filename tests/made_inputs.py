@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from command_outcomes import run
 from dataset_folder import small_folder
 from model_formats import write_format
@@ -125,50 +123,6 @@ def _result(folder: Path) -> None:
     assert run(words).code == 0
 
 
-def _formats(folder: Path) -> None:
-    """Write machines in the formats of others: a hexapod, and a 3-RPR in MJCF."""
-    entry = yaml.safe_load((ROOT / "models/hexapod.yaml").read_text())
-    urdf = (ROOT / "urdf/hexapod.urdf").read_text()
-    del entry["legcal"]
-    (folder / "gepetto").mkdir()
-    (folder / "gepetto/robot.yaml").write_text(yaml.safe_dump(entry))
-    (folder / "gepetto/robot.urdf").write_text(urdf)
-    (folder / "bare.yaml").write_text(yaml.safe_dump(entry))
-    (folder / "bare.urdf").write_text(urdf)
-    loops = "".join(
-        f'<loop_joint name="loop{k}" type="spherical"><link1 link="{one}"/>'
-        f'<link2 link="{other}"/></loop_joint>'
-        for k, (one, other) in enumerate(entry["closed_loop"])
-    )
-    (folder / "loops.urdf").write_text(urdf.replace("</robot>", f"{loops}</robot>"))
-    (folder / "planar.xml").write_text(_planar_mjcf())
-
-
-def _planar_mjcf() -> str:
-    """Return three legs from a circle of 0.4 m to one of 0.14 m, at readings of zero."""
-    bodies, ties, motors = "", "", ""
-    for j, angle in enumerate((0.3, 2.4, 4.5)):
-        A = 0.4 * np.array([math.cos(angle), math.sin(angle)])
-        B = 0.14 * np.array([math.cos(angle + 0.6), math.sin(angle + 0.6)])
-        length, turn = np.linalg.norm(B - A), math.atan2(*(B - A)[::-1])
-        bodies += (
-            f'<body name="tube{j}" pos="{A[0]:.12f} {A[1]:.12f} 0" euler="0 0 {turn:.12f}">'
-            f'<joint name="a{j}" axis="0 0 1"/>'
-            f'<body name="rod{j}"><joint name="q{j}" type="slide" axis="1 0 0" range="-0.1 0.1"/>'
-            f'<geom type="cylinder" size="0.01" fromto="0.1 0 0 0.2 0 0"/>'
-            f'<body name="end{j}" pos="{length:.12f} 0 0"><joint name="b{j}" axis="0 0 1"/></body>'
-            "</body></body>"
-        )
-        ties += f'<weld body1="end{j}" body2="platform"/>'
-        motors += f'<position joint="q{j}"/>'
-    platform = '<body name="platform"><freejoint name="free"/></body>'
-    return (
-        '<mujoco model="planar"><compiler angle="radian"/>'
-        f"<worldbody>{bodies}{platform}</worldbody><equality>{ties}</equality>"
-        f"<actuator>{motors}</actuator></mujoco>"
-    )
-
-
 def _written(style: str) -> Callable[[Path], None]:
     """Write the shipped hexapod in the format of another program."""
 
@@ -185,6 +139,5 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "tables": _tables,
     "tool-poses": _tool_poses,
     "result": _result,
-    "formats": _formats,
     **{style: _written(style) for style in ("mjcf bodies", "loop_joint", "gepetto")},
 }

@@ -18,7 +18,6 @@ from dataset_folder import (
     Folder,
     dataset_of_readings,
     folder,
-    hexapod,
     readings,
 )
 from scipy.spatial.transform import RigidTransform
@@ -27,7 +26,6 @@ from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError, LegcalError
 from legcal.geometry.types import Image
-from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import (
     BadImage,
@@ -90,27 +88,6 @@ def test_views_keep_their_camera_pose_and_legs(folder: Folder) -> None:
     assert c2.T_base_camera is None
     (note,) = dataset.notes
     assert "view c9 has no row" in note
-
-
-def test_mechanism_is_a_path_before_it_is_a_shipped_name(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loaded: list[Path] = []
-
-    def load(path: Path) -> Machine:
-        loaded.append(path)
-        return hexapod()
-
-    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load)
-    monkeypatch.setattr("legcal.data.dataset.shipped_names", lambda: ["shipped"])
-    (folder.path / "model").touch()
-    for named in ("model", "shipped", "../elsewhere/model.yaml"):
-        folder.entry["mechanism"] = named
-        read(folder)
-    assert loaded[0] == folder.path / "model"
-    assert loaded[1].name == "shipped.yaml"
-    assert folder.path not in loaded[1].parents
-    assert loaded[2] == folder.path / "../elsewhere/model.yaml"
 
 
 # --- measurements.csv

@@ -22,13 +22,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor, load_dataset
 from legcal.calibration.detection import Detection, Examination
-from legcal.data.outlines import QUALITY, Outlines, join_outlines, read_observations, unmeasured
+from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
 from legcal.perception.overlays import (
-    PartMarks,
     marks_of_image,
 )
 from legcal.viewer.click_server import ClickServer
@@ -258,7 +257,6 @@ def test_an_earlier_detection_is_replaced_and_other_files_are_kept(
 # What is drawn over images.
 
 A, B, RADIUS = np.array([-0.30, 0.22, 0.8]), np.array([0.25, 0.21, 0.9]), 0.012
-NAMES = ("leg1",)
 
 
 def camera(model: str) -> Camera:
@@ -296,12 +294,9 @@ def outlines(cam: Camera) -> Outlines:
     )
 
 
-def marked(cam: Camera, found: Outlines) -> PartMarks:
-    (part,) = marks_of_image(cam, found, predicted(cam), NAMES)
-    return part
-
-
-def curves(part: PartMarks) -> dict[str, Array]:
+def curves(cam: Camera, found: Outlines) -> dict[str, Array]:
+    """Return what is drawn over an image, by kind."""
+    (part,) = marks_of_image(cam, found, predicted(cam), ("leg1",))
     return {mark.kind: mark.points for mark in part.marks}
 
 
@@ -309,7 +304,7 @@ def curves(part: PartMarks) -> dict[str, Array]:
 def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model: str) -> None:
     cam = camera(model)
     found = outlines(cam)
-    drawn = curves(marked(cam, found))
+    drawn = curves(cam, found)
     assert list(drawn) == ["edge 1", "edge 2", "axis"]
     u = (B - A) / np.linalg.norm(B - A)
     for i, kind in enumerate(("edge 1", "edge 2")):
@@ -320,7 +315,7 @@ def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model:
     apart = np.linalg.norm(drawn["axis"][:, None] - on_axis, axis=2).min(axis=1)
     assert apart.max() < 0.2  # of points a third of a pixel apart
     moved = replace(found, ends=found.ends + np.array([0.0, 3.0]))  # beside their lines
-    beside = curves(marked(cam, moved))["edge 1"]
+    beside = curves(cam, moved)["edge 1"]
     assert np.abs(cam.line_offset(found.h[0], cam.undistort(beside))).max() < 1e-6
     normal = np.cross(u, A)
     assert np.abs(cam.line_offset(normal, cam.undistort(drawn["axis"]))).max() < 1e-6
@@ -328,32 +323,6 @@ def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model:
         drawn["axis"][0] + np.linspace(0.0, 1.0, 40)[:, None] * np.diff(drawn["axis"][[0, -1]].T).T
     )
     assert np.abs(chord - drawn["axis"]).max() > 1.0  # the lens bends it
-
-
-def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_should_be() -> None:
-    cam = camera("plumb_bob")
-    found = outlines(cam)
-    one = replace(
-        found, used=np.array([True, False]), reason=(USED, Rejection(Reason.CONTRAST, "2.1"))
-    )
-    part = marked(cam, one)
-    assert list(curves(part)) == ["edge 1", "rejected"]
-    assert (part.name, part.reason) == ("leg1", "edge 2: low contrast")
-    lost = replace(
-        found,
-        h=np.full((2, 3), np.nan),
-        ends=np.full((2, 2, 2), np.nan),
-        used=np.zeros(2, dtype=np.bool_),
-        reason=(Rejection(Reason.NO_PAIR),) * 2,
-    )
-    part = marked(cam, lost)
-    assert [mark.kind for mark in part.marks] == ["predicted", "predicted"]
-    assert part.reason == "no convincing pair of edges"
-    h = predicted(cam)[0].outlines[0]
-    for mark, line in zip(part.marks, h, strict=True):
-        assert np.abs(cam.line_offset(line, cam.undistort(mark.points))).max() < 1e-6
-    of_body = replace(one, part=("leg1_tube",) * 2, edge=np.array([3, 4]))
-    _, body = marks_of_image(cam, join_outlines([one, of_body]), predicted(cam), NAMES)
-    assert [mark.kind for mark in body.marks] == ["body", "rejected"]
-    gone = replace(lost, reason=(Rejection(Reason.OUTSIDE),) * 2)
-    assert marks_of_image(cam, gone, predicted(cam), NAMES) == []
+    weak = Rejection(Reason.CONTRAST, "2.1")
+    one = replace(found, used=np.array([True, False]), reason=(USED, weak))
+    assert list(curves(cam, one)) == ["edge 1", "rejected"]
