@@ -67,11 +67,12 @@ def _model(folder: Path) -> None:
         shutil.copy(ROOT / name, folder / name)
 
 
-def _delta(folder: Path) -> None:
-    """Copy the files of the shipped Delta beside each other."""
-    model = (ROOT / "models/delta.yaml").read_text()
-    (folder / "delta.yaml").write_text(model.replace("../urdf/", ""))
-    shutil.copy(ROOT / "urdf/delta.urdf", folder)
+def _with_motors(folder: Path) -> None:
+    """Copy the files of shipped machines whose joints at A move."""
+    for name in ("delta", "3-prs"):
+        model = (ROOT / f"models/{name}.yaml").read_text()
+        (folder / f"{name}.yaml").write_text(model.replace("../urdf/", ""))
+        shutil.copy(ROOT / f"urdf/{name}.urdf", folder)
 
 
 def _tables(folder: Path) -> None:
@@ -135,7 +136,7 @@ def _written(style: str) -> Callable[[Path], None]:
 MAKERS: dict[str, Callable[[Path], None]] = {
     "plain": _plain,
     "model": _model,
-    "delta": _delta,
+    "motors": _with_motors,
     "tables": _tables,
     "tool-poses": _tool_poses,
     "result": _result,

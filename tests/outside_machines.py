@@ -99,28 +99,14 @@ def _rod(at: Array, end: Array, tangent: Array) -> list[Joint]:
     return [("revolute", at, tangent), ("revolute", at, inner / np.linalg.norm(inner))]
 
 
-def _delta(*, parallelograms: bool, elbows: int = 1) -> Drawing:
+def _arms() -> Drawing:
     drawing = Drawing()
     for j in range(3):
         (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
         end = _around(j, 0.05, HEIGHT)[0]
-        if not parallelograms:
-            serial: list[Joint] = [("revolute", 0.9 * elbow, axis)] * (elbows - 1)
-            joints = [("revolute", pivot, axis), *serial, *_rod(elbow, end, axis)]
-            drawing.chain(f"arm{j}", "base", np.zeros(3), joints, end=end, kind="3d")
-            drawing.legs[f"arm{j}"] = f"j_arm{j}_0"
-            continue
-        root = "base"
-        for i in range(elbows - 1):
-            drawing.add(f"lower{j}_{i}", "revolute", root, -0.05 * Z, axis)
-            root = f"lower{j}_{i}"
-            drawing.motors.append(f"j_{root}")
-        drawing.add(f"arm{j}", "revolute", root, pivot + 0.05 * (elbows - 1) * Z, axis)
-        drawing.motors.append(f"j_arm{j}")
-        drawing.legs[f"leg{j}"] = f"j_arm{j}"
-        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
-            rod = _rod(elbow + out, end + out, axis)
-            drawing.chain(f"rod{j}{k}", f"arm{j}", pivot, rod, end=end + out, kind="3d")
+        joints = [("revolute", pivot, axis), *_rod(elbow, end, axis)]
+        drawing.chain(f"arm{j}", "base", np.zeros(3), joints, end=end, kind="3d")
+        drawing.legs[f"arm{j}"] = f"j_arm{j}_0"
     return drawing
 
 
@@ -162,16 +148,6 @@ def _bars(joint: str, n_bars: int) -> Drawing:
             at = ("platform", HEIGHT * Z) if on is None else on
             drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
             drawing.legs[name] = f"j_{name}_0"
-    return drawing
-
-
-def _prs() -> Drawing:
-    drawing = Drawing()
-    for j in range(3):
-        (foot, axis), (end, _) = _around(j, 0.3, 0.0), _around(j, 0.2, HEIGHT)
-        joints = [("prismatic", foot, Z), ("revolute", foot, axis)]
-        drawing.chain(f"leg{j}", "base", np.zeros(3), joints, end=end, kind="3d")
-        drawing.legs[f"leg{j}"] = f"j_leg{j}_0"
     return drawing
 
 
@@ -315,39 +291,23 @@ def _on_one_line() -> MachineSpec:
     return replace(machine, legs=(*legs, *machine.legs[3:]))
 
 
-ARMS = ("no slider and 3 joints in different places", "the joint at A moves")
 PLANE = ("a planar machine of arms", "axes are parallel", "cannot be calibrated")
-RODS = ("carries 2 rods on the moving link 'arm0'", "the joints at A move")
 LOOP = ("a loop inside the leg", "'j_arm0'", "as a leg of its own")
 SEVERAL = ("a platform of several bodies", "H4 or I4", "legs end on link 'bar", "joint 'j_bar0'")
 OFF_AXIS = "from perpendicular to the leg"
-H4 = partial(_bars, "revolute", 2)
-RODS_ON_ARMS = partial(_delta, parallelograms=False)
-PARALLELOGRAMS = partial(_delta, parallelograms=True)
 
 OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
-    "undriven-delta-rods": (_drawn(RODS_ON_ARMS, driven=False), ARMS),
-    "undriven-delta": (_drawn(PARALLELOGRAMS, driven=False), RODS),
-    "undriven-prs": (
-        _drawn(_prs, driven=False),
-        ("the slider 'j_leg0_0' on the base itself", "the joint at A moves"),
+    "undriven-arms": (
+        _drawn(_arms, driven=False),
+        ("no slider and 3 joints in different places", "the joint at A moves"),
     ),
-    "undriven-hinges": (_drawn(_hinges, driven=False), ("directly between base and platform",)),
-    "h4": (_drawn(H4), SEVERAL),
+    "hinges": (_drawn(_hinges, driven=False), ("directly between base and platform",)),
     "i4": (_drawn(partial(_bars, "prismatic", 1)), SEVERAL),
     "delta-of-four": (
         _drawn(partial(_bars, "revolute", 0)),
         ("overconstrained machine (1 of the 4", "moving joints at A"),
     ),
     "couplers": (_drawn(_couplers), LOOP),
-    "arm-on-arm": (
-        _drawn(partial(_delta, parallelograms=False, elbows=2)),
-        ("the leg of motor 'j_arm0_0'", "no slider and 3 joints in different places", "a rod of"),
-    ),
-    "parallelograms-on-arms": (
-        _drawn(partial(_delta, parallelograms=True, elbows=2)),
-        ("'j_lower0_0'", "2 rods on link 'arm0'", "'j_arm0'", "arms on arms"),
-    ),
     "3-rrr": (_drawn(_planar_arms), PLANE),
     **{
         f"slider-off-{types}": (

@@ -929,7 +929,10 @@ def _models() -> Iterable[Refusal]:
         yield Refusal(
             f"file-{file}", f"inspect {{in}}/{file}", (named,), "", (text(file, content),)
         )
-    yield from _spoiled("motors", "inspect {in}/delta.yaml", "delta", _motors())
+    yield from _spoiled("motors", "inspect {in}/delta.yaml", "motors", _motors())
+    yield Refusal("motors-of-slider", "inspect {in}/3-prs.yaml",
+                  ("the slider", "on the base itself", "the joint at A moves"), "motors",
+                  (keyed("3-prs.yaml", name_mot=[]),))  # fmt: skip
 
 
 def _motors() -> Rows:
