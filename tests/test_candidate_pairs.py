@@ -1,6 +1,5 @@
 """Straight edges of pictures, and the pairs of them that may be the outlines of a leg."""
 
-import leg_pictures as lp
 import numpy as np
 import pytest
 from rendering import Bar, Light, render
@@ -8,7 +7,6 @@ from rendering import Bar, Light, render
 from legcal.geometry.types import Array
 from legcal.perception.candidate_pairs import (
     EdgeSegments,
-    find_candidate_pairs,
     find_segments,
     segments_of_reduced,
     still_picture,
@@ -107,49 +105,3 @@ def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_
         assert length[1] > 0.9 * length[0]
         assert whole.covered[i] > 0.95
         assert crossed.covered[j] < 0.9
-
-
-def _edges(width: float, length: float, *, turn: float = 0.0, same_way: bool = False) -> Array:
-    """Return two parallel edges about the origin, in pixels."""
-    x, y = 0.5 * length, 0.5 * width
-    lines = np.array([[[x, y], [-x, y]], [[-x, -y], [x, -y]]])
-    if same_way:
-        lines[1] = lines[1, ::-1]
-    c, s = np.cos(turn), np.sin(turn)
-    return np.asarray(lp.PIXEL * lines @ np.array([[c, s], [-s, c]]))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_outlines_of_legs_are_pairs_with_their_axes_and_widths(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    made, T = lp.machine(6, rng), lp.camera(rng)
-    targets = lp.pieces(made.A, made.posed(lp.platform(rng)))
-    for k in range(len(targets)):
-        lines = lp.edges(targets, T)[k]
-        pairs = find_candidate_pairs(lp.segments(lines))
-        assert len(pairs) == 1
-        X = T.inv().apply(targets.ends[k])
-        ends = X[:, :2] / X[:, 2:]
-        aside = (ends - pairs.middle[0]) @ pairs.normal[0]
-        assert np.abs(aside).max() < 0.2 * lp.PIXEL  # the axis is not quite in the middle
-        middle = X.mean(axis=0)
-        normal = np.cross(X[0], X[1])
-        flat = np.linalg.norm(normal[:2]) / np.linalg.norm(normal)
-        width = 2.0 * targets.radius[k] / (middle[2] * flat)
-        assert pairs.width[0].mean() == pytest.approx(width, rel=0.02)
-        assert 2.0 * pairs.half_length[0] == pytest.approx(
-            np.linalg.norm(ends[1] - ends[0]), rel=0.05
-        )
-
-
-def test_a_pair_at_which_light_changes_the_same_way_twice_counts_less() -> None:
-    opposite, same = (
-        find_candidate_pairs(lp.segments(_edges(12.0, 80.0, same_way=way))) for way in (False, True)
-    )
-    assert 0.0 < same.merit[0] < opposite.merit[0]
-    turned = find_candidate_pairs(lp.segments(_edges(12.0, 80.0, turn=1.6)))
-    assert abs(float(turned.along[0] @ [np.cos(1.6), np.sin(1.6)])) == pytest.approx(1.0)
-    np.testing.assert_allclose(turned.merit, opposite.merit)
-    np.testing.assert_allclose(turned.width, opposite.width)
-    nothing = find_segments(np.full((240, 320), 90.0, dtype=np.float32), _camera())
-    assert len(nothing) == len(find_candidate_pairs(nothing)) == 0
