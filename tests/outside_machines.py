@@ -314,7 +314,7 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
             _specified(partial(missing, types, 0.002)),
             ("'leg2_slider'", "by 2 mm", "needed at most 0.01"),
         )
-        for types in ("US", "RS", "UU", "RR")
+        for types in ("RS", "UU", "RR")
     },
     "slider-off-small": (
         _specified(lambda: scaled(missing("RS", 4e-5), 0.1)),

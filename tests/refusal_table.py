@@ -305,7 +305,6 @@ def _options() -> Iterable[Refusal]:
         ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
         ("fraction", "-o {out} --holdout 1.5", ("1.5", "0", "1")),
-        ("no-result", "--check {in}/none", ("none",)),
     ]
     yield from _worded("check", "calibrate {in}/set", checks, "result")
 
@@ -322,7 +321,6 @@ def _options() -> Iterable[Refusal]:
         ("error-none-there", "--error twists=1deg", ("twists",)),
         ("error-radii", "--error radii=9mm", ("radii", "9 mm")),
         ("error-shape", "--error joints=2mm:gauss", ("joints", "'gauss'")),
-        ("camera", "--camera none.yaml", ("none.yaml",)),
         ("camera-kind", "--camera webcm", ("'webcm'", "webcam, phone")),
         ("camera-two", "--camera phone --camera webcam", ("0 files and 2 kinds",)),
         ("camera-level", "--camera phone --level outlines", ("--camera phone", "--level outlines")),
@@ -335,7 +333,6 @@ def _options() -> Iterable[Refusal]:
     locate: Words = [
         ("tool-position", "-o {out} --tool-position 1,2", ("--tool-position",)),
         ("tool-text", "-o {out} --tool-position 1,2,x", ("--tool-position", "'x'")),
-        ("sigma", "-o {out} --position-sigma 0.02", ("--position-sigma", "0.02")),
         ("angle", "-o {out} --angle-sigma 3mm", ("--angle-sigma", "3mm")),
         ("folder", "-o none/a.yaml", ("none",)),
     ]
@@ -344,7 +341,6 @@ def _options() -> Iterable[Refusal]:
     camera: Words = [
         ("kind", "chessbord:9x6", ("chessbord", "chessboard:9x6:25mm")),
         ("few", "chessboard:3x6", ("3 x 6",)),
-        ("unit", "chessboard:9x6:25", ("25",)),
         ("metres", "chessboard:9x6:25m", ("25 m",)),
         ("dictionary", "charuco:7x5:40mm:29mm", ("charuco:7x5:40mm:29mm:DICT_4X4_50",)),
         ("unknown", "charuco:7x5:40mm:29mm:DICT_4X4_51", ("DICT_4X4_51",)),
@@ -388,7 +384,6 @@ def _datasets() -> Iterable[Refusal]:
         ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
         ("no-views", entry(views={}), ("views",)),
         ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
-        ("mechanism", entry(mechanism="models/none.yaml"), ("none.yaml",)),
         ("key", entry(measurement="x"), ("measurement", "'measurements'")),
         ("tolerance", entry(tolerance={"joints": "1 deg"}),
          ("tolerance.joints", "needed a value in m")),
@@ -400,8 +395,6 @@ def _datasets() -> Iterable[Refusal]:
         ("both-kinds", entry(tolerance={"joints": 1e-3}, machine_kind="bought"),
          ("needed one of them",)),
         ("outside", entry(measurements="../m.csv"), ("measurements", "../m.csv")),
-        ("no-table", entry(measurements="none.csv"), ("none.csv",)),
-        ("camera", entry(views__c1__camera="none.yaml"), ("none.yaml",)),
         ("gamma-large", entry(views__c1__gamma=100), ("views.c1.gamma", "100", "5")),
         ("pose-list", entry(views__c1__T_base_camera=[1, 2, 3]), ("views.c1.T_base_camera",)),
         (
@@ -447,7 +440,6 @@ def _datasets() -> Iterable[Refusal]:
         ("kind", {**chess, "kind": "chess"}, ("board.kind", "'chess'")),
         ("half-turn", {**chess, "squares_x": 8}, ("8 x 6",)),
         ("few", {**chess, "squares_x": 3}, ("3 x 6", "4")),
-        ("key", {**chess, "columns": 9}, ("board.columns",)),
         ("marker", {**char, "marker": 0.05}, ("0.05 m", "0.04 m")),
         ("dictionary", {**char, "dictionary": "4X4"}, ("board.dictionary", "'4X4'")),
         ("markers", {**char, "squares_x": 20, "squares_y": 20}, ("200", "50")),
@@ -455,10 +447,8 @@ def _datasets() -> Iterable[Refusal]:
         ("spacing", {**april, "tag_spacing": 0.026}, ("0.026", "0.05")),
         ("tags", {**april, "tags_x": 60, "tags_y": 60}, ("60 x 60", "587")),
     ]
-    for name, board, named in boards:
-        yield from _spoiled(
-            "board", "calibrate {in} -o {out}", "plain", [(name, entry(board=board), named)]
-        )
+    of_boards = [(name, entry(board=board), named) for name, board, named in boards]
+    yield from _spoiled("board", "calibrate {in} -o {out}", "plain", of_boards)
 
 
 def _in_hand() -> Iterable[Refusal]:
@@ -594,10 +584,7 @@ def _cameras() -> Iterable[Refusal]:
         ("variance", block(covariance=[[4.0, 0.0], [0.0, -1.0]]), ("the variance -1 of cx",)),
         ("model", content(distortion_model="fov"), ("distortion_model", "'fov'")),
         ("equidistant", content(distortion_model="equidistant"), ("5", "4", "equidistant")),
-        ("thin-prism", content(distortion_model="thin_prism"), ("5", "12")),
-        ("height", content(image_height=-768), ("image_height", "-768")),
         ("few-numbers", content(camera_matrix__data=K[:6]), ("camera_matrix", "6", "9")),
-        ("nan", content(distortion_coefficients__data__0=float("nan")), ("data.0", "nan")),
         ("last-row", matrix((8, 2.0)), ("[0, 0, 1]",)),
         (
             "all-at-once",
@@ -665,7 +652,6 @@ def _two_cameras(folder: Path) -> None:
 def _tables() -> Iterable[Refusal]:
     o = "observations.csv"
     outlines: Rows = [
-        ("image", cell(o, 1, image="i.png"), ("row 1", "image", "'i.png'")),
         ("part", cell(o, 1, part="leg2_rod"), ("row 1", "part", "'leg2_rod'", "leg1")),
         ("verdict", cell(o, 1, verdict="yes"), ("verdict", "'yes'", "used", "rejected")),
         ("zero", cell(o, 1, a="0", b="0", c="0"), ("norm 0",)),
@@ -680,9 +666,7 @@ def _tables() -> Iterable[Refusal]:
         ("by-gamma", cell(o, 1, by_gamma="nan"), ("column by_gamma", "'nan'")),
         ("rejected", cell(o, 1, verdict="rejected", a="left"), ("column a", "'left'")),
         ("far", cell(o, 1, u0="-400", v0="-300"), ("px", "(a, b, c)")),
-        ("twice", doubled(o), ("row 1",)),
         ("one-gamma", cell(o, 2, gamma="2.2"), ("row 2", "gamma", "by_gamma")),
-        ("header", header(o, "edge", "side"), (o, "edge")),
         ("no-table", text(o, ""), (o,)),
         (
             "all-at-once",
@@ -702,11 +686,6 @@ def _tables() -> Iterable[Refusal]:
     })  # fmt: skip
     corners: Words = [
         ("many", "c1,images/c1_2.png,99,1,2,0.1,used,,detected", ("corner", "99")),
-        ("u", "c1,images/c1_2.png,3,x,2,0.1,used,,detected", ("column u", "'x'")),
-        ("outside", "c1,images/c1_2.png,3,470,2,0.1,used,,detected", ("column u", "470 px")),
-        ("sigma", "c1,images/c1_2.png,3,1,2,0,used,,detected", ("column sigma", "0")),
-        ("verdict", "c1,images/c1_2.png,3,1,2,0.1,good,,detected", ("verdict", "used")),
-        ("twice", good.strip(), ("row 2", "row 1")),
         ("image", "c2,images/c1_2.png,3,1,2,0.1,used,,detected", ("column image", "c1_2.png")),
     ]
     for name, row, said in corners:
@@ -735,11 +714,9 @@ def _landmarks() -> Iterable[Refusal]:
     """Joints clicked in pictures."""
     c = "landmarks.csv"
     rows: Rows = [
-        ("image", cell(c, 2, image="images/c2_1.png"), ("row 2", "column image", "c2_1.png")),
         ("outside", cell(c, 2, u="470"), ("row 2", "column u", "470 px", "63.5 px")),
         ("sigma", cell(c, 2, sigma="0"), ("row 2", "column sigma", "0.01")),
         ("twice", doubled(c), ("row 13", "row 1", "the same image and joint")),
-        ("column", header(c, "joint", "leg"), ("'joint'",)),
         ("few", kept(c, 3), ("view c1", "3 clicks", "4 or more, better 6")),
         ("wrong-joint", (clicks("leg4.platform"), cell(c, 1, joint="leg4.platform")),
          ("the click on leg4.platform in images/c1_1.png", "perhaps it shows leg1.base")),
@@ -760,7 +737,6 @@ def _overrides() -> Iterable[Refusal]:
     priors: Words = [
         ("empty", "leg1.offset=", ("leg1.offset",)),
         ("sigma-0", "leg1.offset=0.35±0", ("sigma 0",)),
-        ("infinite", "leg1.offset=0.35±1e999", ("'1e999'",)),
         ("one-unit", "leg1.offset=350mm±0.1", ("unit",)),
         ("unit", "leg1.offset=350±1furlong", ("'furlong'", "mm")),
         ("pixels", "leg1.offset=350±1px", ("px", "leg1.offset", "m")),
@@ -824,7 +800,6 @@ def _models() -> Iterable[Refusal]:
                          swap(y, "leg5: leg5_prismatic", "leg5: lost")),
          ("'nowhere'", "'bass'", "'lost'")),
         ("list", text(y, "- 1\n"), (y,)),
-        ("broken", text(y, "a: [1\n"), (y,)),
         ("python", swap(y, "type:", "x: !!python/object/apply:os.system [touch trace]\ntype:"),
          ("python/object/apply",)),
         ("turning-motor", swap(y, "- leg2_prismatic\n", "- leg2_b1\n"), ("'leg2_b1'",)),
@@ -843,8 +818,6 @@ def _models() -> Iterable[Refusal]:
          ("'leg1_end'",)),
         ("same-link", swap(u, '<link name="leg1_seat"/>', '<link name="leg1_end"/>'),
          ("leg1_end", "another link")),
-        ("same-joint", swap(u, 'joint name="leg2_b1"', 'joint name="leg1_b1"'),
-         ("leg1_b1", "another joint")),
         ("loose", swap(u, '<link name="base"/>', '<link name="base"/><link name="loose"/>'),
          ("loose",)),
         ("doctype", (swap(u, '<link name="base"/>', '<link name="base">&a;</link>'),
@@ -856,7 +829,6 @@ def _models() -> Iterable[Refusal]:
         ("moved-axis", swap(u, 'xyz="0.0 0.0 0.345"', 'xyz="0.0 0.002 0.345"'), ("leg1", "2 mm")),
         ("version-true", swap(y, "version: 1", "version: true"),
          ("legcal.version", "true", "needed 1")),
-        ("no-version", swap(y, "  version: 1\n", ""), ("legcal.version",)),
         ("no-leg-name", swap(y, "    leg6: leg6_prismatic\n", ""),
          ("no name", "'leg6_prismatic'")),
         ("named-twice", swap(y, "leg2: leg2_prismatic", "leg2: leg1_b1"),
@@ -1005,11 +977,9 @@ def _formats() -> Iterable[Refusal]:
         ("joint", (slide, slide.replace("slide", "screw")), ("'screw'", "needed free")),
         ("joint-twice", (slide, slide.replace("leg1", "leg2")), ("which another joint has",)),
         ("axis", (slide + ' axis="0.0 0.0 1.0"', slide + ' axis="0 0 0"'), ("zero axis",)),
-        ("body-twice", (body_2, body_2.replace("2", "1")), ("which another body has",)),
         ("body-world", added('<body name="world"/>'), ("which <worldbody> has",)),
         ("two-turns", (body_2, body_2 + ' euler="0 0 1"'), ("one orientation",)),
         ("quat", ('quat="1.0 0.0 0.0 0.0"', 'quat="0 0 0 0"'), ("no orientation",)),
-        ("pos", ('pos="0.0 0.0 0.0"', 'pos="1e400 0 0"'), ("pos='1e400 0 0'", "3 finite numbers")),
         ("range", ('range="-0.004 0.144"', 'range="1 -1"'),
          (", line 9: joint 'leg1_prismatic'", "1 to -1")),
         ("grad", (world, f'<compiler angle="grad"/>{world}'), ("angle='grad'", "degree")),
@@ -1040,7 +1010,6 @@ def _formats() -> Iterable[Refusal]:
     link1 = '<link1 link="leg1_tube"'
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
-        ("twice", ('name="loop1"', 'name="loop0"'), ("line", "'loop0', which another")),
         ("link", (link1, link1.replace("tube", "tub")), ("line", "mean 'leg1_tube'")),
         ("base", (link1, link1.replace("leg1_tube", "base")), ("line", "joins the link 'base' to")),
         ("one-link", (link1, link1.replace("link1", "link9")), ("line", "names 1 links")),
@@ -1101,7 +1070,6 @@ def _new() -> Iterable[Refusal]:
 
     rows: Rows = [
         ("no-unit", entry(unit=GONE), ("unit",)),
-        ("key", entry(ofsets=380), ("ofsets", "'offsets'")),
         ("no-type", entry(type=GONE), ("type", "types")),
         ("types", entry(types=["RPS"] * 3), ("type", "types")),
         ("count", entry(type="6-RPS"), ("6-RPS", "3", "6")),
@@ -1187,13 +1155,11 @@ def _described() -> Iterable[Refusal]:
         ("version-key", {"legcal_table": None, "version": 1},
          ("version could not", "unknown key", "add 'legcal_table: 1'")),
         ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),
-        ("types-numbers", {"types": [3, 4, 5], "type": None}, ("types.0",)),
         ("one-leg", {"base_joints": [[1, 2, 3]]}, ("base_joints", "at least 2")),
         ("joints-number", {"base_joints": 7}, ("base_joints", "found 7", "a list")),
         ("frame-twice", {"base_frame": ["leg1", "leg1", "leg2"]},
          ("base_frame", "'leg1' more than once")),
         ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),
-        ("travel-number", {"travel": 150}, ("travel", "found 150")),
         ("no-xyz", {"home": {"rpy_deg": [0, 0, 0]}}, ("home.xyz",)),
         ("fixed-axis", {"type": "UP", "platform_axes": [[1, 0, 0]] * 3}, ("axis", "fixed")),
         ("two-points", pairs, ("'leg1' and 'leg2'", "same two points")),
@@ -1255,20 +1221,13 @@ def _without_none(entry: dict[str, Any]) -> dict[str, Any]:
 
 def _poses() -> Iterable[Refusal]:
     p = "hexapod.csv"
-    joint = "leg1_prismatic"
     rows: Rows = [
-        ("no-qw", header(p, "qw", None), ("'qw'",)),
         ("angle", header(p, "qx", "rx"), ("'rx'",)),
         ("column", swap(p, "leg1_prismatic,", "quality,leg1_prismatic,"), ("'quality'",)),
-        ("nan", cell(p, 2, x="nan"), ("row 2 (line 3)", "x", "'nan'")),
         ("far", cell(p, 2, z="2e9"), ("2e9", "1e+06 m")),
-        ("travel", cell(p, 2, **{joint: "0.4"}), (joint, "0.4")),
-        ("half", cell(p, 2, qx=""), ("row 2", "qx")),
         ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
         ("twice", doubled(p), ("row 25", "row 1")),
-        ("no-rows", kept(p, 0), ("no row",)),
         ("two-poses", kept(p, 2), ("2", "3")),
-        ("gone", remove(p), (p,)),
     ]
     command = "locate {in}/hexapod/models/hexapod.yaml {in}/hexapod.csv -o {out}"
     yield from _spoiled("poses", command, "tool-poses", rows)
@@ -1289,7 +1248,6 @@ def _results() -> Iterable[Refusal]:
         ("asymmetric", document(covariance__0__1=1.0), ("covariance",)),
         ("kinematic", document(kinematic__covariance__0__1=1.0), ("kinematic",)),
         ("names", document(kinematic__names__0="leg9.base.x"), ()),
-        ("sigma", document(parameters__0__sigma=-1e-5), ("sigma",)),
         ("value", _micrometre, ("leg2.base.x", "other values of leg")),
         ("held", document(kinematic__held=[[1.0], [1.0, 2.0]]), ("rows of other lengths",)),
         ("shared", document(residuals__shared_px={"bias of nothing": 0.1}), ("bias of nothing",)),
@@ -1300,18 +1258,8 @@ def _results() -> Iterable[Refusal]:
 
 def _scenes() -> Iterable[Refusal]:
     command = "simulate hexapod -o {out} --level outlines --poses 1"
-    head = ",".join(JOINTS)
-    drawn: dict[str, tuple[str, tuple[str, ...]]] = {
-        "column": ("leg9_prismatic\n0.1\n", ("leg9_prismatic",)),
-        "travel": (f"{head}\n{','.join(['0.5'] * 6)}\n", ("0.5",)),
-        "empty": (f"{head}\n", ()),
-    }
-    for name, (content, named) in drawn.items():
-        yield Refusal(
-            f"readings-{name}",
-            "simulate hexapod -o {out} --level outlines --poses {in}/p.csv", named, "",
-            (text("p.csv", content),),
-        )  # fmt: skip
+    far = text("p.csv", f"{','.join(JOINTS)}\n{','.join(['0.5'] * 6)}\n")
+    yield Refusal("readings-travel", f"{command} --poses {{in}}/p.csv", ("0.5",), "", (far,))
     wide = keyed("camera_info.yaml", image_width=20000, image_height=20000)
     yield Refusal("scene-huge", f"{command} --camera {{in}}/camera_info.yaml",
                   ("20000 x 20000", "100000000"), "plain", (wide,))  # fmt: skip
