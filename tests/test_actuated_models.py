@@ -1,7 +1,6 @@
-"""Machines whose rods hang on carriages and arms: written, loaded, refused, and by closed forms."""
+"""Machines whose rods hang on carriages and arms: written, loaded, and by closed forms."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -198,16 +197,11 @@ def test_rods_of_other_joints_are_loaded_as_they_were_stated(tmp_path: Path) -> 
     np.testing.assert_array_equal(again.A_base, machine.A_base)
 
 
-ARMS: dict[str, Any] = yaml.safe_load((TABLES / "delta.yaml").read_text())
-
-
-# --- machines that are not supported -------------------------------------------------------------
-
-
 def test_of_two_readings_at_home_the_one_that_a_file_draws_is_taken(tmp_path: Path) -> None:
-    motors = ARMS["actuators"]
+    arms = yaml.safe_load((TABLES / "delta.yaml").read_text())
+    motors = arms["actuators"]
     wide = {name: arm | {"travel_deg": [-175, 175]} for name, arm in motors.items()}
-    table = ARMS | {"actuators": wide, "home_readings_deg": dict.fromkeys(motors, 20)}
+    table = arms | {"actuators": wide, "home_readings_deg": dict.fromkeys(motors, 20)}
     machine = create_model(described_machine(table, Path("wide")), tmp_path).machine
     export(Subject(machine, "wide"), "mjcf", tmp_path / "wide.xml")
     back = load_mechanism(tmp_path / "wide.xml")

@@ -123,9 +123,6 @@ def test_targets_of_kalibr_and_basalt_are_boards(tmp_path: Path, target: str, bo
             board_of(path)
 
 
-# What is printed.
-
-
 # Where its corners are in an image.
 
 

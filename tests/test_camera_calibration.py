@@ -33,7 +33,7 @@ from legcal.calibration.camera_calibration.document import CameraCalibration, wr
 from legcal.calibration.camera_calibration.lens import chosen_lens, given_lens
 from legcal.calibration.camera_calibration.projection import compare_cameras, projection_sigma
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.perception.board_adjustment import BoardImages
 from legcal.vision.board import board_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
@@ -253,6 +253,14 @@ def test_cameras_of_one_covariance_differ_as_it_says_of_the_projection() -> None
         compare_cameras(camera, PINHOLE)
 
 
+def shown_in(seen: BoardImages, part: BoolArray) -> BoardImages:
+    """Return the corners in a part of the image, of images that have twelve there."""
+    enough = np.bincount(seen.image[part], minlength=seen.image.max() + 1) >= 12
+    keep = part & enough[seen.image]
+    _, image = np.unique(seen.image[keep], return_inverse=True)
+    return BoardImages(image, seen.points[keep], seen.px[keep], seen.sigma_px[keep])
+
+
 def test_what_images_hardly_determine_is_warned_of_with_figures() -> None:
     flat = " ".join(warnings(fitted(seen_corners(CAMERAS["plumb_bob"], 6, 2, tilt=0.08))))
     for words in (
@@ -263,10 +271,7 @@ def test_what_images_hardly_determine_is_warned_of_with_figures() -> None:
         assert words in flat
     good = seen_corners(CAMERAS["plumb_bob"], 14, 4)
     assert warnings(fitted(good)) == []
-    middle = np.all(np.abs(good.px - [320.0, 240.0]) < [150.0, 110.0], axis=1)
-    keep = middle & (np.bincount(good.image[middle], minlength=14)[good.image] >= 12)
-    _, image = np.unique(good.image[keep], return_inverse=True)
-    part = BoardImages(image, good.points[keep], good.px[keep], good.sigma_px[keep])
+    part = shown_in(good, np.all(np.abs(good.px - [320.0, 240.0]) < [150.0, 110.0], axis=1))
     said = " ".join(warnings(fitted(part)))
     hull = cv2.contourArea(cv2.convexHull(part.px.astype(np.float32))) / (640 * 480)
     assert int(said.split("Corners cover ")[1].split(" %")[0]) == round(100 * hull)
@@ -280,10 +285,7 @@ def test_a_board_that_is_not_as_stated_is_named_and_what_to_add() -> None:
     assert "bent by 9 mm" in " ".join(warnings(bent))
     seen = seen_corners(TRUTH, 12, 4)
     assert "along y" in " ".join(warnings(fitted(stretched(seen))))
-    left = (seen.px[:, 0] < 300.0) & (seen.px[:, 1] < 300.0)
-    keep = left & (np.bincount(seen.image[left], minlength=12)[seen.image] >= 12)
-    _, image = np.unique(seen.image[keep], return_inverse=True)
-    part = BoardImages(image, seen.points[keep], seen.px[keep], seen.sigma_px[keep])
+    part = shown_in(seen, np.all(seen.px < 300.0, axis=1))
     said = " ".join(warnings(fitted(part)))
     missing = said.split("bring the board to ")[1].split(" of the image")[0].split(", ")
     assert {"the right", "the bottom", "the bottom right"} <= set(missing)

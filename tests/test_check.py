@@ -138,7 +138,7 @@ def test_a_significance_that_is_no_small_probability_is_refused(significance: fl
         check("images", "result", significance=significance)
 
 
-# Results that are read back. More refusals are in refusal_table.py.
+# Refusals; more of them are in refusal_table.py.
 
 
 def test_the_result_of_another_machine_is_refused(result: Path, tmp_path: Path) -> None:
