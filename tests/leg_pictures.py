@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -144,14 +143,22 @@ def pictures(
     rng: np.random.Generator,
     *,
     joint_error: float = 0.0,
-    **difficulty: Any,
+    n_clutter: int = 0,
+    **difficulty: float,
 ) -> list[Picture]:
     """Return pictures of a machine that differs from its model by a joint error [m]."""
     A = made.A + rng.uniform(-joint_error, joint_error, made.A.shape)
     off = rng.uniform(-joint_error, joint_error, made.B.shape)
     true = MachineSpec(A, made.B + off)
     return [
-        picture((made.A, made.posed(T)), (true.A, true.posed(T)), T_base_camera, rng, **difficulty)
+        picture(
+            (made.A, made.posed(T)),
+            (true.A, true.posed(T)),
+            T_base_camera,
+            rng,
+            n_clutter=n_clutter,
+            **difficulty,
+        )
         for T in platforms
     ]
 
