@@ -1,26 +1,22 @@
-"""What several cases start from: simulated datasets and small files, each made once a process."""
+"""What refusals and damaged files start from, each made once a process."""
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from command_outcomes import run
 from dataset_folder import small_folder
+from located import located, write_poses
 from model_formats import write_format
-from scipy.spatial.transform import Rotation
 from simulated import simulated
 
 from legcal.machine.loader import load_mechanism
 
 ROOT = Path(__file__).resolve().parents[1]
-SIMULATED = ("3-rpr-outlines", "hexapod-outlines")  # by machine and level
 
 
 @cache
@@ -39,9 +35,8 @@ def remove_inputs() -> None:
 def made_input(name: str) -> Path:
     """Return the folder of an input; nobody may change it: take a copy."""
     folder = _top() / name
-    if name in SIMULATED:
-        machine, _, level = name.rpartition("-")
-        simulated(folder, machine, views=3, level=level, seed=3, poses=8)
+    if name == "3-rpr-outlines":
+        simulated(folder, "3-rpr", views=3, seed=3, poses=8)
     else:
         folder.mkdir()
         MAKERS[name](folder)
@@ -88,33 +83,8 @@ def _tables(folder: Path) -> None:
 
 
 def _tool_poses(folder: Path) -> None:
-    """Measure a tool at the poses of a simulated hexapod, with known noise."""
-    source = made_input("hexapod-outlines")
-    shutil.copytree(source / "truth", folder / "hexapod")
-    truth = json.loads((source / "truth/truth.json").read_text())
-    rows = _measured(list(truth["poses"].values()), np.random.default_rng(1))
-    header = [*rows[0]]
-    text = "".join(",".join(row[name] for name in header) + "\n" for row in rows)
-    (folder / "hexapod.csv").write_text(",".join(header) + "\n" + text)
-
-
-def _measured(poses: list[dict[str, Any]], chance: np.random.Generator) -> list[dict[str, str]]:
-    """Return the rows of a table of tool poses: 0.02 mm and 0.01 deg of noise a component."""
-    base_R = Rotation.from_euler("xyz", [10.0, -20.0, 130.0], degrees=True)
-    base_t = np.array([1.2, -0.4, 0.8])
-    tool_R = Rotation.from_euler("xyz", [5.0, 8.0, -30.0], degrees=True)
-    tool_t = np.array([0.02, -0.03, 0.11])
-    rows = []
-    for pose in poses:
-        R = Rotation.from_quat(pose["T_base_platform"]["quat_xyzw"])
-        t = np.array(pose["T_base_platform"]["xyz"])
-        noise = Rotation.from_rotvec(np.radians(0.01) * chance.normal(size=3))
-        place = base_R.apply(R.apply(tool_t) + t) + base_t + 2e-5 * chance.normal(size=3)
-        quaternion = (noise * base_R * R * tool_R).as_quat()
-        readings = {k: repr(v) for k, v in pose["joints"].items() if k.endswith("_prismatic")}
-        cells = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*place, *quaternion], strict=True)
-        rows.append(readings | {name: repr(float(value)) for name, value in cells})
-    return rows
+    """Write measured poses of a tool on the shipped hexapod."""
+    write_poses(folder / "hexapod.csv", located("hexapod", 24))
 
 
 def _result(folder: Path) -> None:

@@ -638,9 +638,24 @@ def _units() -> Iterable[Refusal]:
         ("sigma-unit", angles, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
         ("sigma-number", angles, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
     ]  # fmt: skip
+    for hidden, named in (
+        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
+        (r"leg\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
+    ):
+        yield Refusal(f"unseen-{hidden}", "calibrate {in} -o {out}", named, "motors",
+                      (partial(_without_rods, hidden=hidden),))  # fmt: skip
     for name, readings, entry, named in rows:
         edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
         yield Refusal(f"units-{name}", "calibrate {in} -o {out}", named, "", edits)
+
+
+def _without_rods(folder: Path, hidden: str) -> None:
+    """Write readings of a Delta some of whose rods are not drawn."""
+    urdf, drawn = folder / "delta.urdf", rf'(<link name="{hidden}\w*">).*?</link>'
+    urdf.write_text(re.sub(drawn, r"\1</link>", urdf.read_text(), flags=re.DOTALL))
+    arms, angles = ("arm1", "arm2", "arm3"), np.array([[0.3, 0.2, 0.1], [0.1, 0.4, 0.3]])
+    entry = {"encoder_sigma": dict.fromkeys(arms, 1e-4)}
+    dataset_of_readings(folder, angles, entry, "delta.yaml", arms)
 
 
 def _two_cameras(folder: Path) -> None:
@@ -1229,8 +1244,7 @@ def _poses() -> Iterable[Refusal]:
         ("twice", doubled(p), ("row 25", "row 1")),
         ("two-poses", kept(p, 2), ("2", "3")),
     ]
-    command = "locate {in}/hexapod/models/hexapod.yaml {in}/hexapod.csv -o {out}"
-    yield from _spoiled("poses", command, "tool-poses", rows)
+    yield from _spoiled("poses", "locate hexapod {in}/hexapod.csv -o {out}", "tool-poses", rows)
 
 
 def _results() -> Iterable[Refusal]:

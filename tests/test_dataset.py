@@ -4,7 +4,6 @@ Refusals of single cells and keys are in tests/refusal_table.py; here are those 
 Python alone shows, and every kind and every fault of an image file.
 """
 
-import re
 import struct
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from dataset_folder import (
     ROOT,
     SIZE,
     Folder,
-    dataset_of_readings,
     folder,
     readings,
 )
@@ -24,7 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
-from legcal.errors import DatasetError, LegcalError
+from legcal.errors import DatasetError
 from legcal.geometry.types import Image
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import (
@@ -248,32 +246,3 @@ def test_orientation_in_the_exif_data_does_not_turn_the_pixels(tmp_path: Path) -
     assert turned is not None
     assert turned.shape == (W, H)
     np.testing.assert_allclose(read_image(path, CAMERA), picture(), atol=4.0)
-
-
-@pytest.mark.parametrize(
-    ("hidden", "named"),
-    [
-        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
-        ("leg\\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
-        ("leg1_", ()),
-    ],
-)
-def test_arms_without_a_visible_rod_are_told_before_images_are_looked_at(
-    hidden: str, named: tuple[str, ...], tmp_path: Path
-) -> None:
-    urdf = (ROOT / "urdf/delta.urdf").read_text()
-    bare = re.sub(rf'(<link name="{hidden}\w*">).*?</link>', r"\1</link>", urdf, flags=re.DOTALL)
-    (tmp_path / "delta.urdf").write_text(bare)
-    model = (ROOT / "models/delta.yaml").read_text().replace("../urdf/", "")
-    (tmp_path / "delta.yaml").write_text(model)
-    arms = ("arm1", "arm2", "arm3")
-    angles = np.array([[0.3, 0.2, 0.1], [0.1, 0.4, 0.3]])
-    entry = {"encoder_sigma": dict.fromkeys(arms, 1e-4)}
-    made = dataset_of_readings(tmp_path, angles, entry, "delta.yaml", arms)
-    if not named:
-        load_dataset(made, check_images=False)
-        return
-    with pytest.raises(LegcalError) as caught:
-        load_dataset(made)
-    (said,) = caught.value.problems
-    assert all(word in said for word in named), said
