@@ -638,11 +638,11 @@ def _units() -> Iterable[Refusal]:
         ("sigma-unit", angles, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
         ("sigma-number", angles, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
     ]  # fmt: skip
-    for hidden, named in (
+    for hidden, said in (
         ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
         (r"leg\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
     ):
-        yield Refusal(f"unseen-{hidden}", "calibrate {in} -o {out}", named, "motors",
+        yield Refusal(f"unseen-{hidden}", "calibrate {in} -o {out}", said, "motors",
                       (partial(_without_rods, hidden=hidden),))  # fmt: skip
     for name, readings, entry, named in rows:
         edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
