@@ -423,6 +423,10 @@ def _datasets() -> Iterable[Refusal]:
         ("yaml", text("dataset.yaml", "legcal_dataset: 1\nviews: {c1: [}\n"), ("line 2",)),
         ("repeated", swap("dataset.yaml", "  c2:", "  c1:"), ("'c1'",)),
         ("gone", remove("dataset.yaml"), ("dataset.yaml",)),
+        ("control", entry(**{"views__\x1b[31m": {"camera": "camera_info.yaml"}}),
+         ("needed printable characters",)),
+        *((f"tag-{k}", text("dataset.yaml", f"a: 1\nb: {value}\n"), ("line 2, column 4",))
+          for k, value in enumerate(("!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"))),
     ]  # fmt: skip
     yield from _spoiled("dataset", "calibrate {in} -o {out}", "plain", rows)
 
@@ -659,6 +663,9 @@ def _units() -> Iterable[Refusal]:
     for name, readings, entry, named in rows:
         edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
         yield Refusal(f"units-{name}", "calibrate {in} -o {out}", named, "", edits)
+    given = cast(Edit, partial(dataset_of_readings, readings=angles, entry=sigma))
+    yield Refusal("units-open", "calibrate {in} -o {out}", ("servo1", "moves joints at the base"),
+                  "", (given, cell("measurements.csv", None, servo1="")))  # fmt: skip
 
 
 def _two_cameras(folder: Path) -> None:
@@ -1179,6 +1186,13 @@ def _new() -> Iterable[Refusal]:
         ("twice", f"{head},type\n{row},RPS\n", "--unit mm", ("'type'",)),
         ("long", f"{head}\n{row},1\n", "--unit mm", ("line 2", "6", "5")),
         ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
+        ("points-column", "point,x,y,zz\nB1,1,2,3\nP1,4,5,6\n", "--unit mm", ("'zz'", "'z'")),
+        (
+            "points",
+            "point,x,y\nB1,1,2\nB2,a,2\nP1,4\nB1,4,5\nQQ,4,5\n",
+            "--unit mm",
+            ("line 3", "'a'", "line 4", "2 cells", "line 5", "'B1' twice", "line 6", "'QQ'"),
+        ),
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("other-unit", f"{head},unit\n{row},mm\n{row},mm\n", "--unit m", ("--unit m", "'mm'")),
         ("no-type", f"{head}\n{row}\n,1,2,3,4\n", "--unit mm", ("types.1",)),

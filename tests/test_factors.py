@@ -16,7 +16,6 @@ from dense_fit import (
     jacobians,
     projected_move,
     residuals,
-    violations,
 )
 from fit_sessions import (
     BOARD,
@@ -42,11 +41,9 @@ from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
 from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.errors import DidNotConverge
-from legcal.estimation import solver
 from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import EstimationProblem, linearize
 from legcal.estimation.solver import normal_equations
-from legcal.geometry.types import Array
 from legcal.perception import board_adjustment, view_fit
 from legcal.perception.board_adjustment import adjust_board
 from legcal.perception.placement import Search, group_views
@@ -137,18 +134,6 @@ def test_offsets_are_those_of_the_camera_s_lines_from_the_cylinder(camera: Camer
     assert np.abs(offsets).max() > 1.0
     linear = linearize(problem, state)
     np.testing.assert_allclose(linear.prior_r, 0.5, rtol=1e-9)  # 1 % off, known to 2 %
-
-
-@pytest.mark.parametrize("name", ["hexapod", "nategh-agheli"])
-def test_readings_are_closures_of_legs(name: str) -> None:
-    problem, state = _problem(name)
-    e, poses = problem.readings, state.platform_pose.motions
-    r = linearize(problem, state)["readings"].r[:, 0]
-    legs = [poses[k].apply(state.B[j]) - state.A[j] for k, j in zip(e.pose, e.leg, strict=True)]
-    closure = np.linalg.norm(legs, axis=1) - e.length - state.lengths[e.leg]
-    np.testing.assert_allclose(r * e.sigma, closure, atol=1e-14)
-    q = _session(name).measurements.q[e.pose, e.leg]
-    np.testing.assert_array_equal(e.length, problem.legs.sign[e.leg] * q)
 
 
 def test_corners_are_where_the_camera_projects_them() -> None:
@@ -309,53 +294,6 @@ def test_a_step_is_that_of_the_whole_system_inside_the_constraints(
     assert predicted == pytest.approx(-0.5 * g @ expected, rel=1e-6)
     wrong = step - expected
     assert wrong @ H @ wrong < 1e-10 * predicted
-
-
-@pytest.mark.parametrize("name", ["3-upu-tilted", "tricept"])
-def test_angles_of_axes_follow_their_turns_as_finite_differences_do(name: str) -> None:
-    session = machine_session(name, n_poses=2)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    state = problem.begin(session.start)
-    step = np.where(np.arange(problem.size) < problem.n_kinematic, 0.1, 0.0)
-    state = problem.moved(state, step)  # far from nominal, where turns do not simply add up
-    J, h = problem.jacobian(state), 1e-6
-    for j in range(problem.n_named):
-        by_h = np.where(np.arange(problem.size) == j, h, 0.0)
-        ahead, behind = (
-            problem.coordinates(problem.moved(state, sign * by_h)) for sign in (1.0, -1.0)
-        )
-        np.testing.assert_allclose(J[:, j], (ahead - behind) / (2.0 * h), rtol=0.0, atol=2e-9)
-
-
-@pytest.mark.parametrize("name", ["tricept", "3-rpr"])
-def test_constraints_hold_at_every_state_that_the_solver_looks_at(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    session = machine_session(name)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    looked_at: list[State] = []
-
-    def watched(problem: FitProblem, state: State, known: object = None) -> object:
-        looked_at.append(state)
-        return linearize(problem, state)
-
-    monkeypatch.setattr(solver, "linearize", watched)
-    begin = problem.begin(session.start)
-    found = solver.minimise(problem, begin, PseudoHuber(3.0))
-    assert len(looked_at) >= 4
-    for state in looked_at:
-        assert np.abs(violations(problem, state) - _heights(problem, begin)).max() < 1e-12
-        turned = state.platform_pose.R @ np.swapaxes(state.platform_pose.R, 1, 2)
-        assert np.abs(turned - np.eye(3)).max() < 1e-14
-    assert found.cost < 1e-12
-
-
-def _heights(problem: FitProblem, begin: State) -> Array:
-    """Return what the violations of a planar machine are where its platform has its height."""
-    heights = np.zeros_like(violations(problem, begin))
-    if not problem.legs.spatial:
-        heights[-3 * problem.n_elements :][2::3] = begin.platform_pose.t[:, 2]
-    return heights
 
 
 def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> None:

@@ -14,9 +14,7 @@ from fit_sessions import (
     noisy_outlines,
 )
 
-from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import (
     Start,
     start_from,
@@ -37,38 +35,6 @@ def at_truth(session: HexapodSession) -> Start:
     legs, poses = point_like_legs(TRUTH), session.T_Rb_Re
     m, cameras = session.measurements, session.T_camera_Rb
     return start_from(legs, m, session.legs, cameras, poses, "nominal")
-
-
-def one_pose_many_times(n_times: int) -> HexapodSession:
-    """Return a session in which three views see the same pose again and again."""
-    once = irregular_hexapod(1, shared_poses=True)
-    m, n = once.measurements, 3 * n_times
-    measurements = replace(
-        m,
-        image=tuple(f"{i:03d}.png" for i in range(n)),
-        view=np.tile(m.view, n_times),
-        pose=np.arange(n),
-        q=np.tile(m.q, (n_times, 1)),
-    )
-    o = once.outlines
-    row = np.repeat(3 * np.arange(n_times), len(o)) + np.tile(o.row, n_times)
-    outlines = replace(
-        o,
-        row=row,
-        leg=np.tile(o.leg, n_times),
-        edge=np.tile(o.edge, n_times),
-        h=np.tile(o.h, (n_times, 1)),
-        ends=np.tile(o.ends, (n_times, 1, 1)),
-        covariance=np.tile(o.covariance, (n_times, 1, 1)),
-        used=np.tile(o.used, n_times),
-        gamma=np.tile(o.gamma, n_times),
-        by_gamma=np.tile(o.by_gamma, n_times),
-        polish=np.tile(o.polish, n_times),
-        part=o.part * n_times,
-        reason=o.reason * n_times,
-        source=o.source * n_times,
-    )
-    return replace(once, measurements=measurements, outlines=outlines, T_Rb_Re=once.T_Rb_Re * n)
 
 
 Change = Callable[[Outlines], Outlines]
@@ -122,10 +88,9 @@ def test_outlines_that_cannot_be_fitted_are_refused(
             irregular_hexapod(1, n_views=2),
             r"2 images with 16 outlines and 12 readings give \d+ equations",
         ),
-        (one_pose_many_times(6), r"\d+ of \d+ combinations .*leg length: .*leg"),
         (irregular_hexapod(10), r"\d+ of \d+ combinations .* with a prior"),
     ],
-    ids=["two images", "one pose", "one leg"],
+    ids=["two images", "one leg"],
 )
 def test_images_that_do_not_determine_the_parameters_are_refused(
     few: HexapodSession, found: str
@@ -147,32 +112,3 @@ def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
     assert len(refused.value.problems) == 1
     with pytest.raises(DidNotConverge, match="needs at least one"):
         refine(session.legs, session.measurements, session.outlines, [])
-
-
-def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
-    session: HexapodSession, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    starts = [replace(at_truth(session), label=label) for label in ("second", "first", "third")]
-    costs = {"first": 1.0, "second": 2.0, "third": 3.0}
-    unwatched = fit._first_minimum
-
-    def with_cost(problem: FitProblem, start: Start) -> object:
-        return replace(unwatched(problem, start), cost=costs[start.label])
-
-    monkeypatch.setattr(fit, "_first_minimum", with_cost)
-    found = refine(session.legs, session.measurements, session.outlines, starts)
-    assert found.start == "first"
-
-
-def test_platform_poses_have_the_lengths_of_the_readings(session: HexapodSession) -> None:
-    m = session.measurements
-    start = start_from(
-        point_like_legs(TRUTH),
-        m,
-        session.legs,
-        session.T_camera_Rb,
-        disturbed_start(session, camera=0.02, angle=0.1).T_Rb_Re,
-        "nominal",
-    )
-    for found, true in zip(start.T_Rb_Re, session.T_Rb_Re, strict=True):
-        assert np.linalg.norm((found.inv() * true).translation) < 1e-11

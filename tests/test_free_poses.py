@@ -1,8 +1,6 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
-from dataclasses import replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 import yaml
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
-from layouts import Layout, LegLayout, MachineSpec, write_machine
+from layouts import Layout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
 from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
 from outline_sessions import made
@@ -18,11 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
-from legcal.calibration.identify.session import REACHED, recorded_session
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.scale import explaining_missing_scale
-from legcal.data.image_choice import dataset_at
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
@@ -50,11 +44,6 @@ KINDS: dict[str, tuple[list[str], list[str], int]] = {
     "6-UPS by hand": (["US"] * 6, ["passive"] * 6, 6),
     "3-RPS, two motors": (["RS"] * 3, ["actuated"] * 2 + ["passive"], 3),
 }
-LAYOUTS = {
-    "hung from the base": Layout(),
-    "hung from the platform": Layout((LegLayout(hung="platform", sphere=False),)),
-    "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True),)),
-}
 
 
 CAMERA = Camera(np.array([[1000.0, 0.0, 639.5], [0.0, 1000.0, 479.5], [0.0, 0.0, 1.0]]), 1280, 960)
@@ -73,27 +62,6 @@ def without_motors(machine: Path, *left: str) -> Path:
             text = text.replace(f"{line}\n", "", 1)
     machine.write_text(text if left else text.replace("name_mot:\n", "name_mot: []\n"))
     return machine
-
-
-def _usual(kind: str, layout: str) -> bool:
-    """Say whether a kind is tried in a layout: each in one, each layout with one at least."""
-    return [*KINDS].index(kind) % len(LAYOUTS) == [*LAYOUTS].index(layout)
-
-
-@pytest.mark.parametrize(
-    ("kind", "layout"), [pair for pair in product(KINDS, LAYOUTS) if _usual(*pair)]
-)
-def test_what_moves_freely_is_said_of_every_layout(kind: str, layout: str, tmp_path: Path) -> None:
-    types, kinds, mobility = KINDS[kind]
-    machine = load_mechanism(write_machine(tmp_path, drawn(kind), LAYOUTS[layout]))
-    assert [leg.type for leg in machine.legs] == [f"{t[0]}P{t[1]}" for t in types]
-    assert [leg.kind.value for leg in machine.legs] == kinds
-    n_motors = kinds.count("actuated")
-    assert (machine.mobility, len(machine.motors)) == (mobility, n_motors)
-    assert not machine.is_determined
-    assert f"mobility {mobility}" in machine.undetermined
-    said = [note for note in machine.diagnostics if "do not determine the pose" in note]
-    assert len(said) == 1
 
 
 # --- ranks --------------------------------------------------------------------------------------
@@ -179,15 +147,6 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
     path.write_text(SHIPPED_YAML.read_text().replace("../urdf/hexapod.urdf", str(SHIPPED_URDF)))
     motors = [f"leg{j}_prismatic" for j in range(1, n_motors + 1)]
     return load_mechanism(without_motors(path, *motors))
-
-
-def test_poses_in_place_of_those_that_readings_do_not_give_differ(tmp_path: Path) -> None:
-    few = dataset_at(legcal.load_dataset(ROOT / "examples/hexapod"), np.arange(4))
-    session = recorded_session(replace(few, machine=by_hand(3, tmp_path)))
-    t = session.t_reached
-    assert len(t) == REACHED
-    apart = np.linalg.norm(t[:, None] - t, axis=2)[np.triu_indices(REACHED, 1)]
-    assert apart.min() > 1e-4
 
 
 @pytest.mark.parametrize(
@@ -391,14 +350,6 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
         refine(session.legs, session.measurements, some, session.start)
     first = refusal.value.problems[0]
     assert ("no measured length" in first and "board on the platform" in first) == says
-
-
-def test_of_arms_one_length_is_to_be_measured() -> None:
-    session = machine_session("servo-hexapod", n_views=1, n_poses=1)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    with pytest.raises(NotIdentifiable) as refusal, explaining_missing_scale(problem):
-        raise NotIdentifiable("It is not determined.")
-    assert "state it (--length)" in refusal.value.problems[0]
 
 
 def test_legs_and_a_board_on_the_platform_calibrate_what_is_moved_by_hand(tmp_path: Path) -> None:

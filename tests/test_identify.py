@@ -27,7 +27,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at
-from legcal.errors import NotIdentifiable, UsageError
+from legcal.errors import NotIdentifiable
 from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of
 from legcal.report.machine import identify_table
@@ -41,7 +41,6 @@ VIEWS = {
     "weak joint": (LEGS[:5], LEGS[:5], LEGS[4:]),
     "halves": (LEGS[:3], LEGS[3:], LEGS[:3]),
 }
-SOME = ((0, 1), (1, 2))
 
 
 @cache
@@ -125,43 +124,7 @@ def test_the_document_is_that_of_the_report(
     assert found == report("halves", images=15, board=True)
 
 
-@pytest.mark.parametrize(
-    ("name", "views"),
-    [("3-upu", ()), ("hexapod", SOME)],
-)
-def test_tables_fit_80_columns_and_say_the_verdict(
-    name: str,
-    views: tuple[tuple[int, ...], ...],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    legs = loaded(name).leg_names
-    chosen = [[legs[j] for j in view] for view in views]
-    assert run(monkeypatch, "identify", name, *options(chosen), "--images", "6") == 0
-    out = capsys.readouterr().out
-    assert max(len(line) for line in out.splitlines()) <= 80
-    verdict = legcal.identifiability(loaded(name), chosen, 6)
-    said = "NOT identifiable" if not verdict.identifiable else "dentifiable: the joint fit"
-    assert said in out
-
-
-def test_all_problems_of_views_are_refused_at_once() -> None:
-    views: list[Any] = [["leg7"], [], ["leg1", "leg1"], ["leg1", 9], "leg1"]
-    with pytest.raises(UsageError) as refused:
-        legcal.identifiability(loaded("hexapod"), views, images=-1)
-    assert len(refused.value.problems) == 6
-    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found '9'", "'leg1'")
-    assert all(word in problem for word, problem in zip(named, refused.value.problems, strict=True))
-
-
 # Datasets
-
-
-def test_a_dataset_is_judged_by_itself() -> None:
-    found = identifiability_of_dataset(example())
-    assert found.identifiable
-    assert (found.full.rank, sum(found.images)) == (30, example().measurements.n_rows)
 
 
 def test_a_dataset_with_a_board_is_judged_with_it() -> None:

@@ -1,23 +1,28 @@
-"""Counts and ranks: equations written out, and what counts get wrong."""
+"""Counts, ranks and information: equations written out, and what counts get wrong."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import with_round_arms
 from random_legs import closed_leg
 from staged_sessions import exact_session
+from uncertainty import compared
 
 import legcal
 from legcal import identifiability
-from legcal.calibration.identify.identifiability import Analysis, weak_directions
+from legcal.calibration.identify.identifiability import Analysis, is_scale_open
 from legcal.calibration.identify.report import Identifiability
-from legcal.calibration.identify.session import Session, planned_session
-from legcal.geometry.rotations import cross_matrices
+from legcal.calibration.identify.session import planned_session
+from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.descriptions.new_model import create_model
+from legcal.geometry.motions import motion_of
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
@@ -143,27 +148,6 @@ def test_three_legs_at_once_where_18_and_19_need_them(
     assert (condition.ok, condition.legs) == (not failing, failing)
 
 
-# The rank of the joint fit
-
-
-def shared_poses(session: Session) -> Session:
-    """Return the session in which all views show the poses of the first."""
-    n = int((session.view == 0).sum())
-    pose = np.tile(np.arange(n), session.n_views)
-    return replace(session, R=session.R[:n], t=session.t[:n], pose=pose, unread=session.unread[:n])
-
-
-def test_the_joint_fit_determines_as_much_as_rows_are_more_than_unknowns() -> None:
-    """Six readings a pose and four rows a leg, for the motions of platform and cameras."""
-    planned = planned_session(model("hexapod"), ((0, 1), (2, 3), (4, 5)), 1)
-    alone, together = (Analysis(s).full.rank for s in (planned, shared_poses(planned)))
-    assert (alone, together) == (3 * (6 + 8) - 3 * (6 + 6), (6 + 3 * 8) - (6 + 3 * 6))
-    for seen, most in ((1, 0), (3, 6), (4, 10)):
-        full = Analysis(planned_session(model("hexapod"), (tuple(range(seen)),), 1)).full
-        assert full.rank == most
-        assert full.rank + len(full.weak) == full.of
-
-
 # What counts get wrong
 
 
@@ -238,33 +222,6 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert report("hexapod", (*HALVES, (1, 2, 3)), 2).full.rank == 30
 
 
-def test_a_direction_hides_what_moving_its_parameters_does_to_the_platform() -> None:
-    """The platform error of a weak direction, by forward kinematics of another model."""
-    analysis = Analysis(planned_session(model("hexapod"), WEAK_JOINT))
-    session = analysis.session
-    z_of_base_joint_6 = session.parametrization.names.index("leg6.base.z")
-    (weak,) = weak_directions(session, analysis.motion, np.eye(30)[[z_of_base_joint_6]])
-    assert weak.direction == "z of base joint 6"
-    assert weak.parameters == ("leg6.base.z",)
-    step = 0.0025 * session.mean_length
-    assert weak.components == pytest.approx((step,))
-    B = np.array([leg.B for leg in session.legs])
-    moved = []
-    for R, t in zip(session.R, session.t, strict=True):
-        A = np.array([leg.A for leg in session.legs])
-        length = np.linalg.norm(B @ R.T + t - A, axis=1)
-        A[5, 2] += step
-        x = np.zeros(6)
-        for _ in range(5):
-            arm = B @ R.T @ (np.eye(3) + cross_matrices(x[3:])).T
-            legs = arm + t + x[:3] - A
-            norms = np.linalg.norm(legs, axis=1)
-            u = legs / norms[:, None]
-            x += np.linalg.solve(np.hstack([u, np.cross(arm, u)]), length - norms)
-        moved.append(np.linalg.norm(x[:3]))
-    assert weak.dX_m == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=0.05)
-
-
 def test_the_platform_is_predicted_as_the_whole_covariance_says() -> None:
     """sigma of the platform: the motion by parameters times the inverse of their information."""
     analysis = Analysis(planned_session(model("hexapod"), VIEWS[0]))
@@ -276,3 +233,56 @@ def test_the_platform_is_predicted_as_the_whole_covariance_says() -> None:
     variances = np.einsum("kii->ki", covariance)
     assert found.dE_rad == pytest.approx(np.sqrt(variances[:, :3].sum(axis=1).mean()), rel=1e-3)
     assert found.dX_m == pytest.approx(np.sqrt(variances[:, 3:].sum(axis=1).mean()), rel=1e-3)
+
+
+# Information
+
+
+def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
+    machine = create_model(with_round_arms("delta"), tmp_path).machine
+    with_arms, without = (
+        Analysis(planned_session(m, [range(6)] * 2, 15)) for m in (machine, model("delta"))
+    )
+    sigma, other = (a.motion.sigma(a.information) for a in (with_arms, without))
+    assert sigma is not None
+    assert other is not None
+    assert 0.5 * other.dX_m < sigma.dX_m < 0.9 * other.dX_m
+    assert is_scale_open(with_arms)
+    radii = {f"leg{j}.radius.arm{a}_link": Prior(0.008, 1e-5) for j, a in ((1, 1), (3, 2), (5, 3))}
+    assert not is_scale_open(replace(with_arms, choices=Choices(priors=radii)))
+
+
+def larger(leg: Leg, size: float) -> Leg:
+    cylinders = tuple(
+        replace(c, radius=size * c.radius, start=size * c.start, end=size * c.end)
+        for c in leg.cylinders
+    )
+    return replace(leg, A=size * leg.A, B=size * leg.B, q0=size * leg.q0, cylinders=cylinders)
+
+
+def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None:
+    """A thousand times as large and as far, before the same cameras: relative figures stay."""
+    session, size = planned_session(model("3-rps"), [range(3)] * 3, 3), 1e3
+    assert session.home is not None
+    other = replace(
+        session,
+        legs=tuple(larger(leg, size) for leg in session.legs),
+        home=motion_of(session.home.rotation.as_matrix(), size * session.home.translation),
+        t=size * session.t,
+        t_reached=size * session.t_reached,
+        cameras=tuple(
+            replace(view, T_base_camera=motion_of(T.rotation.as_matrix(), size * T.translation))
+            for view, T in zip(session.cameras, session.places, strict=True)
+        ),
+        sigma_q=size * session.sigma_q,
+    )
+    found = [Analysis(each) for each in (session, other)]
+    singular = [np.linalg.svd(each.information, compute_uv=False) for each in found]
+    np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["planar", pytest.param("revolute", marks=pytest.mark.system)])
+def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
+    """At the same poses, cameras and used outlines, with the noise of the result."""
+    _, (stated, *predicted) = compared(Path(__file__).parent / "data/recorded" / name)
+    np.testing.assert_allclose(predicted, stated, rtol=0.02)

@@ -8,11 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from actuated_sessions import frame_legs, machine, poses_at
 from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
     BOARD_SCALE,
-    LENS,
     PINHOLE,
     HexapodSession,
     MachineSession,
@@ -24,11 +22,9 @@ from fit_sessions import (
     noisy_outlines,
     noisy_readings,
     place_of_board,
-    session_of_legs,
     shifted,
     with_board,
 )
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.identify.identifiability import Analysis
 from legcal.calibration.identify.session import Session
@@ -380,42 +376,10 @@ def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: Hexa
     assert not found.left_out
 
 
-def test_images_near_a_turning_point_of_a_reading_fit_as_well_as_others() -> None:
-    """There a pose has two readings, or none, and their derivative is infinite."""
-    legs, R0, t0 = machine("square")
-    names = tuple(leg.name for leg in legs)
-    fitted = FittedLegs(
-        names,
-        legs,
-        frame_legs(len(legs)),
-        {(j, "rod"): 0.008 for j in range(len(legs))},
-        RigidTransform.from_components(t0, Rotation.from_matrix(R0)),
-    )
-    q = np.random.default_rng(0).uniform(-0.1, 0.1, (200, len(legs)))
-    R, t, closed = poses_at("square", q)
-    rod, actuator = legs[1], legs[1].actuator
-    assert actuator is not None
-    cosine = (R @ rod.B + t - actuator.at(rod.A, q[:, 1])) @ actuator.axis / rod.q0
-    off_square = np.degrees(np.arcsin(cosine))
-    near = np.flatnonzero(closed & (np.abs(off_square) < 5.0))[:18]
-    assert off_square[near].min() < -2.0 < 2.0 < off_square[near].max()
-    wrong = (0.003, float(np.deg2rad(1.0)), 0.003, float(np.deg2rad(1.0)))
-    rng = np.random.default_rng(0)
-    exact = session_of_legs(fitted, R[near], t[near], q[near], wrong, 3, LENS, rng)
-    found = refine(exact.legs, exact.measurements, exact.outlines, exact.start)
-    assert max(errors(exact, found).values()) < 1e-7
-    assert found.outlines.used.all()
-
-
 def noisy(name: str) -> MachineSession:
     session = machine_session(name)
     measurements, outlines = session.noisy(0)
     return replace(session, measurements=measurements, outlines=outlines)
-
-
-@cache
-def fitted(session: MachineSession) -> Solution:
-    return refine(session.legs, session.measurements, session.outlines, session.start)
 
 
 def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layouts import Layout, LegLayout, write_machine
-from machines import MACHINES, displaced, of_types
+from machines import displaced, of_types
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
@@ -134,35 +134,6 @@ def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: 
     ]
     numeric = (np.array(ends[0]) - np.array(ends[1])).T / (2 * h)
     np.testing.assert_allclose(jacobian, numeric, atol=1e-8)
-
-
-# --- closed forms and other routes --------------------------------------------------------------
-
-
-def test_a_3_rpr_agrees_with_its_distance_equations() -> None:
-    machine, drawn = machine_of("3-rpr"), drawn_of("3-rpr")
-    A, B = machine.A_base, machine.B_platform
-    for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        x, y, _ = T.translation
-        angle = T.rotation.as_rotvec()[2]
-        c, s = np.cos(angle), np.sin(angle)
-        across = x + c * B[:, 0] - s * B[:, 1] - A[:, 0]
-        along = y + s * B[:, 0] + c * B[:, 1] - A[:, 1]
-        np.testing.assert_allclose(np.hypot(across, along), q + machine.q0, atol=1e-12)
-
-
-def test_a_planar_platform_stays_in_its_plane(tmp_path: Path) -> None:
-    description = MACHINES["3-RPR, tilted plane"]()
-    machine = load_mechanism(write_machine(tmp_path, description, Layout(virtual="planar")))
-    n = description.normal
-    assert n is not None
-    drawn = random_configurations(machine, 5, 2)
-    for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        axis = (T * machine.home.inv()).rotation.as_rotvec()
-        assert np.abs(np.cross(axis, n)).max() < 1e-12
-        assert abs((T.translation - machine.home.translation) @ n) < 1e-12
-        lengths = np.linalg.norm(vectors_A_to_B(machine, T), axis=1)
-        np.testing.assert_allclose(lengths, machine.sign * q + machine.q0, atol=1e-12)
 
 
 # --- the same machine in other trees, far from home ---------------------------------------------

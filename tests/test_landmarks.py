@@ -128,20 +128,6 @@ def test_base_joints_place_the_camera_where_readings_give_no_pose(
     assert any("leg4_prismatic" in note for note in loaded.notes) == (unknown != "no motors")
 
 
-def test_readings_are_left_open_of_all_rows_or_none_and_not_of_what_moves_joints(
-    tmp_path: Path,
-) -> None:
-    folder = dataset(tmp_path, "hexapod")
-    cell("measurements.csv", 2, leg1_prismatic="")(folder)
-    with pytest.raises(DatasetError, match=r"row 2 .*column leg1_prismatic.*an empty cell"):
-        load_dataset(folder, check_images=False)
-    folder = dataset(tmp_path, "linear-delta")
-    motor = load_mechanism("linear-delta").motor_names[0]
-    cell("measurements.csv", None, **{motor: ""})(folder)
-    with pytest.raises(DatasetError, match=rf"column {motor}.*moves joints at the base"):
-        load_dataset(folder, check_images=False)
-
-
 @pytest.fixture(scope="module")
 def planar(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     """The calibration of a planar machine in three views."""

@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hexapod_sessions import PaperSession, disturbed_hexapod, paper_session
-from staged_sessions import exact_session
 
 from legcal.data.outlines import (
     LegAxes,
     Outlines,
     axes_from_outlines,
-    join_axes,
-    outline_derivative,
 )
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
@@ -59,19 +56,6 @@ def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> 
         assert abs(axes.u[i] @ (axes.M[i] - 0.5 * (A + B))) < 0.1 * np.linalg.norm(B - A)
 
 
-def test_normals_follow_offsets_as_finite_differences_say() -> None:
-    session = _session(LENS)
-    outlines = session.outlines
-    _, derivative = outline_derivative(LENS, outlines.h, outlines.ends)
-    step = 1e-3
-    for end in range(2):
-        offset = step * np.eye(2)[end]
-        plus, _ = shifted_outlines(LENS, outlines.h, outlines.ends, offset)
-        minus, _ = shifted_outlines(LENS, outlines.h, outlines.ends, -offset)
-        found = (plus - minus) / (2.0 * step)
-        assert np.allclose(found, derivative[:, end], rtol=1e-4, atol=1e-7)
-
-
 def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     session = _session(LENS)
     outlines = session.outlines
@@ -89,23 +73,6 @@ def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     samples = np.concatenate(normalised)
     assert np.allclose(samples.mean(axis=0), 0.0, atol=0.08)
     assert np.allclose(np.cov(samples.T), np.eye(4), atol=0.1)
-
-
-def test_tube_and_rod_of_a_leg_are_joined_with_the_weight_of_their_covariances() -> None:
-    axes = exact_session(n_poses=2).axes
-    moved = replace(axes, M=axes.M + 1e-4 * axes.basis[:, 0], covariance=3.0 * axes.covariance)
-    both = LegAxes(
-        *(
-            np.concatenate([getattr(axes, name), getattr(moved, name)])
-            for name in ("row", "leg", "u", "M", "basis", "covariance")
-        )
-    )
-    joined = join_axes(both, both.row)
-    assert np.array_equal(joined.row, axes.row)
-    assert np.array_equal(joined.leg, axes.leg)
-    shift = np.sum((joined.M - axes.M) * axes.basis[:, 0], axis=1)
-    assert np.allclose(shift, 0.25e-4, atol=1e-10)
-    assert np.allclose(joined.covariance, 0.75 * axes.covariance, rtol=1e-6)
 
 
 def test_legs_with_one_used_outline_are_passed_over_and_none_with_two_is_refused() -> None:

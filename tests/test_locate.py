@@ -31,7 +31,6 @@ from legcal import (
     ToolPoses,
     load_mechanism,
     locate,
-    write_location,
 )
 from legcal.calibration.location.document import write_located_model
 from legcal.errors import (
@@ -231,9 +230,7 @@ def _loose() -> Located:
         (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
         (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),
         (_loose, {}, LegcalError, ("the pose cannot be computed from readings",)),
-        (lambda: _rows([0, 1, 2]), {"position_sigma": 0.0}, UsageError, ("position sigma", "0 m")),
         (lambda: _rows([0, 1, 2]), {"angle_sigma": 0.5}, UsageError, ("angle sigma", "0.5 rad")),
-        (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 1.0)}, UsageError, ("three numbers",)),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 0.0, float("inf"))}, UsageError,
          ("tool position",)),
     ],
@@ -303,15 +300,6 @@ def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
     assert run(monkeypatch, "locate", *words, "--position-sigma", "0.001mm") == 1
     assert "Doubtful" in capsys.readouterr().out
     assert yaml.safe_load((tmp_path / "a.yaml").read_text())["status"] == "doubtful"
-
-
-def test_other_files_are_kept(found: Location, tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text("other: 1\n")
-    for place in (path, tmp_path):
-        with pytest.raises(UsageError, match="found a"):
-            write_location(found, place)
-    assert path.read_text() == "other: 1\n"
 
 
 def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(

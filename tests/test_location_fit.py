@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from located import (
     BASE,
     SIGMA_ANGLE,
@@ -35,17 +33,6 @@ from legcal.geometry.types import Array
 STATED = (np.array([SIGMA_POSITION, SIGMA_ANGLE]), (True, True))
 UNKNOWN = (np.array([1e-3, 1e-2]), (False, False))
 
-unit = st.floats(-1.0, 1.0)
-vectors = st.tuples(unit, unit, unit).map(np.array)
-rotations = st.tuples(unit, unit, unit, unit).map(np.array).filter(
-    lambda q: bool(np.linalg.norm(q) > 0.1)
-).map(Rotation.from_quat)  # fmt: skip
-half_turns = vectors.filter(lambda v: bool(np.linalg.norm(v) > 0.1)).map(
-    lambda v: Rotation.from_rotvec(np.pi * v / np.linalg.norm(v))
-)
-motions = st.builds(RigidTransform.from_components, vectors, rotations | half_turns)
-FEW = settings(max_examples=4, deadline=None)
-
 
 def fitted(pairs: PosePairs, noise: tuple[Array, tuple[bool, bool]] = STATED) -> FrameFit:
     return fit(pairs, search(pairs, 3).frames[0], PoseNoise(*noise))
@@ -70,9 +57,9 @@ def test_the_nearest_rotation_is_never_a_mirror() -> None:
     assert np.all(apart < np.linalg.norm(matrices - others, axis=(2, 3)))
 
 
-@FEW
-@given(world=motions)
-def test_moving_the_world_moves_the_base_and_nothing_else(world: RigidTransform) -> None:
+@pytest.mark.parametrize("turn", [[0.3, -1.0, 2.0], [np.pi, 0.0, 0.0]])
+def test_moving_the_world_moves_the_base_and_nothing_else(turn: list[float]) -> None:
+    world = RigidTransform.from_components([0.7, -0.4, 1.0], Rotation.from_rotvec(turn))
     pairs = noisy(pairs_at(BASE, TOOL), np.random.default_rng(5))
     R = world.rotation.as_matrix()
     before = fitted(pairs, UNKNOWN)

@@ -1,7 +1,6 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
 import pickle
-import re
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -14,7 +13,6 @@ from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
-from outside_machines import OUTSIDE, missing, scaled
 
 from legcal.errors import OutOfClass, UsageError
 from legcal.geometry.lines import normal_basis
@@ -263,12 +261,6 @@ def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
         _close(leg.B, expected_B(description, j))
 
 
-def test_by_how_much_a_slider_may_miss_its_joint_grows_with_the_machine(tmp_path: Path) -> None:
-    """Ten times as much is refused: see ``OUTSIDE``."""
-    path = write_machine(tmp_path, scaled(missing("RS", 4e-6), 25.0), Layout())
-    assert load_mechanism(path).home.translation[2] == pytest.approx(0.6 * 25.0, rel=1e-4)
-
-
 # --- what a file does not name ------------------------------------------------------------------
 
 UNNAMED = {
@@ -358,16 +350,3 @@ def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(
     assert load_mechanism(path).urdf_path == path.with_suffix(".urdf")
     monkeypatch.chdir(tmp_path)  # where a folder has the name of a shipped model
     assert load_mechanism("hexapod").yaml_path == SHIPPED_YAML
-
-
-@pytest.mark.parametrize("name", ["u-off", "turning-motor"])
-def test_a_refused_leg_says_what_was_found_and_what_is_needed(name: str, tmp_path: Path) -> None:
-    write, named = OUTSIDE[name]
-    write(tmp_path)
-    with pytest.raises(OutOfClass, match=re.escape(named[0])) as refused:
-        load_mechanism(tmp_path / "machine.yaml")
-    fact = refused.value.facts[0]
-    assert fact.found
-    assert fact.needed
-    assert fact.remedy
-    assert fact.file

@@ -10,14 +10,12 @@ from staged_sessions import planned
 
 from legcal.calibration.identify import identifiability
 from legcal.calibration.identify.identifiability import Analysis, check_identifiable, is_scale_open
-from legcal.calibration.identify.report import RmsMotion
 from legcal.calibration.identify.session import Session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.errors import NotIdentifiable
 from legcal.machine.leg import Cylinder
 from legcal.machine.parameters import parametrize
 from legcal.paper.conditions import count_conditions
-from legcal.report.machine import _verdict
 
 RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
 TURNING = ("6-rss", "delta")
@@ -61,20 +59,6 @@ def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: st
         ]
         radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
         assert not is_scale_open(Analysis(replace(session(name), legs=tuple(rods)), radius))
-
-
-def test_the_verdict_names_the_scale() -> None:
-    analysis = Analysis(session("6-rss"))
-    report: Any = SimpleNamespace(
-        identifiable=True,
-        full=analysis.full,
-        platform_sigma=RmsMotion(1e-4, 1e-3),
-        scale_is_open=True,
-        conditions=(),
-        notes=(),
-    )
-    text = " ".join(str(line) for line in _verdict(report))
-    assert "calibrate refuses it until a length or radii are stated" in text
 
 
 def gained(name: str) -> Session:

@@ -197,24 +197,6 @@ def test_millimetres_metres_and_csv_give_the_same_files(tmp_path: Path) -> None:
     assert found[0] == found[1] == found[2]
 
 
-def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
-    base = [[400, 0, 0], [-200, 0, 346], [-200, 0, -346]]
-    platform = [[140, 0, 0], [-70, 0, 121], [-70, 0, -121]]
-    machine = made(
-        tmp_path,
-        type="3-RPR",
-        base_joints=base,
-        platform_joints=platform,
-        base_axes=[[0, 1, 0]] * 3,
-        platform_axes=[[0, 1, 0]] * 3,
-        offsets=200,
-        home={"xyz": [10, 0, 20], "rpy_deg": [0, 30, 0]},
-    )
-    assert not machine.spatial
-    assert machine.urdf.joints["platform_free"].type == "floating"
-    assert len(machine.frame_legs) == 2
-
-
 # --- families -----------------------------------------------------------------------------------
 
 
@@ -260,41 +242,6 @@ def test_dimensions_of_a_hexapod_are_those_that_were_given(tmp_path: Path) -> No
     np.testing.assert_allclose(machine.q0, 0.38, atol=1e-12)
     assert {leg.travel for leg in machine.legs} == {(0.0, 0.125)}
     assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.0125}
-
-
-def test_the_delta_is_the_shipped_one(tmp_path: Path) -> None:
-    described = description_of(None, Dimensions(family="delta"))
-    machine, shipped = create_model(described, tmp_path).machine, load_mechanism("delta")
-    for key in ("A_base", "B_platform", "q0"):
-        np.testing.assert_allclose(getattr(machine, key), getattr(shipped, key), atol=1e-12)
-    np.testing.assert_allclose(machine.home.as_matrix(), shipped.home.as_matrix(), atol=1e-10)
-
-
-HEAD = "type,base_x,base_y,platform_x,platform_y"
-
-
-def test_a_csv_whose_file_name_is_no_name_needs_one(tmp_path: Path) -> None:
-    path = tmp_path / "my machine (2).csv"
-    path.write_text(f"{HEAD}\nSS,1,2,3,4\nSS,5,6,7,8\n")
-    with pytest.raises(ModelError, match=r"'my machine \(2\)'.*--name NAME"):
-        read_table(path, "mm")
-    assert read_table(path, "mm", "mine").name == "mine"
-
-
-def test_an_unknown_column_of_a_table_of_joints_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "joints.csv"
-    path.write_text("point,x,y,zz\nB1,1,2,3\nP1,4,5,6\n")
-    with pytest.raises(ModelError, match=r"the unknown column 'zz'.*did you mean 'z'"):
-        read_table(path, "mm")
-
-
-def test_cells_of_a_table_of_joints_are_refused_on_their_own_lines(tmp_path: Path) -> None:
-    path = tmp_path / "joints.csv"
-    path.write_text("point,x,y\nB1,1,2\nB2,a,2\nP1,4\nB1,4,5\nQQ,4,5\n")
-    with pytest.raises(ModelError) as refused:
-        read_table(path, "mm")
-    facts = [(problem.line, problem.found) for problem in refused.value.facts]
-    assert facts == [(3, "'a'"), (4, "2 cells"), (5, "'B1' twice"), (6, "'QQ'")]
 
 
 def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:

@@ -37,19 +37,14 @@ from legcal.calibration.joint_fit.outline_errors import (
     PLACES,
     RECOVERED_SHARE,
     EdgeBiases,
-    NoiseModel,
-    estimate_noise,
     possible_biases,
 )
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import (
-    NO_CHANGES,
-    Changes,
-    check_convergence,
     with_edge_biases,
 )
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings, State
+from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.calibration.tuning import LIMB_GAMMA_SIGMA
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
@@ -251,32 +246,6 @@ def test_scores_are_those_of_the_residuals_of_a_fit(session: HexapodSession) -> 
         np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_errors_of_an_outline_are_its_noise_and_those_of_both_ends() -> None:
-    claimed = np.diag([0.03, 0.05])[None] ** 2
-    noise = NoiseModel(2.0, bias_px=0.2, tilt_px=0.1).covariance(claimed)[0]
-    ends = np.array([[1.0, 1.0], [1.0, -1.0]])  # by the mean of both, and half their difference
-    expected = 4.0 * claimed[0] + ends.T @ np.diag([0.2, 0.1]) ** 2 @ ends
-    np.testing.assert_allclose(noise, expected)
-
-
-def test_scores_do_not_depend_on_the_biases_that_are_fitted(session: HexapodSession) -> None:
-    rng = np.random.default_rng(5)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-    problem = build_fit(session.legs, measurements, outlines)
-    state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
-    possible = biases_of(session)
-    without = scores_of(problem, state, possible)
-    some = possible.of_sizes(np.array([0.0, 0.1, 0.2, 0.0, 0.1, 0.0]))
-    with_some, there = with_edge_biases(problem, state, some)
-    there = replace(there, biases=0.1 * rng.standard_normal(len(some)))
-    for one, other in zip(
-        without,
-        scores_of(with_some, there, possible),
-        strict=True,
-    ):
-        np.testing.assert_allclose(other, one, atol=1e-7 * np.abs(one).max())
-
-
 def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
     start = disturbed_start(session)
     normalised, sizes = [], []
@@ -364,16 +333,6 @@ def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> N
     (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
     assert "has not converged" in note
     assert " px to 0." in note
-
-
-def test_inliers_that_change_have_not_converged() -> None:
-    sizes, claimed = np.array([1.0, 0.0, 0.0]), np.broadcast_to(0.01 * np.eye(2), (100, 2, 2))
-    assert check_convergence(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()
-    assert check_convergence(NO_CHANGES, claimed, DEFAULT_SETTINGS) == ()
-    (note,) = check_convergence(Changes(sizes, sizes, 4, 100), claimed, DEFAULT_SETTINGS)
-    assert "4 outlines were newly accepted or rejected (100 are accepted)" in note
-    with pytest.raises(DidNotConverge, match="6 outlines were newly accepted or rejected"):
-        check_convergence(Changes(sizes, sizes, 6, 100), claimed, DEFAULT_SETTINGS)
 
 
 def without_gamma(measurements: Measurements) -> Measurements:
@@ -499,17 +458,3 @@ def test_a_likelihood_that_is_flat_leaves_the_gamma_open(session: HexapodSession
     )
     (note,) = trials.tried(gammas, None).notes({"c1": 2.0})
     assert "with 2.00, fewer of its outlines are usable" in note
-
-
-def test_kinds_of_noise_are_kept_where_they_would_take_turns() -> None:
-    """A tilt below significance is left out of an estimate, unless it had it before."""
-    rng = np.random.default_rng(4)
-    claimed = np.tile(0.01**2 * np.eye(2), (400, 1, 1))
-    tilt = 0.003 * rng.normal(size=(400, 1)) * [-1.0, 1.0]
-    offsets = 0.01 * rng.normal(size=(400, 2)) + tilt
-    none = np.zeros((400, 2, 2))
-    plain = estimate_noise(offsets, none, claimed)
-    kept = estimate_noise(offsets, none, claimed, included=NoiseModel(1.0, 0.0, 0.1))
-    assert plain.tilt_px == plain.bias_px == kept.bias_px == 0.0
-    assert 0.001 < kept.tilt_px < 0.006
-    assert kept.scale < plain.scale < 1.2

@@ -1,7 +1,5 @@
 """Sub-pixel lines: pixels beside an outline, the limb model, and blocks fitted to it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -10,19 +8,14 @@ from legcal.geometry.types import Array
 from legcal.perception.blocks import (
     COMMON_BIAS,
     TILT_BIAS,
-    BlockFit,
     BlockLine,
     Blocks,
-    fit_blocks,
     fit_lines,
 )
 from legcal.perception.limb import (
     MATTE_DIRECTIONS,
-    N_AMPLITUDES,
-    N_POWERS,
     powers,
     profile_functions,
-    simple_functions,
 )
 from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import (
@@ -48,16 +41,7 @@ LENS = Camera(
     300,
     np.array([-0.2, 0.05, 0.001, -0.001, 0.0]),
 )
-V = np.array([1.5, -2.0])
 DEEP = 3.5
-
-
-def edge_at(angle: float, epsilon: float = 1.0, length: float = 200.0) -> Edge:
-    """Return an outline through the middle of the image, at an angle to its rows."""
-    along = np.array([np.cos(angle), np.sin(angle)])
-    normal = np.array([-along[1], along[0]])
-    band = Band(-0.5 * length / 500.0 * along, along, normal, 500.0, length)
-    return Edge(band, V, epsilon, 20.0, np.zeros(10, dtype=np.bool_))
 
 
 def numbered(axis: int) -> Samples:
@@ -70,40 +54,6 @@ def read(
 ) -> Profiles:
     depths = DEEP, np.full(len(edges), inner)
     return read_profiles(numbered(axis), LENS, edges, [e.v for e in edges], depths, 8, most)
-
-
-@pytest.mark.parametrize(
-    ("angle", "epsilon", "place"),
-    [(0.1, 1.0, None), (1.5, -1.0, None), (2.4, -1.0, None), (5.0, 1.0, None),
-     (np.pi / 2, 1.0, (399.0, 150.0)), (0.0, 1.0, (200.0, 299.0))],
-)  # fmt: skip
-def test_distances_are_those_of_the_pixels_that_are_read(
-    angle: float, epsilon: float, place: tuple[float, float] | None
-) -> None:
-    """Those inside the image, up to a depth, also where an outline is on its border."""
-    one = edge_at(angle, epsilon)
-    if place is not None:
-        there = LENS.undistort(np.array(place))
-        one = replace(one, band=replace(one.band, origin=one.band.origin + there))
-    columns, rows = read([one], 0), read([one], 1)
-    xy = LENS.undistort(np.stack([columns.grey, rows.grey], axis=-1).astype(np.float64))
-    h = one.band.line(*V)
-    distance = epsilon * LENS.line_offset(np.broadcast_to(h, (*xy.shape[:-1], 3)), xy)
-    seen = columns.window >= 0.5
-    np.testing.assert_allclose(
-        columns.d[seen], distance[seen], atol=0.02 if place is None else 0.05
-    )
-    if place is not None:
-        assert np.count_nonzero(seen) > 50
-        return
-    assert np.count_nonzero(seen) > 500
-    assert distance[seen].min() < -DEEP + 0.3
-    assert distance[seen].max() > DEEP - 0.3
-    t, _ = one.band.coordinates(xy)
-    np.testing.assert_allclose(columns.position, t.mean(axis=1) / one.band.length, atol=0.02)
-    shallow = read([one], inner=1.0)
-    assert shallow.d[shallow.window >= 0.5].max() <= 1.0
-    assert shallow.d[shallow.window >= 0.5].min() < -3.0
 
 
 # Sums over pixels, and their noise.
@@ -143,41 +93,6 @@ def test_both_sides_are_equally_noisy_when_weighted(behind: float) -> None:
 
 
 # Blocks one by one, and lines through them.
-
-HALF_WIDTH_PX = 14.0
-
-
-def simple(d: Array, blur: float, half_width: float = HALF_WIDTH_PX) -> tuple[Array, Array]:
-    """Return the functions of single blocks (..., 5) at distances, and their slopes."""
-    values, slopes = simple_functions(np.array([half_width]), np.array([blur]))
-    at, _ = powers(np.asarray(d, dtype=np.float64) / blur)
-    return at @ values[0].T, at @ slopes[0].T
-
-
-def block_fit(d: Samples, grey: Samples, weight: Samples, blur: float = 0.6) -> BlockFit:
-    """Return the fit of blocks of one edge."""
-    sums = PixelBins.of(d, weight, blur).sums(grey)
-    edge = np.zeros(len(d), dtype=np.intp)
-    return fit_blocks(sums, np.array([HALF_WIDTH_PX]), np.array([blur]), edge)
-
-
-def limb_blocks(
-    shift: float, blur: float, amplitude: list[float], noise: float, n: int = 200
-) -> tuple[Samples, Samples]:
-    """Return distances from a line and the grey levels of outlines ``shift`` further inside."""
-    rng = np.random.default_rng(1)
-    d = rng.uniform(-4.0, 4.0, (n, 120)).astype(np.float32)
-    values, _ = simple(d.astype(np.float64) - shift, blur)
-    grey = values @ np.array(amplitude) + noise * rng.standard_normal(d.shape)
-    return d, grey.astype(np.float32)
-
-
-def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
-    d, grey = limb_blocks(0.0, 0.6, [20.0, 0.0, 120.0, 60.0, 0.0], noise=3.0)
-    weight = np.ones(d.shape, dtype=np.float32)
-    fit = block_fit(d, grey, weight)
-    assert np.std(fit.shift) == pytest.approx(np.sqrt(np.median(fit.variance)), rel=0.2)
-    assert np.sqrt(np.median(fit.noise)) == pytest.approx(3.0, rel=0.05)
 
 
 def fit_straight(position: Array, shift: Array, variance: Array) -> BlockLine | None:
@@ -263,24 +178,6 @@ def outline(
     )  # fmt: skip
     read.noise[:] = max(noise, 0.3) ** 2  # as the blocks by themselves show it
     return read
-
-
-@pytest.mark.parametrize("blur", [0.35])
-def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
-    d, half_width = np.linspace(-4.0, 4.0, 81), single(HALF_WIDTH, 1)
-
-    def profile(d: Array, blur: float) -> Array:
-        values, _, _ = profile_functions(half_width, single(blur, 1), DEPTH)
-        return np.asarray(values[0] @ powers(d / blur)[0].T)
-
-    _, slopes, widenings = profile_functions(half_width, single(blur, 1), DEPTH)
-    U = powers(d / blur)[0].T
-    step = 1e-3
-    by_distance = (profile(d + step, blur) - profile(d - step, blur)) / (2.0 * step)
-    np.testing.assert_allclose(by_distance, slopes[0] @ U, atol=0.01)
-    by_blur = (profile(d, blur * np.exp(step)) - profile(d, blur * np.exp(-step))) / (2.0 * step)
-    np.testing.assert_allclose(by_blur, widenings[0] @ U, atol=0.01)
-    assert slopes.shape == (1, N_AMPLITUDES, N_POWERS)
 
 
 @pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])

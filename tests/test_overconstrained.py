@@ -20,8 +20,7 @@ from thinned import thinned
 
 from legcal import identifiability
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.variables import LegConstraints, start_from
+from legcal.calibration.joint_fit.variables import start_from
 from legcal.errors import OutOfClass
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
@@ -171,18 +170,3 @@ def test_a_file_of_nine_decimals_is_refused_for_its_digits(tmp_path: Path) -> No
     urdf.write_text(re.sub(r"-?\d\.\d{9,}", lambda x: f"{float(x[0]):.9f}", urdf.read_text()))
     with pytest.raises(OutOfClass, match=r"2 of the 5 constraints .* with all digits"):
         load_mechanism(path)
-
-
-def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
-    machine = load_mechanism(write_machine(tmp_path, two_upr_two_sps(), LAYOUTS[0]))
-    session = wrong_but_tied(machine_session(str(machine.yaml_path)), machine)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    state = problem.projected(problem.begin(session.truth))
-    t = state.platform_pose.t.copy()
-    t[0], t[1, 0], t[2] = np.inf, 1e3, t[2] + 0.01
-    there = LegConstraints(problem.parameters).with_poses(state, state.platform_pose._replace(t=t))
-    moved = np.linalg.norm(there.platform_pose.t - state.platform_pose.t, axis=1)
-    assert moved[0] == 0.0
-    assert moved[2] > 1e-3
-    assert moved[3:].max() < 1e-9
-    assert np.isfinite(moved).all()

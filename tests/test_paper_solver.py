@@ -8,32 +8,26 @@ from threading import Timer
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from random_legs import closed_leg
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.lines import axis_angles, normal_basis, turned_axis
+from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations
 from legcal.machine.leg import EquationKind, JointType
 from legcal.paper.equations import (
-    angles_of,
     axis_frames,
-    axis_slope,
     change_of_distance,
     closure_of_leg,
     distance_of_ends,
     end_of_leg,
     end_on_axis,
     end_on_ray,
-    gibbs_of,
     joint_on_axis,
     leg_across_axis,
     mean_distance,
     point_on_ray,
-    turned_frame,
 )
 from legcal.paper.least_squares import (
     LeastSquares,
@@ -191,31 +185,3 @@ def test_equations_of_a_leg_are_those_of_the_machine(joints: str) -> None:
         function = closure_of_leg(leg.base_joint, leg.platform_joint)
         sine = float(function(np.zeros(5), none, u, E, R, a, b, float(leg.twist or 0.0), 0.5))
         assert sine == pytest.approx(2.0 * values[EquationKind.TWIST], abs=1e-12)
-
-
-# Unknown motions and axes
-
-
-@given(turns=st.tuples(*[st.floats(-1.0, 1.0)] * 2), seed=st.integers(0, 10**6))
-@settings(max_examples=30, deadline=None)
-def test_turns_of_an_axis_are_its_angles_from_the_nominal_one(
-    turns: tuple[float, float], seed: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    nominal = rng.standard_normal(3)
-    nominal /= np.linalg.norm(nominal)
-    w = np.array(turns)
-    symbol, frame = ca.SX.sym("turns", 2), ca.SX(ca.DM(axis_frames(nominal[None])[0]))
-    in_casadi = ca.Function("axis", [symbol], [turned_frame(symbol, frame)[:, 0]])
-    axis = in_casadi(w).full().ravel()
-    np.testing.assert_allclose(turned_axis(nominal, angles_of(w)), axis, atol=1e-12)
-    np.testing.assert_allclose(gibbs_of(axis_angles(axis, nominal)), w, atol=1e-9)
-    np.testing.assert_allclose(axis_angles(-axis, nominal), angles_of(w), atol=1e-9)
-    exact = Rotation.from_rotvec(angles_of(w) @ normal_basis(nominal)).apply(nominal)
-    np.testing.assert_allclose(axis, exact, atol=1e-12)
-    h = 1e-6
-    slope = [(in_casadi(w + h * e) - in_casadi(w - h * e)).full() / (2.0 * h) for e in np.eye(2)]
-    np.testing.assert_allclose(axis_slope(nominal, w), np.hstack(slope), atol=1e-8)
-
-
-# Registration of points

@@ -39,7 +39,6 @@ from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import Session, choose
 from legcal.planning.places import Place, Setting, default_setting, parse_bounds
-from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
 from legcal.planning.session import Plan, write_session
@@ -303,22 +302,6 @@ def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path
     assert missing <= 0.1 * agreeing
 
 
-def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
-    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1, FEW)
-    view = planned.views[0]
-    candidates = Candidates(Place(view.T_base_camera), view.poses)
-    found = Scene.nominal(task).of(candidates)
-    assert found is not None
-    session = Session([found])
-    one_more = session.with_one_more(0, np.array([0, 1]))
-    session.changed(0, 1, 1.0)
-    np.testing.assert_allclose(session.machine, one_more[1], rtol=1e-6, atol=1e-15)
-    updated = session.covariance.copy()
-    session.renewed()
-    sigma = np.sqrt(np.diagonal(session.covariance))
-    assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
-
-
 FAR: dict[str, Any] = {"images": 4, "setting": FEW}
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 0}, UsageError, "--images 0"),
@@ -389,15 +372,6 @@ def test_photographs_of_one_site_share_errors_at_its_places() -> None:
     unit = np.sqrt(np.diagonal(information + found.prior))
     J = found.all_gains() / unit
     np.testing.assert_allclose(J.T @ J, information / unit / unit[:, None], atol=1e-9)
-
-    # A fit that knows nothing of them does worse than that, and than it would without them.
-    twice = contributions(*2 * [*range(6)], is_fit=True)
-    fit, best = Session([], [twice]), np.linalg.inv(least_squares(twice) + twice.prior)
-    sigma = np.sqrt(np.diagonal(fit.machine))
-    for least in (best[: fit.p, : fit.p], fit.machine):
-        worse = np.linalg.eigvalsh((fit.fitted() - least) / np.outer(sigma, sigma))
-        assert worse.min() > -1e-6
-        assert worse.max() > 0.1
 
     several = contributions(0, 5, 0, 5, 0)
     assert several.site.tolist() == [0, 1, 0, 1, 0]

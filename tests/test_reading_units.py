@@ -13,7 +13,7 @@ from command_line import run
 from csv_rows import read_rows
 from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
-from photograph_files import jpeg
+from test_init import own_folder
 
 import legcal
 from legcal.data.dataset import Dataset, load_dataset
@@ -26,6 +26,7 @@ from legcal.simulation.settings import Distribution, Level, SimulationSettings, 
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
 BOTH_WAYS = np.concatenate([ANGLES, -ANGLES])
+PHOTOGRAPHS = [f"IMG_{k}.jpg" for k in range(4)]
 PULSES = {"centre_us": 1500, "us_per_deg": 11.1}
 
 
@@ -130,20 +131,6 @@ def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_t
         sigmas_of("80deg", [endless])
 
 
-def photographs(folder: Path, n: int) -> None:
-    """Write photographs and the file of their camera."""
-    (folder / "photos").mkdir()
-    for k in range(n):
-        picture = np.full((48, 64), 40 + k, dtype=np.uint8)
-        (folder / f"photos/IMG_{k}.jpg").write_bytes(jpeg(picture))
-    (folder / "camera_info.yaml").write_text(
-        "image_width: 64\nimage_height: 48\ncamera_name: c\n"
-        "camera_matrix: {rows: 3, cols: 3, data: [80, 0, 32, 0, 80, 24, 0, 0, 1]}\n"
-        "distortion_model: plumb_bob\n"
-        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
-    )
-
-
 @pytest.mark.parametrize(
     ("headings", "scale", "words", "sigma_deg"),
     [
@@ -162,7 +149,7 @@ def test_init_takes_angles_and_pulses(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    photographs(tmp_path, 4)
+    own_folder(tmp_path, PHOTOGRAPHS)
     given = {"rad": ANGLES, "deg": np.degrees(ANGLES), "us": pulses(ANGLES)}[scale]
     model = "servo-hexapod"
     if scale == "us":
@@ -216,7 +203,7 @@ def test_what_init_cannot_make_of_angles(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    photographs(tmp_path, 4)
+    own_folder(tmp_path, PHOTOGRAPHS)
     assert init(tmp_path, given, headings, words, monkeypatch) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert said.count("legcal: ") == 1

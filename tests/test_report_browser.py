@@ -26,9 +26,6 @@ from legcal.viewer.click_server import ClickServer
 pytestmark = pytest.mark.system
 
 
-HOSTILE = "\"'`</script><img src=x onerror=alert(1)><script>alert(1)</script>"
-
-
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with chromium() as found:
@@ -105,44 +102,6 @@ def test_sliders_move_the_machine(page: Any) -> None:
     assert _errors(page) == []
 
 
-def test_words_of_tables_are_whole_on_a_telephone(page: Any) -> None:
-    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
-    try:
-        inside, outside, first = page.execute_script(
-            "const table = document.querySelector('#platform table');"
-            "return [document.documentElement.scrollWidth, table.parentElement.clientWidth,"
-            " table.rows[1].cells[0].offsetWidth]"
-        )
-    finally:
-        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert inside <= 390
-    assert outside < 390
-    assert first > 80
-
-
-def test_a_scene_is_turned_and_zoomed(page: Any) -> None:
-    from selenium.webdriver.common.action_chains import ActionChains
-
-    canvas = page.find_element("id", "machine-scene")
-
-    def picture() -> str:
-        return str(page.execute_script("return arguments[0].toDataURL()", canvas))
-
-    show = "arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})"
-    page.execute_script(show, canvas)
-    before = picture()
-    ActionChains(page).drag_and_drop_by_offset(canvas, 60, 20).perform()
-    turned = picture()
-    page.execute_script(
-        "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -300, cancelable: true}))",
-        canvas,
-    )
-    assert len({before, turned, picture()}) == 3
-    assert _is_drawn(page, "machine-scene")
-    assert _errors(page) == []
-
-
 def test_a_point_of_a_chart_tells_its_outline_and_leads_to_it(page: Any) -> None:
     from selenium.webdriver.common.action_chains import ActionChains
 
@@ -185,41 +144,6 @@ def test_tables_sort_by_numbers_and_back(page: Any) -> None:
     page.execute_script("arguments[0].click()", button)
     assert column() == sorted(before, reverse=True)
     assert button.find_element("xpath", "..").get_dom_attribute("aria-sort") == "descending"
-
-
-def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
-    button = page.find_element("css selector", ".crop .zoom")
-    page.execute_script("arguments[0].click()", button)
-    width = "return document.querySelector('#enlarged svg').viewBox.baseVal.width"
-    before = page.execute_script(width)
-    page.execute_script(
-        """const stage = document.querySelector("#enlarged div");
-        const box = stage.getBoundingClientRect();
-        stage.dispatchEvent(new WheelEvent("wheel", {deltaY: -500, clientX: box.x + 9,
-                                                     clientY: box.y + 9, cancelable: true}));"""
-    )
-    assert page.execute_script(width) < 0.5 * before
-    page.execute_script("document.getElementById('enlarged').close()")
-
-
-def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path) -> None:
-    calibration = example_run.calibration
-    machine = calibration.dataset.machine
-    legs = tuple(replace(leg, name=f"{leg.name}{HOSTILE}") for leg in machine.legs)
-    measured = calibration.dataset.measurements
-    views = tuple(replace(view, name=f"{HOSTILE}{view.name}") for view in measured.views)
-    dataset = replace(
-        calibration.dataset,
-        machine=replace(machine, name=HOSTILE, legs=legs),
-        measurements=replace(measured, views=views),
-    )
-    changed = replace(calibration, dataset=dataset, notes=(HOSTILE,))
-    changed.__dict__["result"] = calibration.result
-    browser.get(legcal.write_report(changed, tmp_path).as_uri())
-    assert _is_drawn(browser, "machine-scene")
-    assert _errors(browser) == []
-    assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
-    assert HOSTILE in browser.find_element("css selector", "h1").text
 
 
 # Correcting outlines on the page of ``legcal detect``.

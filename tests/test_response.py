@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from dataset_folder import Folder, folder
+from dataset_folder import folder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from legcal.data.dataset import load_dataset
 from legcal.perception.blocks import fit_blocks
 from legcal.perception.profiles import PixelBins, to_light
 
@@ -56,10 +55,3 @@ def test_weights_make_the_noise_of_light_that_of_grey_levels(
         scatter = np.std(light[0, half]) * np.mean(weight[0, half])
         assert scatter == pytest.approx(0.3, rel=0.1)
     assert not np.any(to_light(noisy, np.zeros_like(window), gamma)[1])
-
-
-def test_dataset_tells_the_gamma_of_a_camera(folder: Folder) -> None:
-    folder.entry["views"]["c1"]["gamma"] = 2.2
-    views = {view.name: view for view in load_dataset(folder.write()).measurements.views}
-    assert views["c1"].camera.gamma == 2.2
-    assert all(view.camera.gamma == 1.0 for name, view in views.items() if name != "c1")

@@ -153,25 +153,6 @@ def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSe
             fitted(session, Choices(free=frozenset(f"c1.{name}" for name in names)))
 
 
-def test_what_is_held_stays_at_nominal() -> None:
-    session = machine_session("3-upu")
-    found = fitted(session)
-    legs = session.legs
-    names = legs.parametrization.names
-    change = legs.vector(found.legs) - legs.vector(legs.nominal)
-    pairs = [
-        [names.index(f"leg{j}.{side}_axis.{angle}") for side in ("base", "platform")]
-        for j in (1, 2, 3)
-        for angle in (1, 2)
-    ]
-    # Base and platform axes part, as the truth wants, and their means stay.
-    assert np.abs(change[pairs].sum(axis=1)).max() < 1e-3
-    assert np.abs(change[pairs]).max() > 5e-3
-    assert sum("axis" in words for words in found.kinematic.held) == 6
-    weak = {name for name, status in found.estimates.status.items() if status == "weak"}
-    assert weak.isdisjoint(found.estimates.names)
-
-
 @pytest.mark.system
 def test_two_priors_that_contradict_each_other_are_refused() -> None:
     session = machine_session("3-upu", n_poses=4)

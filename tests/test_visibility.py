@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform
 
 import legcal
 from legcal.errors import NotVisible
 from legcal.geometry.motions import components, look_at
-from legcal.geometry.types import Array
 from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.observe import legs_in_image, shares, take_images
-from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
+from legcal.simulation.solids import PosedMachine, Solid, dressed, pose_machine, solids_of
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import DistortionModel
-from legcal.vision.visibility import Bodies, Seen, in_picture, pixels_inside, visible_parts
+from legcal.vision.visibility import Bodies, in_picture, pixels_inside, visible_parts
 
 FAR = np.array([1.4, 0.3, 0.25])
 MIDDLE = np.array([0.0, 0.0, 0.2])
@@ -44,31 +42,6 @@ def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[Pos
     return pose_machine(machine, [*shown, *more], poses)
 
 
-def box(centre: Array, size: tuple[float, float, float]) -> Solid:
-    return Solid("box", None, Box(size), RigidTransform.from_translation(centre))
-
-
-def seen_at_home(*more: Solid) -> Seen:
-    T = look_at(FAR, MIDDLE)
-    return legs_in_image(
-        posed_machine("hexapod").legs, posed("hexapod", 1, *more)[0], sample_camera(), T
-    )
-
-
-def test_a_box_hides_what_the_lines_of_sight_say() -> None:
-    machine = posed_machine("hexapod")
-    nearest = int(np.argmin(np.linalg.norm(machine.A_base - FAR, axis=1)))
-    A, B = machine.A_base[nearest], machine.home.apply(machine.B_platform[nearest])
-    split = A + 0.3 * (B - A)
-    # The upper face of a wide box stands where the line of sight to that point passes.
-    height = (split + 0.5 * (FAR - split))[2]
-    middle = 0.5 * (FAR + split)
-    wall = box(np.array([middle[0], middle[1], height - 0.5]), (0.02, 2.0, 1.0))
-    seen = seen_at_home(wall)
-    [(start, _)] = seen.span[seen.leg == nearest]
-    assert start == pytest.approx(0.3, abs=0.03)  # the box is thick, the leg is round
-
-
 def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
     machine, here = posed_machine("hexapod"), posed("hexapod", 1)[0]
     least = list[float]()
@@ -80,34 +53,6 @@ def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
         np.testing.assert_array_equal(np.unique(seen.leg), np.flatnonzero(share >= 0.4))
         least += share[share > 0.0].tolist()
     assert min(abs(share - 0.4) for share in least) < 0.02
-
-
-def test_the_border_of_the_image_cuts_legs() -> None:
-    machine, camera = posed_machine("hexapod"), sample_camera()
-    here = posed("hexapod", 1)[0]
-    T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, 0.45]))  # the base is below the image
-    seen = legs_in_image(machine.legs, here, camera, T, least=0.0)
-    assert len(seen.leg)
-    assert np.all(seen.ends[..., 1] < camera.height)
-    assert seen.ends[..., 1].max() > camera.height - 20
-    assert shares(seen, machine.n_legs).max() < 0.95
-
-
-def test_a_thick_tube_covers_the_rod_in_it() -> None:
-    leg = posed_machine("3-rps").legs[0]
-    here = posed("3-rps", 1)[0]
-    T = look_at(np.array([1.0, -0.8, 0.3]), MIDDLE)
-    seen = legs_in_image(
-        (leg,),
-        PosedMachine(here.A[:1], here.B[:1], here.solids, here.vertices, here.faces),
-        sample_camera(),
-        T,
-    )
-    tube, rod = (next(c for c in leg.cylinders if c.link == part) for part in seen.part)
-    assert tube.radius > rod.radius
-    assert seen.span[0, 1] <= seen.span[1, 0]
-    length = float(np.linalg.norm(here.B[0] - here.A[0]))
-    assert rod.span(length)[0] < seen.span[0, 1] * length < rod.span(length)[1]
 
 
 def test_cameras_around_a_machine_see_its_legs_and_all_of_it() -> None:
