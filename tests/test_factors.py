@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from camera_sessions import CAMERAS, seen_corners
 from dense_fit import (
-    allowed,
     by_differences,
     jacobian,
-    jacobians,
     projected_move,
     residuals,
 )
@@ -41,9 +39,7 @@ from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
 from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.errors import DidNotConverge
-from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import EstimationProblem, linearize
-from legcal.estimation.solver import normal_equations
 from legcal.perception import board_adjustment, view_fit
 from legcal.perception.board_adjustment import adjust_board
 from legcal.perception.placement import Search, group_views
@@ -53,8 +49,6 @@ from legcal.vision.cylinder import outlines_of_axis
 
 CARRIED = ("delta", "delta-round-arms", "3-prs")  # whose joints at A move
 WITH_BODIES = "hexapod", "delta", "3-rps"
-K = 0.1
-LOSS = PseudoHuber(K**-0.5)
 CHOICES = {
     "hexapod": Choices(
         free=frozenset({"c1.fx", "c1.cy", "c1.k1"}),
@@ -262,38 +256,6 @@ def test_poses_follow_every_parameter_as_finite_differences_do(name: str) -> Non
     size = np.abs(expected).max(axis=0)
     assert np.all(size > 0.0)
     assert np.abs((J @ steps.T - expected) / size).max() < 1e-6
-
-
-@pytest.mark.parametrize(
-    ("name", "is_held"),
-    [("tricept", False), ("3-rpr", True)],
-)
-def test_a_step_is_that_of_the_whole_system_inside_the_constraints(
-    name: str, is_held: bool
-) -> None:
-    problem, state = _problem(name)
-    if is_held:
-        held = np.random.default_rng(1).normal(size=(problem.n_kept, 2))
-        problem = replace(problem, held_directions=np.linalg.qr(held)[0].T)
-    linear = linearize(problem, state)
-    H, g = np.zeros((problem.size, problem.size)), np.zeros(problem.size)
-    for kind, J in jacobians(problem, linear).items():
-        is_robust = kind != "priors" and problem.factor(kind).robust
-        r = linear.prior_r[:, None] if kind == "priors" else linear[kind].r
-        for ri, Ji in zip(r, J.reshape(*r.shape, problem.size), strict=True):
-            w, k = (1.0 / np.sqrt(1.0 + K * (ri @ ri)), K) if is_robust else (1.0, 0.0)
-            H += Ji.T @ (w * np.eye(len(ri)) - k * w**3 * np.outer(ri, ri)) @ Ji
-            g += w * Ji.T @ ri
-    N = allowed(problem, state)
-    assert N.shape[1] == problem.n_unknowns - len(problem.held_directions)
-    inside = N.T @ H @ N
-    scale = 1.0 / np.sqrt(np.diag(inside))
-    free = np.linalg.solve(scale[:, None] * inside * scale, scale * (N.T @ g))
-    expected = -N @ (scale * free)
-    step, predicted = normal_equations(problem, state, linear, LOSS).step(0.0)
-    assert predicted == pytest.approx(-0.5 * g @ expected, rel=1e-6)
-    wrong = step - expected
-    assert wrong @ H @ wrong < 1e-10 * predicted
 
 
 def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> None:

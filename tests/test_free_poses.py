@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
 from layouts import Layout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
-from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
+from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
 from outline_sessions import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
@@ -20,7 +19,6 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
-from legcal.descriptions.new_model import create_model
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry.motions import look_at, pose_distance
 from legcal.geometry.types import Array
@@ -28,7 +26,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
-from legcal.perception.free_poses import find_free_poses, require_standing_joints
+from legcal.perception.free_poses import find_free_poses
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
 from legcal.simulation.dataset import simulate
@@ -262,14 +260,6 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     }
 
 
-def five_carriages(folder: Path) -> Machine:
-    """A Hexaglide that has lost a carriage, so that its motors leave a freedom."""
-    table = yaml.safe_load((ROOT / "models/tables/hexaglide.yaml").read_text()) | {"type": "5-PSS"}
-    del table["actuators"]["rail6"], table["base_joints"][5], table["platform_joints"][5]
-    (folder / "five.yaml").write_text(yaml.safe_dump(table))
-    return create_model(read_table(folder / "five.yaml"), folder).machine
-
-
 @pytest.mark.system
 def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
     tmp_path: Path,
@@ -322,13 +312,6 @@ def test_a_page_to_click_on_is_written_where_no_image_can_be_searched(
     said = [one.what for one in found.findings if one.check == "legs"]
     assert any("view c2" in what and "landmarks.csv" in what for what in said)
     assert "data-place" in (tmp_path / "found" / "index.html").read_text()
-
-
-def test_images_are_not_searched_where_neither_poses_nor_base_joints_are_known(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(NotIdentifiable, match=r"joints at A that move.*5 motors.*observations"):
-        require_standing_joints(five_carriages(tmp_path))
 
 
 def test_no_images_are_kept_aside_where_readings_give_no_poses(

@@ -15,7 +15,7 @@ from legcal.geometry.lines import (
     normal_basis,
 )
 from legcal.geometry.motions import frame_on_points, motion_of, product
-from legcal.geometry.rotations import nearest_rotation, roll_pitch_yaw, rotation_between, turned
+from legcal.geometry.rotations import nearest_rotation, roll_pitch_yaw
 from legcal.geometry.types import Array
 
 FAST = settings(deadline=None, max_examples=25)
@@ -75,21 +75,6 @@ def test_roll_pitch_and_yaw_turn_about_fixed_axes_at_any_pitch(seed: int, pitch:
     R = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
     again = Rotation.from_euler("xyz", roll_pitch_yaw(R)).as_matrix()
     np.testing.assert_allclose(again, R, atol=2e-15)
-
-
-@FAST
-@given(SEEDS)
-def test_small_turns_are_those_of_their_rotation_vector(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    R, w = Rotation.random(rng=rng).as_matrix(), 1e-4 * rng.normal(size=3)
-    found = turned(R, w)
-    np.testing.assert_allclose(found, Rotation.from_rotvec(w).as_matrix() @ R, atol=1e-11)
-    np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-15)
-    one, other = directions(seed, 2)
-    for end in (other, one, -one):
-        turn = rotation_between(one, end)
-        np.testing.assert_allclose(turn.apply(one), end, atol=1e-12)
-        assert turn.magnitude() == pytest.approx(np.arccos(np.clip(one @ end, -1, 1)), abs=1e-7)
 
 
 @FAST

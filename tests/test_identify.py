@@ -5,12 +5,10 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from command_line import run
 from hexapod_example import HEXAPOD
 from rich.console import Console
@@ -140,23 +138,6 @@ def test_a_dataset_with_a_board_is_judged_with_it() -> None:
     found = identifiability_of_dataset(with_board)
     assert found.board
     assert found.conditions[0].needed is False
-
-
-def test_the_legs_of_a_datasets_views_count(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    entry = yaml.safe_load((HEXAPOD / "dataset.yaml").read_text())
-    entry["mechanism"] = str((HEXAPOD / entry["mechanism"]).resolve())
-    for view in entry["views"].values():
-        view["legs"] = ["leg1", "leg2"]
-        (tmp_path / view["camera"]).write_bytes((HEXAPOD / view["camera"]).read_bytes())
-    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(entry))
-    table = entry["measurements"]
-    (tmp_path / table).write_bytes((HEXAPOD / table).read_bytes())
-    assert run(monkeypatch, "identify", tmp_path, "--json") == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["views"] == [["leg1", "leg2"]] * 3
-    assert not document["paper"]["ok"]
 
 
 def test_choices_determine_what_they_say_and_no_more() -> None:

@@ -222,19 +222,6 @@ def test_remedies_were_tried_and_are_true() -> None:
     assert report("hexapod", (*HALVES, (1, 2, 3)), 2).full.rank == 30
 
 
-def test_the_platform_is_predicted_as_the_whole_covariance_says() -> None:
-    """sigma of the platform: the motion by parameters times the inverse of their information."""
-    analysis = Analysis(planned_session(model("hexapod"), VIEWS[0]))
-    by_metres, root = analysis.motion.by_metres, analysis.information
-    assert by_metres is not None
-    covariance = by_metres @ np.linalg.inv(root.T @ root) @ np.swapaxes(by_metres, 1, 2)
-    found = report("hexapod", VIEWS[0]).platform_sigma
-    assert found is not None
-    variances = np.einsum("kii->ki", covariance)
-    assert found.dE_rad == pytest.approx(np.sqrt(variances[:, :3].sum(axis=1).mean()), rel=1e-3)
-    assert found.dX_m == pytest.approx(np.sqrt(variances[:, 3:].sum(axis=1).mean()), rel=1e-3)
-
-
 # Information
 
 

@@ -28,7 +28,6 @@ from legcal.machine.model import readings_at
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import geometries
 from legcal.machine.picture import draw_machine
-from legcal.report.calibration import accuracy_table
 from legcal.report.machine import inspect_table
 
 
@@ -126,24 +125,12 @@ def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path:
     assert 0 < n < 6
     assert len(off) == 2 * n  # both views show every pose
     assert len(found.displacement) == document["poses"] == 6 - n
-    assert {rows[k]["pose"] for k in everything if k not in off}.isdisjoint(
-        rows[k]["pose"] for k in off
-    )
-    swapped = compared(everything, made.truth_path, other)
-    assert [row - 1 for row in swapped.unreached] == off
-    shown = _printed(accuracy_table(found))
-    assert f"{n} of 6 poses are left out" in shown
-
     rest = compared([k for k in everything if k not in off], other, made.truth_path)
     assert rest.document()["left_out"] == 0
     np.testing.assert_allclose(rest.displacement, found.displacement, atol=1e-9)
     with pytest.raises(DidNotConverge, match="no row whose readings both reach") as refusal:
         compared(off, other, made.truth_path)
     assert refusal.value.exit_code == 1
-    (short, *legs) = truth.legs
-    shorter_than_nothing = replace(truth, legs=(replace(short, q0=-1.0), *legs))
-    with pytest.raises(DidNotConverge, match="no row whose readings both reach"):
-        evaluate(shorter_than_nothing, truth, dataset=made.folder)
 
 
 def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good_home(
@@ -197,23 +184,6 @@ def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
         assert run(monkeypatch, "inspect", model, "--picture", place) == 2
         assert word in capsys.readouterr().err
     assert svg.read_text() == "mine"
-
-
-@pytest.mark.parametrize("in_page", [True, False])
-@pytest.mark.parametrize("model", ["hexapod", "delta"])
-def test_the_legend_of_a_drawing_is_not_cut(model: str, in_page: bool) -> None:
-    machine = load_mechanism(model)
-    root = etree.fromstring(draw_machine(machine, in_page=in_page).markup())
-    width, height = (float(root.get(side, "nan")) for side in ("width", "height"))
-    texts = list(root.iter("{http://www.w3.org/2000/svg}text"))
-    first = next(k for k, text in enumerate(texts) if str(text.text).startswith("Rings: "))
-    legend = [str(text.text) for text in texts[first:]]
-    letter = 6.2  # width, at least [px]
-    assert max(len(line) for line in legend) * letter < width - 12.0
-    assert max(float(text.get("y", "nan")) for text in texts[first:]) < height - 3.0
-    said = " ".join(legend).replace("\N{NO-BREAK SPACE}", " ")
-    assert f"(base{machine.at_zero}) and R_e (platform)." in said
-    assert all(f"{j} {name}" in said for j, name in enumerate(machine.leg_names, 1))
 
 
 def test_hostile_names_do_nothing_in_a_terminal(

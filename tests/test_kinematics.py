@@ -13,17 +13,15 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.configurations import Configurations, random_configurations
-from legcal.machine.equations import pose_equations
 from legcal.machine.kinematics import (
     Follower,
-    follow,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
 )
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, joint_values, slider_columns, vectors_A_to_B
+from legcal.machine.model import Machine, slider_columns, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
 DRAWN = 5
@@ -38,13 +36,6 @@ def drawn_of(name: str) -> Configurations:
 @pytest.fixture(scope="module", params=OF_EACH_KIND)
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
-
-
-def free_motions(machine: Machine, configuration: Array) -> Array:
-    """Return a basis of the motions of the closed chain, (nv, n)."""
-    jacobian = machine.chain.linearize(configuration)[1]
-    values, right = np.linalg.svd(jacobian)[1:]
-    return np.asarray(right[int(np.sum(values > 1e-7)) :].T)
 
 
 def without_a_motor(name: str) -> Machine:
@@ -97,28 +88,6 @@ def test_forward_kinematics_inverts_inverse_kinematics_from_any_start(name: str)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
-def test_closed_forms_have_the_derivatives_of_the_closures(name: str) -> None:
-    machine, drawn = machine_of(name), drawn_of(name)
-    columns = slider_columns(machine, machine.motors)[1]
-    for configuration, T in zip(drawn.configurations[:3], drawn.poses[:3], strict=True):
-        motions = free_motions(machine, configuration)
-        local = machine.chain.twist(machine.base, machine.platform) @ motions
-        R = T.rotation.as_matrix()
-        twist = np.concatenate([R @ local[3:], R @ local[:3]])  # as the legs' equations have it
-        q = joint_values(machine, configuration)[list(machine.motors)]
-        at = q[None] if machine.actuators else None
-        found = pose_equations(machine.legs, R[None], T.translation[None], q=at)
-        rates = found.by_pose[0] @ twist
-        if machine.actuators:  # rods keep their lengths
-            assert np.abs(rates + found.by_q[0] @ motions[columns]).max() < 1e-9
-            continue
-        assert np.abs(rates[~found.measured]).max(initial=0.0) < 1e-9  # no constraint is broken
-        signs = machine.sign[list(machine.motors)]
-        np.testing.assert_allclose(
-            rates[found.measured], signs[:, None] * motions[columns], atol=1e-9
-        )
-
-
 @pytest.mark.parametrize("name", ["hexapod", "3-upu"])  # closed by points, and by frames
 def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: str) -> None:
     chain = machine_of(name).chain
@@ -137,35 +106,6 @@ def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: 
 
 
 # --- the same machine in other trees, far from home ---------------------------------------------
-
-
-def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
-    """Return a layout whose spherical joints turn anywhere, with the same axes in every tree."""
-    legs = [
-        LegLayout(seed=10 * seed + j, flip_axes=True, hung=hung, sphere=sphere) for j in range(6)
-    ]
-    return Layout(tuple(legs))
-
-
-@pytest.mark.parametrize(
-    ("leg_type", "seed"),
-    [("SS", 2), pytest.param("US", 6, marks=pytest.mark.system)],
-)
-def test_random_readings_give_the_same_poses_in_every_tree(
-    leg_type: str, seed: int, tmp_path: Path
-) -> None:
-    machine = of_types([leg_type] * 6, seed=seed)
-    cut = load_mechanism(write_machine(tmp_path / "cut", machine, _square(seed)))
-    layout = _square(seed, hung="platform", sphere=False)
-    other = load_mechanism(write_machine(tmp_path / "other", machine, layout))
-    columns = slider_columns(other, other.motors)[0]
-    drawn = random_configurations(cut, 8, 1)
-    for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        found = forward_kinematics(other, q)
-        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
-    closed = follow(other, other.home_configuration, q)
-    assert np.abs(other.chain.residual(closed)).max() < 1e-12
-    np.testing.assert_allclose(closed[columns], q, rtol=0.0, atol=1e-12)
 
 
 def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:

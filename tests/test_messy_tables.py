@@ -12,7 +12,6 @@ from legcal.calibration.location.tool_poses import read_tool_poses
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description, assemble
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
-from legcal.descriptions.table import read_columns
 from legcal.errors import ModelError
 from legcal.machine.kinematics import forward_kinematics_many
 from legcal.machine.model import Machine, readings_at
@@ -78,8 +77,6 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
              "\n" + ";mm" * 10, "380.0", "500.0", "28", "16", leg="{}"), (14, 8)),
     "cylinder and side": (
         points("Joint,X (mm),Y (mm),Z (mm)", "Cylinder {} bottom", "Cylinder {} top"), ()),
-    "unit after a slash": (
-        points("Gelenk;x/mm;y/mm;z/mm", "Gelenk {} unten", "Gelenk {} oben"), ()),
     "units in cells": (
         wide("leg,bx,by,bz,px,py,pz,min length,max length,rod diameter,tube diameter",
              "380 mm", "500 mm", "16 mm", "28 mm", leg="{}", mark=" mm"), (14, 8)),
@@ -89,8 +86,6 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
         "Stand Mai;;;;;;;;;;\n;Boden;;;Plattform;;;Länge min;Länge max;Ø Rohr;Ø Stange\n"
         + wide("Bein;X;Y;Z;X;Y;Z;;;;", "380", "500", "28", "16", leg="{}")
         .replace("\n", "\n;mm;mm;mm;mm;mm;mm;mm;mm;mm;mm\n", 1), (14, 8)),
-    "title of two cells": (
-        wide("Projekt: Hexapod;;;Datum: 3.2.2026;;;\n" + SIX.format("B", "P")), ()),
     "line below": (wide(SIX.format("b", "p")) + "gemessen mit Messschieber;;;;;\n", ()),
     "metres and millimetres": (
         wide("leg,base x [m],base y [m],base z [m],platform x [m],platform y [m],platform z [m],"
@@ -110,11 +105,7 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
         (14, 8)),
     "no headings": (points("", "Boden{}", "Plattform{}"), ()),
     "letters": (wide("bx,by,bz,px,py,pz"), ()),
-    "letters a and b": (wide("xa,ya,za,xb,yb,zb"), ()),
-    "units in names": (wide("base_x_mm,base_y_mm,base_z_mm,top_x_mm,top_y_mm,top_z_mm"), ()),
     "one row": (one_row("B", "P"), ()),
-    "one row of A and B": (one_row("A", "B"), ()),
-    "points A and B": (points(POINTS, "A{}", "B{}"), ()),
     "platform first": ("\n".join([POINTS, *B_AND_P.splitlines()[:0:-1]]), ()),
     "points by side": (points(POINTS, "Base joint {}", "Platform joint {}"), ()),
 }  # fmt: skip
@@ -214,17 +205,6 @@ def test_other_workbooks_are_refused(content: bytes, tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(ModelError, match=r"workbook.*save the sheet as CSV"):
         described(path, "mm", ())
-
-
-def test_axes_of_joints_are_no_coordinates_of_their_centres(tmp_path: Path) -> None:
-    path = tmp_path / "own.csv"
-    header = "type," + ",".join(f"{name}_{x}" for name in ("base_axis", "base") for x in "xyz")
-    joints = [(0, 1, 0, 100, 0, 0), (-0.866, -0.5, 0, -50, 86, 0), (0.866, -0.5, 0, -50, -86, 0)]
-    rows = [f"RPS,{','.join(map(str, one))},{one[3] / 2},{one[4] / 2},0" for one in joints]
-    path.write_text("\n".join([f"{header},platform_x,platform_y,platform_z", *rows]))
-    found = read_columns(path, "mm")
-    assert found["base_axes"] == [list(one[:3]) for one in joints]
-    assert found["base_joints"] == [list(one[3:]) for one in joints]
 
 
 @pytest.mark.parametrize("mark", [";", " "])

@@ -304,21 +304,6 @@ def test_base_platform_and_legs_are_taken_from_the_bodies(
 # --- the loaded machine -------------------------------------------------------------------------
 
 
-def test_the_shipped_hexapod_loads_by_name_by_yaml_and_by_urdf() -> None:
-    for model in ("hexapod", SHIPPED_YAML, SHIPPED_URDF):
-        machine = load_mechanism(model)
-        assert machine.name == "hexapod"
-        assert machine.leg_names == tuple(f"leg{j}" for j in range(1, 7))
-        assert {leg.type for leg in machine.legs} == {"SPU"}
-        assert machine.frame_legs == (0, 2, 4)
-        assert machine.diagnostics == ()
-        np.testing.assert_allclose(machine.q0, 0.345, atol=1e-15)
-        np.testing.assert_allclose(machine.legs[0].travel, (-0.004, 0.144))
-        assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.01}
-    centre = load_mechanism("tricept").legs[3]
-    assert {(c.side, c.radius) for c in centre.cylinders} == {("base", 0.04), ("platform", 0.03)}
-
-
 def test_legs_may_be_reordered_and_a_machine_pickled() -> None:
     machine = load_mechanism("hexapod")
     names = ("leg3", "leg1", "leg2", "leg6", "leg5", "leg4")

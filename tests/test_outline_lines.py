@@ -10,6 +10,7 @@ from legcal.perception.blocks import (
     TILT_BIAS,
     BlockLine,
     Blocks,
+    fit_blocks,
     fit_lines,
 )
 from legcal.perception.limb import (
@@ -277,13 +278,6 @@ def test_limbs_are_where_the_background_ends_not_where_stripes_begin(start: floa
     np.testing.assert_allclose(found, -start, atol=0.5)
 
 
-def test_lone_steps_are_limbs_whatever_their_width_should_be() -> None:
-    found = limb_shifts(
-        rod_picture(-9.0), UPRIGHT, rod_edges(1.5), 0.5, np.array([0.0]), np.array([2.0])
-    )
-    np.testing.assert_allclose(found, -1.5, atol=0.5)
-
-
 def test_surfaces_that_reflect_stripes_are_told_from_matte_ones() -> None:
     r = np.linspace(0.0, 0.7, 50)
     stripe = 20.0 + 100.0 * np.exp(-(((r - 0.35) / 0.12) ** 2))
@@ -294,3 +288,29 @@ def test_surfaces_that_reflect_stripes_are_told_from_matte_ones() -> None:
     ]
     assert max(polish[:2]) < -1.0
     assert polish[2] > 4.0
+
+
+# Cameras that encode light.
+
+
+def place_found(gamma_of_camera: float, gamma_told: float, dark: float, bright: float) -> float:
+    """Return where an outline is found that lies 0.15 px inside the line [px]."""
+    rng = np.random.default_rng(1)
+    d = rng.uniform(-3.5, 3.5, (150, 120)).astype(np.float32)
+    step = ndtr((d - 0.15) / 0.6)
+    light = dark + (bright - dark) * step
+    grey = 255.0 * light ** (1.0 / gamma_of_camera) + 0.5 * rng.standard_normal(d.shape)
+    levels, weight = to_light(grey.astype(np.float32), np.ones(d.shape, np.bool_), gamma_told)
+    moved = np.zeros(len(d))
+    for _ in range(5):
+        at = d - moved[:, None].astype(np.float32)
+        sums = PixelBins.of(at, weight, 0.6).sums(levels)
+        edge = np.zeros(len(d), dtype=np.intp)
+        moved += fit_blocks(sums, np.array([14.0]), np.array([0.6]), edge).shift
+    return float(np.median(moved))
+
+
+@pytest.mark.parametrize(("dark", "bright"), [(0.02, 0.7), (0.7, 0.02), (0.1, 0.2)])
+@pytest.mark.parametrize("gamma", [1.0, 1.8, 2.2])
+def test_outline_is_where_the_light_has_its_edge(gamma: float, dark: float, bright: float) -> None:
+    assert place_found(gamma, gamma, dark, bright) == pytest.approx(0.15, abs=0.01)

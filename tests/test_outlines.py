@@ -263,30 +263,6 @@ def test_a_mirrored_image_shows_mirrored_outlines_at_its_border_too() -> None:
     np.testing.assert_array_equal(found.used, [False, True])
 
 
-def test_tube_and_rod_are_two_parts() -> None:
-    cam = camera()
-    whole = bar(0.0, 0.03, 150.0)
-    middle = 0.5 * (whole.A + whole.B)
-    tube, rod = Bar(whole.A, middle, 0.014, 150.0), Bar(middle, whole.B, 0.009, 150.0)
-    image = render(cam, [tube, rod], 30.0, blur=0.5, supersample=3).astype(np.uint8)
-    length = float(np.linalg.norm(whole.B - whole.A))
-    parts = (
-        Cylinder("tube", 0.014, "base", 0.0, 0.5 * length),
-        Cylinder("rod", 0.009, "platform", -0.8 * length, 0.0),
-    )
-    A, B, wanted = whole.A[None, None], whole.B[None, None], np.ones((1, 1), dtype=np.bool_)
-    grey, m = image.astype(np.float32), measurements(cam, 1)
-    search = Search(lambda row: grey, m, A, B, [parts], wanted, ["leg1"], length)
-    found, _ = measure_outlines(search, Placement(A, B, (IDENTITY,)), [0])
-    assert found.part == ("rod", "rod", "tube", "tube")
-    assert np.all(found.used), found.reason
-    for i, one in ((slice(0, 2), rod), (slice(2, 4), tube)):
-        u = (one.B - one.A) / np.linalg.norm(one.B - one.A)
-        h = outlines_of_axis(u, one.A, one.radius)
-        offset = cam.line_offset(h[:, None], cam.undistort(found.ends[i]))
-        assert np.abs(offset).max() < 0.15
-
-
 def test_an_edge_stands_alone_only_without_a_rival() -> None:
     near, far = np.array([[0.0, 0.5], [1.0, 1.5]]), np.array([[0.0, 0.5], [9.0, 8.0]])
     cases = (

@@ -35,7 +35,6 @@ from legcal.paper.least_squares import (
     derivatives,
     evaluated,
     solve_least_squares,
-    undetermined,
 )
 
 
@@ -80,13 +79,6 @@ def test_an_outlier_loses_its_weight() -> None:
     clean, wrong = (solve_least_squares(_line(y), weighted=True).x for y in (0.0, 0.1))
     plain = solve_least_squares(_line(0.1)).x
     assert np.abs(wrong - clean).max() < 0.02 * np.abs(plain - clean).max()
-
-
-def test_a_direction_that_no_residual_shows_is_undetermined() -> None:
-    x = ca.SX.sym("x", 3)
-    residuals = ca.vertcat(x[0] - 1.0, x[1] + x[2], 2.0 * (x[1] + x[2]) - 1.0)
-    problem = _problem("A sum", x, residuals, [0.0, 0.0, 0.0])
-    assert undetermined(problem.jacobian(np.ones(3))).tolist() == [False, True, True]
 
 
 def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:

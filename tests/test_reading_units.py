@@ -116,7 +116,6 @@ def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_t
     noisy = SimulationSettings(Level.OUTLINES, readings=Spread(sigma, Distribution.NORMAL))
     ways: list[Callable[[], object]] = [
         lambda: load(sigma),
-        lambda: load(dict.fromkeys(machine.motor_names, sigma)),
         lambda: legcal.plan(machine, encoder_sigma=sigma),
         lambda: legcal.simulate(machine, tmp_path / "out", noisy),
     ]

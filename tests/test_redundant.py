@@ -1,7 +1,6 @@
 """More motors than freedoms: ranks, poses of least squares, errors of parameters, refusals."""
 
 import dataclasses
-import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -182,17 +181,9 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     simulate(machine.yaml_path, folder, settings(poses=6, shared_poses=True))
     calibration = legcal.calibrate(folder, output=tmp_path / "result")
     judged = calibration.solution.quality.redundant_readings
-    written = json.loads((tmp_path / "result/result.json").read_text())["residuals"]
     assert judged is not None
-    assert written["redundant_readings"] == {
-        "rms": pytest.approx(judged.rms),
-        "rms_expected": pytest.approx(judged.rms_expected),
-        "rms_m": pytest.approx(judged.rms_m),
-        "wrong": [],
-    }
     assert 0.0 < judged.rms_expected < 1.0
     assert judged.rms == pytest.approx(judged.rms_expected, rel=0.5)
-    assert f"{judged.rms:.2f} of their standard deviations, rms (expected" in calibration.summary()
     truth = next((folder / "truth/models").glob("*.yaml"))
     before, after = (
         legcal.evaluate(path, truth, dataset=folder).displacement

@@ -16,6 +16,9 @@ from browser import PATIENCE, chromium
 from browser import errors as _errors
 from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.wait import WebDriverWait
 
 import legcal
 from legcal.calibration.detection import Detection, Examination
@@ -103,8 +106,6 @@ def test_sliders_move_the_machine(page: Any) -> None:
 
 
 def test_a_point_of_a_chart_tells_its_outline_and_leads_to_it(page: Any) -> None:
-    from selenium.webdriver.common.action_chains import ActionChains
-
     place = """const charts = document.querySelector(".charts");
     const { links } = JSON.parse(charts.querySelector("script").textContent);
     const svg = charts.querySelectorAll("svg")[2];
@@ -127,23 +128,6 @@ def test_a_point_of_a_chart_tells_its_outline_and_leads_to_it(page: Any) -> None
     pointer.click()
     actions.perform()
     assert "#outline-" in page.current_url
-
-
-def test_tables_sort_by_numbers_and_back(page: Any) -> None:
-    button = page.find_element("xpath", "//*[@id='parameters']//th/button[text()='change']")
-
-    def column() -> list[float]:
-        cells = page.find_elements(
-            "css selector", "#parameters > div:nth-of-type(1) td.n:nth-child(5)"
-        )
-        return [float(one.get_dom_attribute("data-value")) for one in cells]
-
-    before = column()
-    page.execute_script("arguments[0].click()", button)
-    assert column() == sorted(before) != before
-    page.execute_script("arguments[0].click()", button)
-    assert column() == sorted(before, reverse=True)
-    assert button.find_element("xpath", "..").get_dom_attribute("aria-sort") == "descending"
 
 
 # Correcting outlines on the page of ``legcal detect``.
@@ -182,8 +166,6 @@ class Editor:
 
     def open(self, image: int) -> None:
         """Open the editor at an image."""
-        from selenium.webdriver.support.wait import WebDriverWait
-
         button = self.browser.find_element("css selector", f"figcaption [data-edit='{image}']")
         self.browser.execute_script("arguments[0].click()", button)
         shown = (
@@ -211,9 +193,6 @@ class Editor:
 
     def press(self, *keys: str) -> None:
         """Press keys; one of several words, as "Shift ArrowDown", holds the first."""
-        from selenium.webdriver.common.action_chains import ActionChains
-        from selenium.webdriver.common.keys import Keys
-
         named = {"Ctrl": Keys.CONTROL, "Shift": Keys.SHIFT, "Esc": Keys.ESCAPE,
                  "Left": Keys.ARROW_LEFT, "Down": Keys.ARROW_DOWN}  # fmt: skip
         actions = ActionChains(self.browser)
@@ -228,8 +207,6 @@ class Editor:
 
     def drag(self, end: int, dx: float, dy: float, *, to_the_end: bool = True) -> None:
         """Drag an end by pixels of the image, enlarged."""
-        from selenium.webdriver.common.action_chains import ActionChains
-
         self.press(str(end))
         handle = self.find(f".handle[data-end='{end - 1}'] circle")
         held = ActionChains(self.browser).click_and_hold(handle)
@@ -237,8 +214,6 @@ class Editor:
         (held.release() if to_the_end else held).perform()
 
     def release(self) -> None:
-        from selenium.webdriver.common.action_chains import ActionChains
-
         ActionChains(self.browser).release().perform()
 
     def state(self, name: str) -> str:
@@ -341,8 +316,6 @@ class Placer:
         self.browser = browser
 
     def open(self, image: int) -> None:
-        from selenium.webdriver.support.wait import WebDriverWait
-
         button = self.browser.find_element("css selector", "[data-place]")
         self.browser.execute_script("arguments[0].click()", button)
         while self.shown() != image:
@@ -366,16 +339,12 @@ class Placer:
         return round(x), round(y)
 
     def click(self, px: Any) -> None:
-        from selenium.webdriver.common.action_chains import ActionChains
-
         actions = ActionChains(self.browser)
         pointer: Any = actions.w3c_actions.pointer_action
         pointer.move_to_location(*self.on_screen(px)).click()
         actions.perform()
 
     def drag(self, start: Any, end: Any) -> None:
-        from selenium.webdriver.common.action_chains import ActionChains
-
         actions = ActionChains(self.browser)
         pointer: Any = actions.w3c_actions.pointer_action
         pointer.move_to_location(*self.on_screen(start)).pointer_down()
@@ -393,8 +362,6 @@ class Placer:
 
     def until(self, script: str) -> Any:
         """Wait for what a script returns."""
-        from selenium.webdriver.support.wait import WebDriverWait
-
         return WebDriverWait(self.browser, PATIENCE).until(
             lambda _: self.browser.execute_script(script)
         )

@@ -23,7 +23,6 @@ from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.pages.document import page_html
 from legcal.perception.overlays import COLOURS
 from legcal.report.calibration_page import calibration_page
-from legcal.vision.cylinder import outlines_of_axis
 
 HOSTILE = "<script>alert(1)</script><b>\x1b[31m\u202e"
 
@@ -140,26 +139,6 @@ def test_the_map_of_the_workspace_agrees_with_the_models(example_run: Run) -> No
     assert platform is not None
     assert platform.workspace is not None
     assert np.nanmean(found.sigma) == pytest.approx(platform.workspace.sigma_dX_m, rel=0.1)
-
-
-def test_residuals_belong_to_their_outlines(example_run: Run) -> None:
-    # By what the fit predicts of each outline, made from the result in the order of the files.
-    calibration = example_run.calibration
-    solution, residuals = calibration.solution, calibration.residuals
-    o, m = solution.outlines, calibration.dataset.measurements
-    for k in range(0, len(residuals), 37):
-        i = int(residuals.index[k])
-        row, leg = int(o.row[i]), solution.legs[int(o.leg[i])]
-        v, pose = int(m.view[row]), int(m.pose[row])
-        T = solution.T_camera_Rb[v]
-        A, B = T.apply(leg.A), (T * solution.T_Rb_Re[pose]).apply(leg.B)
-        radius = solution.radii[int(o.leg[i]), o.part[i]]
-        u = (B - A) / np.linalg.norm(B - A)
-        h = outlines_of_axis(u, A, radius)[int(o.edge[i]) - 1]
-        ends = solution.cameras[v].undistort(o.ends[i])
-        off = solution.cameras[v].line_offset(h[None], ends)
-        # but for the edge biases that outlines share, which the residuals are without
-        assert np.abs(np.abs(off) - np.abs(residuals.offset[k])).max() < 0.08
 
 
 def test_hostile_names_are_harmless(example_run: Run, tmp_path: Path) -> None:

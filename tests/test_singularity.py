@@ -160,20 +160,3 @@ def test_readings_from_a_little_beyond_a_singularity_are_met_on_this_side(
     found = forward_kinematics(machine, inverse_kinematics(machine, beyond), start=here)
     sides = [np.sign(np.linalg.det(_lines(machine, T))) for T in (here, beyond, found)]
     assert sides[0] == -sides[1] == sides[2]
-
-
-def test_readings_of_long_travels_are_reached_in_the_mode_of_home_or_refused() -> None:
-    machine = machine_of("nategh-agheli")
-    lower, upper = np.array([leg.travel for leg in machine.legs]).T
-    home = np.sign(np.linalg.det(_lines(machine, machine.home)))
-    refused = 0
-    start = inverse_kinematics(machine, machine.home)
-    readings = start + 0.3 * (np.random.default_rng(1).uniform(lower, upper, (20, 6)) - start)
-    for q in readings:
-        try:
-            T = forward_kinematics(machine, q)
-        except DidNotConverge:
-            refused += 1
-            continue
-        assert np.sign(np.linalg.det(_lines(machine, T))) == home
-    assert 0 < refused < len(readings)

@@ -83,15 +83,6 @@ def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSes
     assert_exact(session, found)
 
 
-def test_an_axis_fixed_at_an_angle_stays_there() -> None:
-    session, name = machine_session("3-spr"), "leg1.platform_axis.2"
-    value = true_values(session)[name]
-    found = fitted(session, fixed_at({name: value}))
-    assert found.estimates.values[name] == pytest.approx(value, abs=1e-12)
-    assert found.estimates.status[name] == "fixed"
-    assert_exact(session, found, 1e-7)
-
-
 def test_a_tight_prior_pins_and_a_loose_one_adds_information(noisy: MachineSession) -> None:
     plain = fitted(noisy)
     at = plain.estimates.names.index("leg1.offset")

@@ -11,7 +11,6 @@ from legcal.geometry.types import Array, IntArray
 from legcal.simulation.observe import TableNoise, table_of, table_of_lines
 from legcal.vision.cylinder import (
     angles_of_direction,
-    direction_derivative,
     direction_of_angles,
 )
 
@@ -41,16 +40,6 @@ def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z(
     u = direction_of_angles(psi, theta)
     assert np.allclose(u, turns.apply([0.0, 1.0, 0.0]), atol=1e-15)
     assert np.allclose(angles_of_direction(u), (psi, theta), atol=1e-14)
-
-
-def test_the_derivative_of_the_direction_is_that_of_finite_differences() -> None:
-    rng = np.random.default_rng(1)
-    psi, theta = rng.uniform(-1.5, 1.5, 20), rng.uniform(-3.1, 3.1, 20)
-    step = 1e-6
-    by_psi = direction_of_angles(psi + step, theta) - direction_of_angles(psi - step, theta)
-    by_theta = direction_of_angles(psi, theta + step) - direction_of_angles(psi, theta - step)
-    found = np.stack([by_psi, by_theta], axis=-1) / (2.0 * step)
-    assert np.allclose(direction_derivative(psi, theta), found, atol=1e-9)
 
 
 def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:

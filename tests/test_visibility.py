@@ -14,7 +14,7 @@ from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.simulation.cameras import cameras_around
-from legcal.simulation.observe import legs_in_image, shares, take_images
+from legcal.simulation.observe import legs_in_image, shares
 from legcal.simulation.solids import PosedMachine, Solid, dressed, pose_machine, solids_of
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
@@ -53,22 +53,6 @@ def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
         np.testing.assert_array_equal(np.unique(seen.leg), np.flatnonzero(share >= 0.4))
         least += share[share > 0.0].tolist()
     assert min(abs(share - 0.4) for share in least) < 0.02
-
-
-def test_cameras_around_a_machine_see_its_legs_and_all_of_it() -> None:
-    name = "tricept"
-    machine, camera = posed_machine(name), sample_camera()
-    posed_machines = posed(name, 3, bare=False)
-    views, _ = cameras_around(machine, posed_machines, {"c1": camera}, np.random.default_rng(1))
-    for m in posed_machines:
-        for view in views:
-            T = view.T_base_camera
-            inside = camera.project(T.inv().apply(m.vertices))
-            assert np.all(inside > 0.0)
-            assert np.all(inside < [camera.width, camera.height])
-            assert not m.encloses(T.translation)
-    images = take_images(machine.legs, posed_machines, views, [range(len(posed_machines))], 1)
-    assert np.mean([len(images.seen(row)) for row in range(len(images))]) > 0.7 * machine.n_legs
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2)))
