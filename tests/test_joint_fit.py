@@ -3,6 +3,7 @@
 Nothing that does not matter shows in the result: the start, names and order, the unit of length.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -12,6 +13,7 @@ from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
     BOARD_SCALE,
     PINHOLE,
+    TRUTH,
     HexapodSession,
     MachineSession,
     corners_of,
@@ -26,26 +28,27 @@ from fit_sessions import (
     with_board,
 )
 
-from legcal.calibration.identify.identifiability import Analysis
-from legcal.calibration.identify.session import Session
+from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import (
     FittedLegs,
     RefinementSettings,
     Start,
     State,
+    start_from,
 )
 from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
+from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array
-from legcal.machine.leg import ARMS, ParameterId, radius_name
-from legcal.machine.parameters import parametrize
+from legcal.machine.leg import ARMS, ParameterId, point_like_legs, radius_name
 from legcal.simulation.observe import moved_outlines
 
 
@@ -184,47 +187,6 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
     is_length = np.array(session.legs.parametrization.units) == "m"
     largest = np.sqrt(np.diagonal(spread)[is_length].max())
     assert largest < 2.0 * np.abs(change[is_length]).max()
-
-
-def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Session:
-    """Return what was measured as the analysis of identifiability takes it."""
-    R, t = Frames.of(session.truth.T_Rb_Re)
-    m, cameras = session.measurements, session.truth.T_camera_Rb
-    return Session(
-        leg_names=legs.names,
-        legs=session.truth.legs,
-        frame_legs=legs.frame_legs,
-        parametrization=parametrize(legs.names, session.truth.legs, legs.frame_legs),
-        R=R,
-        t=t,
-        R_reached=R,
-        t_reached=t,
-        view=m.view,
-        pose=m.pose,
-        seen=np.ones((len(cameras), len(legs.names)), dtype=np.bool_),
-        board=np.zeros(len(cameras), dtype=np.bool_),
-        cameras=tuple(
-            replace(view, T_base_camera=T.inv()) for view, T in zip(m.views, cameras, strict=True)
-        ),
-        sigma_q=m.sigma_q,
-        unread=np.zeros((len(t), len(legs.names)), dtype=np.bool_),
-    )
-
-
-@pytest.mark.parametrize("name", ["3-rpr", "3-upu", "tricept"])
-def test_all_that_identify_calls_determined_is_estimated(name: str) -> None:
-    session = machine_session(name)
-    ranks = Analysis(session_as_identify_sees_it(session, session.legs)).full
-    open_to_identify = {p for direction in ranks.weak for p in direction.parameters}
-    assert ranks.rank == (15 if name == "3-upu" else ranks.of)
-    known = frozenset(true_values(session)) - set(session.legs.parametrization.names)  # radii
-    everything = session.legs, session.measurements, session.outlines
-    problem = build_fit(*everything, choices=Choices(fixed=known))
-    state = problem.begin(session.truth)
-    linear = linearize(problem, state)
-    held = undetermined_directions(problem, state, information(problem, state, linear))
-    assert len(held.directions) == ranks.of - ranks.rank
-    assert set(held.names) == open_to_identify
 
 
 def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array, Array]:
@@ -403,3 +365,110 @@ def test_a_fit_with_a_board_and_cameras_by_hand_is_exact_without_noise() -> None
     assert np.linalg.norm(apart.translation) < 1e-8
     assert solution.estimates.values[BOARD_SCALE] == pytest.approx(1.0, abs=1e-8)
     assert solution.estimates.status[BOARD_SCALE] == "estimated"
+
+
+# Refusals
+
+
+@pytest.fixture(scope="module")
+def session() -> HexapodSession:
+    return irregular_hexapod(6, legs_seen=5)
+
+
+def at_truth(session: HexapodSession) -> Start:
+    """Return a start at the truth, poses by the readings."""
+    legs, poses = point_like_legs(TRUTH), session.T_Rb_Re
+    m, cameras = session.measurements, session.T_camera_Rb
+    return start_from(legs, m, session.legs, cameras, poses, "nominal")
+
+
+Change = Callable[[Outlines], Outlines]
+
+
+def with_covariance(o: Outlines) -> Outlines:
+    covariance = o.covariance.copy()
+    covariance[3] = [[0.01, 0.02], [0.02, 0.01]]
+    return replace(o, covariance=covariance)
+
+
+def scattered(o: Outlines) -> Outlines:
+    by = np.random.default_rng(0).uniform(-15.0, 15.0, (len(o), 2))
+    return moved_outlines(o, PINHOLE, by)
+
+
+def measured_with_two_gammas(o: Outlines) -> Outlines:
+    return replace(o, gamma=np.where(np.arange(len(o)) == 5, 2.2, 1.0), by_gamma=np.ones(len(o)))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "found"),
+    [
+        (lambda o: replace(o, used=o.row < 0), NotIdentifiable, "0 outlines and 108 readings"),
+        (
+            lambda o: replace(o, edge=3 - o.edge),
+            DidNotConverge,
+            "right legs and edges|outlines rejected",
+        ),
+        (scattered, DidNotConverge, r"outlines rejected and an error of \d+.\d px"),
+        (with_covariance, DatasetError, r"leg\d in c1_000.png .* not positive definite"),
+        (lambda o: replace(o, part=("tube", *o.part[1:])), DatasetError, r"leg\d\.tube"),
+        (measured_with_two_gammas, DatasetError, r"view c1 could not be used.*1 and 2\.2"),
+    ],
+    ids=["none", "swapped edges", "scattered", "covariance", "part", "gammas"],
+)
+def test_outlines_that_cannot_be_fitted_are_refused(
+    session: HexapodSession, change: Change, error: type[LegcalError], found: str
+) -> None:
+    m = session.measurements
+    camera = replace(PINHOLE, gamma_is_given=False)
+    m = replace(m, views=tuple(replace(view, camera=camera) for view in m.views))
+    with pytest.raises(error, match=found):
+        refine(session.legs, m, change(session.outlines), disturbed_start(session))
+
+
+@pytest.mark.parametrize(
+    ("few", "found"),
+    [
+        (
+            irregular_hexapod(1, n_views=2),
+            r"2 images with 16 outlines and 12 readings give \d+ equations",
+        ),
+        (irregular_hexapod(10), r"\d+ of \d+ combinations .* with a prior"),
+    ],
+    ids=["two images", "one leg"],
+)
+def test_images_that_do_not_determine_the_parameters_are_refused(
+    few: HexapodSession, found: str
+) -> None:
+    shown = few.outlines
+    if "prior" in found:
+        shown = noisy_outlines(few, np.random.default_rng(0))
+        shown = replace(shown, used=shown.leg == 0)
+    with pytest.raises(NotIdentifiable, match=found):
+        refine(few.legs, few.measurements, shown, at_truth(few))
+
+
+def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
+    far = disturbed_start(session, joints=0.1, camera=0.5, angle=2.0)
+    with pytest.raises(DidNotConverge, match=r"still falls by|outlines rejected"):
+        refine(session.legs, session.measurements, session.outlines, far)
+    with pytest.raises(DidNotConverge, match=r"still falls|outlines rejected") as refused:
+        refine(session.legs, session.measurements, session.outlines, [far, far])
+    assert len(refused.value.problems) == 1
+    with pytest.raises(DidNotConverge, match="needs at least one"):
+        refine(session.legs, session.measurements, session.outlines, [])
+
+
+def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
+    session: HexapodSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = [replace(at_truth(session), label=label) for label in ("second", "first", "third")]
+    costs = {"first": 1.0, "second": 2.0, "third": 3.0}
+    unwatched = fit._first_minimum
+
+    def with_cost(problem: FitProblem, start: Start) -> object:
+        return replace(unwatched(problem, start), cost=costs[start.label])
+
+    monkeypatch.setattr(fit, "_first_minimum", with_cost)
+    found = refine(session.legs, session.measurements, session.outlines, starts)
+    assert found.start == "first"
