@@ -25,7 +25,6 @@ from legcal.simulation.observe import (
 )
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.cylinder import (
-    angles_of_direction,
     direction_of_angles,
 )
 
@@ -126,7 +125,6 @@ def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z(
     turns = Rotation.from_euler("xz", np.stack([psi, theta], axis=-1))
     u = direction_of_angles(psi, theta)
     assert np.allclose(u, turns.apply([0.0, 1.0, 0.0]), atol=1e-15)
-    assert np.allclose(angles_of_direction(u), (psi, theta), atol=1e-14)
 
 
 def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
@@ -147,19 +145,11 @@ def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
     )
 
 
-def test_the_simulator_has_its_own_way_to_the_table_and_it_leads_to_the_same() -> None:
+def test_the_table_of_a_line_leads_back_to_it() -> None:
     u, A = _random_lines(200, seed=3)
     u[:4] = [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1e-9, -1.0, 0.0], [1e-5, 1e-4, 1.0]]
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    M = A - u * (A[:, 1:2] / u[:, 1:2])  # the point of the line in the plane y = 0
-    psi, theta = angles_of_direction(u)
     found = table_of_lines(u, A)
-    turn = np.abs(found[:, 1] - theta)
-    assert np.abs(found[:, 0] - psi).max() < 1e-14
-    assert np.minimum(turn, 2.0 * np.pi - turn).max() < 1e-11  # near the optical axis
-    assert np.minimum(turn, 2.0 * np.pi - turn)[4:].max() < 1e-14
-    assert np.allclose(found[:, 2:], M[:, [0, 2]], rtol=1e-11, atol=1e-14)
-    # and both to the line that was there, by turning it back
     turns = Rotation.from_euler("xz", found[:, :2])
     assert np.allclose(turns.apply([0.0, 1.0, 0.0]), u, atol=1e-14)
     points = np.stack([found[:, 2], np.zeros(len(u)), found[:, 3]], axis=-1)
