@@ -10,7 +10,6 @@ from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.geometry.lines import (
     distance_to_line,
     moment,
-    nearest_point_to_line,
     nearest_point_to_origin,
     normal_basis,
 )
@@ -137,19 +136,6 @@ def test_eq01_the_moment_belongs_to_the_line_and_its_norm_is_the_distance(seed: 
     np.testing.assert_allclose(np.linalg.norm(moment(u, M), axis=1), sizes, atol=1e-12)
     np.testing.assert_allclose(np.sum(foot * u, axis=1), 0.0, atol=1e-12)
     np.testing.assert_allclose(distance_to_line(foot, u, M), 0.0, atol=1e-12)
-
-
-@FAST
-@given(SEEDS)
-def test_eq06_no_point_of_a_line_is_nearer_than_its_distance(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    P, M, N = rng.normal(size=(3, 3))
-    u, d = directions(seed, 2)
-    along = M + np.linspace(-5.0, 5.0, 101)[:, None] * u
-    assert np.linalg.norm(along - P, axis=1).min() >= distance_to_line(P, u, M) - 1e-12
-    nearest = nearest_point_to_line(u, M, d, N)  # of two lines
-    assert distance_to_line(nearest, u, M) < 1e-9 * (1.0 + np.linalg.norm(nearest))
-    assert distance_to_line(along, d, N).min() >= distance_to_line(nearest, d, N) - 1e-9
 
 
 @FAST

@@ -273,15 +273,6 @@ def test_estimation_knows_no_images_and_no_robot() -> None:
     }
 
 
-def test_geometry_knows_no_robot_and_no_camera() -> None:
-    assert {_room(other) for m in _of("geometry") for other in _reachable(m)} <= {
-        "errors",
-        "files",
-        "geometry",
-        "signals",
-    }
-
-
 def test_only_the_command_line_imports_the_simulation() -> None:
     method = set(ROOMS) - {"cli"}
     users = {m for m in _of(*method) if any(_room(o) == BESIDE for o in _reachable(m))}

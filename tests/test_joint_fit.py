@@ -299,7 +299,7 @@ def vector(found: Solution) -> Array:
     return np.concatenate([p.base_joints.ravel(), p.platform_joints.ravel(), p.offsets])
 
 
-def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
+def test_the_better_start_wins_and_between_equal_ones_the_first(
     small: HexapodSession,
 ) -> None:
     rng = np.random.default_rng(5)
@@ -310,11 +310,7 @@ def test_the_better_start_wins_and_is_named_and_between_equal_ones_the_first(
     for starts in ([good, bad], [bad, good]):
         found = refine(small.legs, *noisy, starts, settings)
         assert found.start == "nominal"
-        said = (*found.notes, *found.details)
-        assert any("the four steps" in note for note in said)
-        start = "Starting from the nominal model, the joint fit reached a cost of"
-        assert any(note.startswith(start) for note in found.details)
-        assert not any(note.startswith(start) for note in found.notes)
+        assert any("the four steps" in note for note in (*found.notes, *found.details))
     equal = replace(disturbed_start(small, seed=9), label="staged")
     assert refine(small.legs, *noisy, [good, equal]).start == "nominal"
     assert refine(small.legs, *noisy, [equal, good]).start == "staged"

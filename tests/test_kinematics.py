@@ -351,25 +351,6 @@ def _hexapod(A: Array, B: Array, home: RigidTransform) -> MachineSpec:
     return MachineSpec(tuple(legs), home)
 
 
-def test_a_planar_platform_is_singular_where_its_legs_meet_in_a_point() -> None:
-    machine = machine_of("3-rpr")
-    A, B = machine.A_base, machine.B_platform
-
-    def at(angle: float) -> RigidTransform:
-        turn = Rotation.from_rotvec([0.0, 0.0, angle])
-        return RigidTransform.from_components(A.mean(axis=0) - turn.apply(B.mean(axis=0)), turn)
-
-    angles = np.linspace(-np.pi, np.pi, 361)
-    measures = [singularity(machine, at(a)) for a in angles]
-    # both triangles are regular: legs meet in the centre where the platform's corners face them
-    best = float(angles[int(np.argmin(measures))])
-    lines = vectors_A_to_B(machine, at(best))[:, :2]
-    moments = A[:, 0] * lines[:, 1] - A[:, 1] * lines[:, 0]
-    assert min(measures) < 4e-3
-    assert abs(np.linalg.det(np.column_stack([lines, moments]))) < 2e-4
-    assert singularity(machine, at(best + 0.5 * np.pi)) > 0.1
-
-
 @pytest.mark.parametrize("constrained", [False, True])
 def test_the_measure_does_not_depend_on_size_or_frames(constrained: bool, tmp_path: Path) -> None:
     def machine(scale: float, shift: float, inside: float) -> MachineSpec:

@@ -219,11 +219,6 @@ def _unreachable() -> Located:
     return replace(hexapod, poses=replace(hexapod.poses, q=q))
 
 
-def _loose() -> Located:
-    hexapod = located("hexapod", 4)
-    return replace(hexapod, machine=replace(hexapod.machine, mobility=7))
-
-
 @pytest.mark.parametrize(
     ("spoiled", "options", "kind", "named"),
     [
@@ -233,7 +228,6 @@ def _loose() -> Located:
          ("these 10 poses",)),
         (_along_a_line, {}, NotIdentifiable, ("displaced in another direction",)),
         (lambda: _rows([0]), {}, NotIdentifiable, ("1 pose", "3 poses")),
-        (lambda: _rows([0] * 5), {}, NotIdentifiable, ("5 rows at 1 different reading",)),
         (lambda: _rows([0, 1, 2], oriented=False), {}, NotIdentifiable, ("4 poses", "positions")),
         (lambda: _position(np.copy, 20, oriented=np.arange(20) == 4), {}, NotIdentifiable,
          ("orientations of 20 rows", "--angle-sigma")),
@@ -244,7 +238,6 @@ def _loose() -> Located:
         (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
         (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
         (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),
-        (_loose, {}, LegcalError, ("the pose cannot be computed from readings",)),
         (lambda: _rows([0, 1, 2]), {"angle_sigma": 0.5}, UsageError, ("angle sigma", "0.5 rad")),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 0.0, float("inf"))}, UsageError,
          ("tool position",)),

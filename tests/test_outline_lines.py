@@ -105,19 +105,6 @@ def fitted(line: BlockLine | None) -> BlockLine:
     return line
 
 
-def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
-    rng = np.random.default_rng(0)
-    position = np.linspace(0.0, 1.0, 50)
-    shift = 0.2 + 0.02 * rng.standard_normal(50)
-    shift[20:35] += 0.7
-    shift[47:] += 0.8  # and an end that bends away
-    line = fitted(fit_straight(position, shift, np.full(50, 4e-4)))
-    np.testing.assert_allclose(line.ends, 0.2, atol=0.03)
-    assert not np.any(line.kept[20:35])
-    assert line.inlier_share == pytest.approx(0.64, abs=0.03)
-    assert line.last == pytest.approx(46 / 49)
-
-
 def test_covariance_agrees_with_monte_carlo() -> None:
     rng, position_range = np.random.default_rng(2), (0.3, 0.6)
     position = np.linspace(*position_range, 40)

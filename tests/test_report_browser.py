@@ -105,31 +105,6 @@ def test_sliders_move_the_machine(page: Any) -> None:
     assert _errors(page) == []
 
 
-def test_a_point_of_a_chart_tells_its_outline_and_leads_to_it(page: Any) -> None:
-    place = """const charts = document.querySelector(".charts");
-    const { links } = JSON.parse(charts.querySelector("script").textContent);
-    const svg = charts.querySelectorAll("svg")[2];
-    svg.scrollIntoView({block: "center", behavior: "instant"});
-    const matrix = svg.getScreenCTM();
-    for (const path of svg.querySelectorAll("[data-points]")) {
-      const places = [...path.getAttribute("d").matchAll(/M([-\\d.]+) ([-\\d.]+)/g)];
-      const k = path.dataset.points.split(" ").findIndex((number) => links[number]);
-      if (k < 0) continue;
-      const point = new DOMPoint(Number(places[k][1]), Number(places[k][2]));
-      const { x, y } = point.matrixTransform(matrix);
-      return [Math.round(x), Math.round(y), links[path.dataset.points.split(" ")[k]]];
-    }"""
-    x, y, _ = page.execute_script(place)
-    actions = ActionChains(page)
-    pointer: Any = actions.w3c_actions.pointer_action
-    pointer.move_to_location(x, y)
-    actions.perform()
-    assert " px" in page.find_element("id", "tip").text
-    pointer.click()
-    actions.perform()
-    assert "#outline-" in page.current_url
-
-
 # Correcting outlines on the page of ``legcal detect``.
 
 SIGMA = 0.37  # [px] of what is placed by hand in these tests
