@@ -12,7 +12,7 @@ from machines import ROOT, SHIPPED, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.descriptions.new_model import Dimensions, create_model, description_of, write_template
-from legcal.errors import ModelError, OutOfClass, UsageError
+from legcal.errors import OutOfClass, UsageError
 from legcal.machine.closing import singularity
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import inverse_kinematics
@@ -205,16 +205,6 @@ def test_dimensions_of_a_hexapod_are_those_that_were_given(tmp_path: Path) -> No
     np.testing.assert_allclose(machine.q0, 0.38, atol=1e-12)
     assert {leg.travel for leg in machine.legs} == {(0.0, 0.125)}
     assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.0125}
-
-
-def test_a_unit_beside_the_table_counts_where_it_has_none(tmp_path: Path) -> None:
-    path = write_table(tmp_path, unit=None)
-    assert read_table(path, "mm").legs[0].offset == 0.38
-    with pytest.raises(UsageError, match=r"'inch', needed one of .* in, ft"):
-        read_table(path, "inch")
-    (tmp_path / "list.yaml").write_text("- 1\n")
-    with pytest.raises(ModelError, match="needed 'key: value' lines"):
-        read_table(tmp_path / "list.yaml")
 
 
 # --- files ------------------------------------------------------------------------------------

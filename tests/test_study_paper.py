@@ -180,25 +180,6 @@ def test_processes_give_the_same_and_one_that_is_ended_from_outside_is_told(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("there", "output", "message"),
-    [
-        ({"notes.txt": "mine"}, "", "a folder with other files"),
-        ({DOCUMENT_NAME: "mine"}, "", "that is damaged or not of legcal"),
-        ({"notes.txt": "mine"}, "notes.txt/below", "needed a path that can be created"),
-    ],
-    ids=range(3),
-)
-def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(
-    tmp_path: Path, there: dict[str, str], output: str, message: str
-) -> None:
-    for name, text in there.items():
-        (tmp_path / name).write_text(text)
-    with pytest.raises(UsageError, match=message):
-        run_study(Mistaken(), 3, output=tmp_path / output)  # before any run
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == there
-
-
 def test_numbers_that_make_no_sense_are_refused() -> None:
     for n_runs, seed, workers, message in (
         (0, 0, 1, "runs = 0, needed 1 or more"),
