@@ -1,4 +1,4 @@
-"""Residuals by a second route, derivatives of all clients by differences, steps densely."""
+"""Residuals by a second route, derivatives of all clients by differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -237,25 +237,6 @@ def test_problems_of_other_clients_have_them_too(
     size = np.abs(expected).max(axis=0)
     assert np.all(size > 0.0)
     assert np.abs((J - expected) / size).max() < 1e-5
-
-
-@pytest.mark.parametrize("name", ["tricept", "3-prs"])
-def test_poses_follow_every_parameter_as_finite_differences_do(name: str) -> None:
-    problem, state = _problem(name)
-    J = jacobian(problem, linearize(problem, state))
-    assert problem.constraint is not None
-    motion = problem.constraint.tangent(problem, state)
-    assert motion is not None
-    n = problem.n_named
-    steps = np.zeros((n, problem.size))
-    steps[:, :n] = np.eye(n)
-    expected = by_differences(
-        problem, state, lambda s: residuals(problem, s), steps, projected_move
-    )
-    steps[:, problem.n_kept :] = motion.Q[:n].reshape(n, -1)
-    size = np.abs(expected).max(axis=0)
-    assert np.all(size > 0.0)
-    assert np.abs((J @ steps.T - expected) / size).max() < 1e-6
 
 
 def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> None:

@@ -6,12 +6,8 @@ from scipy.special import ndtr
 
 from legcal.geometry.types import Array
 from legcal.perception.blocks import (
-    COMMON_BIAS,
-    TILT_BIAS,
     BlockLine,
     Blocks,
-    fit_blocks,
-    fit_lines,
 )
 from legcal.perception.limb import (
     MATTE_DIRECTIONS,
@@ -96,28 +92,9 @@ def test_both_sides_are_equally_noisy_when_weighted(behind: float) -> None:
 # Blocks one by one, and lines through them.
 
 
-def fit_straight(position: Array, shift: Array, variance: Array) -> BlockLine | None:
-    return fit_lines(np.array([0, len(position)]), position, shift, variance)[0]
-
-
 def fitted(line: BlockLine | None) -> BlockLine:
     assert line is not None
     return line
-
-
-def test_covariance_agrees_with_monte_carlo() -> None:
-    rng, position_range = np.random.default_rng(2), (0.3, 0.6)
-    position = np.linspace(*position_range, 40)
-    lines = [
-        fitted(fit_straight(position, 0.1 * rng.standard_normal(40), np.full(40, 0.01)))
-        for _ in range(200)
-    ]
-    ends = np.array([[(1 - p) * f.ends[0] + p * f.ends[1] for p in position_range] for f in lines])
-    claimed = np.mean([f.covariance for f in lines], axis=0)
-    bias = COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2)
-    seen = np.cov(ends.T) + bias
-    np.testing.assert_allclose(np.diag(claimed), np.diag(seen), rtol=0.5)
-    assert np.all(np.diag(claimed) > 0.8 * np.diag(seen))
 
 
 # All blocks of outlines together.
@@ -275,29 +252,3 @@ def test_surfaces_that_reflect_stripes_are_told_from_matte_ones() -> None:
     ]
     assert max(polish[:2]) < -1.0
     assert polish[2] > 4.0
-
-
-# Cameras that encode light.
-
-
-def place_found(gamma_of_camera: float, gamma_told: float, dark: float, bright: float) -> float:
-    """Return where an outline is found that lies 0.15 px inside the line [px]."""
-    rng = np.random.default_rng(1)
-    d = rng.uniform(-3.5, 3.5, (150, 120)).astype(np.float32)
-    step = ndtr((d - 0.15) / 0.6)
-    light = dark + (bright - dark) * step
-    grey = 255.0 * light ** (1.0 / gamma_of_camera) + 0.5 * rng.standard_normal(d.shape)
-    levels, weight = to_light(grey.astype(np.float32), np.ones(d.shape, np.bool_), gamma_told)
-    moved = np.zeros(len(d))
-    for _ in range(5):
-        at = d - moved[:, None].astype(np.float32)
-        sums = PixelBins.of(at, weight, 0.6).sums(levels)
-        edge = np.zeros(len(d), dtype=np.intp)
-        moved += fit_blocks(sums, np.array([14.0]), np.array([0.6]), edge).shift
-    return float(np.median(moved))
-
-
-@pytest.mark.parametrize(("dark", "bright"), [(0.02, 0.7), (0.7, 0.02), (0.1, 0.2)])
-@pytest.mark.parametrize("gamma", [1.0, 1.8, 2.2])
-def test_outline_is_where_the_light_has_its_edge(gamma: float, dark: float, bright: float) -> None:
-    assert place_found(gamma, gamma, dark, bright) == pytest.approx(0.15, abs=0.01)

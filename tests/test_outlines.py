@@ -22,6 +22,7 @@ from legcal.perception.outline import (
 from legcal.perception.placement import Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
+from legcal.vision.visibility import END_COVER, visible_segments
 
 IDENTITY = RigidTransform.identity()
 F = 700.0
@@ -277,3 +278,43 @@ def test_an_edge_stands_alone_only_without_a_rival() -> None:
     both = np.stack([np.arange(len(cases)), other], axis=1)
     least = np.full(len(cases), LONE_SCORE)
     np.testing.assert_array_equal(_alone(shift[both], score[both], least), expected[both])
+
+
+TUBE, ROD = (
+    Cylinder("tube", 0.012, "base", 0.0, 0.25),
+    Cylinder("rod", 0.008, "platform", -0.3, 0.0),
+)
+LONG_ROD = Cylinder("rod", 0.008, "base", 0.0, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("cylinders", "length", "expected"),
+    [  # of the links: start and end in the radius that covers each, and metres
+        ([TUBE, ROD], 0.4, [("tube", 0.012, 0.0, 0.25), ("rod", 0.012, 0.25, 0.4)]),
+        ([TUBE, replace(ROD, start=-0.1)], 0.26, [("tube", 0.012, 0.0, 0.25)]),
+        (
+            [LONG_ROD, Cylinder("collar", 0.02, "base", 0.1, 0.12)],
+            0.4,
+            [("rod", 0.02, 0.12, 0.4), None],
+        ),
+        ([LONG_ROD, Cylinder("rod", 0.02, "base", 0.1, 0.16)], 0.4, [("rod", 0.02, 0.16, 0.4)]),
+    ],
+    ids=["tube and rod", "rod inside", "collar", "collar of the link"],
+)
+def test_of_overlapping_cylinders_the_thicker_one_is_seen(
+    cylinders: list[Cylinder],
+    length: float,
+    expected: list[tuple[str, float, float, float] | None],
+) -> None:
+    segments = visible_segments(cylinders, length)
+    assert segments == visible_segments(cylinders[::-1], length)
+    named = {segment.link: segment for segment in segments}
+    for one in expected:
+        if one is None:
+            continue
+        link, radius, start, end = one
+        segment = named[link]
+        assert segment.start == pytest.approx(start + END_COVER * radius)
+        assert segment.end == pytest.approx(min(end, length - END_COVER * segment.radius))
+    if None not in expected:
+        assert [segment.link for segment in segments] == [one[0] for one in expected if one]
