@@ -413,9 +413,9 @@ def test_the_nearest_rotation_is_never_a_mirror() -> None:
     assert np.all(apart < np.linalg.norm(matrices - others, axis=(2, 3)))
 
 
-@pytest.mark.parametrize("turn", [[0.3, -1.0, 2.0], [np.pi, 0.0, 0.0]])
-def test_moving_the_world_moves_the_base_and_nothing_else(turn: list[float]) -> None:
-    world = RigidTransform.from_components([0.7, -0.4, 1.0], Rotation.from_rotvec(turn))
+@pytest.mark.parametrize("rotvec", [[0.3, -1.0, 2.0], [np.pi, 0.0, 0.0]])
+def test_moving_the_world_moves_the_base_and_nothing_else(rotvec: list[float]) -> None:
+    world = RigidTransform.from_components([0.7, -0.4, 1.0], Rotation.from_rotvec(rotvec))
     pairs = noisy(pairs_at(BASE, TOOL), np.random.default_rng(5))
     R = world.rotation.as_matrix()
     before = fitted(pairs, UNKNOWN)
