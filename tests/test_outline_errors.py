@@ -25,9 +25,7 @@ from fit_sessions import (
 from legcal.calibration.estimate import (
     GAMMA_RANGE,
     GAMMA_STEP,
-    GAMMA_TOLERANCE,
     MAX_GAMMA_TRIALS,
-    GammaTrials,
     most_likely,
     next_trial,
 )
@@ -359,51 +357,6 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
     assert found.quality.rms_px is not None
     assert as_linear.quality.rms_px is not None
     assert found.quality.rms_px < 0.7 * as_linear.quality.rms_px
-
-
-def trial(session: HexapodSession, gamma: float, lost: float = np.inf, seed: int = 4) -> Outlines:
-    """Return outlines of a camera of LOG_GAMMA, measured with a gamma.
-
-    Each knows its response to it to a third. Those that it moves by more than *lost* [px] are not
-    found.
-    """
-    away = LOG_GAMMA - np.log(gamma)
-    outlines = encoded(session, away)
-    wrong = np.random.default_rng(seed).normal(1.0, 0.33, len(outlines))
-    return replace(
-        outlines,
-        gamma=np.full(len(outlines), gamma),
-        by_gamma=outlines.by_gamma * wrong,
-        used=outlines.used & (np.abs(outlines.by_gamma * away) <= lost),
-    )
-
-
-def gammas_tried(session: HexapodSession, lost: float, seed: int) -> tuple[Solution, GammaTrials]:
-    """Return the fit with a gamma of 1, and all trials that follow it."""
-    measurements, start = without_gamma(session.measurements), disturbed_start(session)
-
-    def fitted(gamma: float) -> Solution:
-        return refine(session.legs, measurements, trial(session, gamma, lost, seed), start)
-
-    first = fitted(1.0)
-    trials = GammaTrials.begun(first, {})
-    while gammas := trials.next():
-        trials = trials.tried(gammas, fitted(gammas["c1"]))
-    return first, trials
-
-
-@pytest.mark.system
-def test_the_most_likely_gamma_is_that_of_the_same_outlines(session: HexapodSession) -> None:
-    lost, off = 0.15, []
-    for seed in (3, 4):
-        first, trials = gammas_tried(session, lost, seed)
-        found = trials.found()
-        assert found.keys() == {"c1", "c2", "c3"}
-        off.append(np.log(found["c1"]) - LOG_GAMMA)
-        assert trials.notes({}) == ()
-        assert GammaTrials.begun(first, {"c2": 1.0}).next() == {}  # by outlines that are kept
-    # A single one may be as far off as the tolerance.
-    assert np.sqrt(np.mean(np.square(off))) < 0.75 * GAMMA_TOLERANCE
 
 
 @pytest.mark.parametrize("truth", [-0.3, 0.0, 0.15, 0.4, 0.65, 0.79, 1.05, 1.4])

@@ -195,7 +195,7 @@ def test_a_saturated_background_moves_no_outline() -> None:
 def test_outlines_are_rejected_where_saturation_leaves_nothing_of_the_step() -> None:
     cam = camera()
     bars = [bar(-0.05, 0.02, 60.0), bar(0.06, 0.02, 60.0)]
-    image = render(cam, bars, 1000.0, blur=0.5, noise=1.0, supersample=3)
+    image = render(cam, bars, 800.0, blur=0.5, noise=1.0, supersample=3)
     clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
     found = detect(cam, bars, clipped, off=1e-3)
     assert not np.any(found.used), errors(cam, bars, found)
