@@ -1,4 +1,4 @@
-"""Counts, ranks and information: equations written out, and what counts get wrong."""
+"""``legcal identify``: counts and ranks against equations written out, information, reports."""
 
 import io
 import json
@@ -309,9 +309,6 @@ def test_steps_of_machines_whose_joints_at_A_move_are_left_out() -> None:
     observed = planned(session("delta", images=6))
     with pytest.raises(NotIdentifiable, match="joints at the base that motors move, needed joints"):
         observed.run()
-
-
-# Counts and ranks
 
 
 def test_counts_by_analogy_are_those_written_out() -> None:

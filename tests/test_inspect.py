@@ -1,4 +1,4 @@
-"""What ``legcal inspect`` and ``legcal evaluate`` say of machines."""
+"""What ``legcal inspect`` and ``legcal evaluate`` say and draw of machines, hostile names too."""
 
 import io
 import json

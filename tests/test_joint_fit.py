@@ -1,6 +1,7 @@
 """The joint fit finds the truth: exactly without noise, at the Cramer-Rao bound with it.
 
 Nothing that does not matter shows in the result: the start, names and order, the unit of length.
+What cannot be fitted is refused.
 """
 
 from collections.abc import Callable

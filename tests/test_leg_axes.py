@@ -1,4 +1,4 @@
-"""Axes and their covariances from outlines."""
+"""Axes and their covariances, from outlines and from the table of the paper."""
 
 from dataclasses import replace
 

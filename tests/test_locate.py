@@ -1,4 +1,4 @@
-"""``legcal locate``: what poses of real machines determine, outliers, the table, the files."""
+"""``legcal locate``: what poses of real machines determine, outliers, the table, files, the fit."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Simulated datasets: of the spread that they claim, reproducible, whole or not there at all.
+"""Simulated datasets and boards: of the spread that they claim, reproducible, whole or not there.
 
 What options of the command give and how wrong ones are refused is in tests/refusal_table.py.
 """

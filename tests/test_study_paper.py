@@ -1,4 +1,4 @@
-"""The paper's evaluation: eq (20), its records, means, table and figure."""
+"""The paper's evaluation: eq (20), its sessions, means and table; the runner of studies."""
 
 import io
 import json

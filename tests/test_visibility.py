@@ -1,4 +1,4 @@
-"""What simulated cameras see of legs: silhouettes, and where solids and borders hide them."""
+"""What cameras see of legs: silhouettes, and where solids of all kinds and borders hide them."""
 
 from collections.abc import Callable
 from functools import cache
