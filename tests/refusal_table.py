@@ -414,6 +414,10 @@ def _datasets() -> Iterable[Refusal]:
         ("yaml", text("dataset.yaml", "legcal_dataset: 1\nviews: {c1: [}\n"), ("line 2",)),
         ("repeated", swap("dataset.yaml", "  c2:", "  c1:"), ("'c1'",)),
         ("gone", remove("dataset.yaml"), ("dataset.yaml",)),
+        ("control", entry(**{"views__\x1b[31m": {"camera": "camera_info.yaml"}}),
+         ("needed printable characters",)),
+        *((f"tag-{k}", text("dataset.yaml", f"a: 1\nb: {value}\n"), ("line 2, column 4",))
+          for k, value in enumerate(("!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"))),
     ]  # fmt: skip
     yield from _spoiled("dataset", "calibrate {in} -o {out}", "plain", rows)
 
@@ -647,6 +651,9 @@ def _units() -> Iterable[Refusal]:
     for name, readings, entry, named in rows:
         edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
         yield Refusal(f"units-{name}", "calibrate {in} -o {out}", named, "", edits)
+    given = cast(Edit, partial(dataset_of_readings, readings=angles, entry=sigma))
+    yield Refusal("units-open", "calibrate {in} -o {out}", ("servo1", "moves joints at the base"),
+                  "", (given, cell("measurements.csv", None, servo1="")))  # fmt: skip
 
 
 def _without_rods(folder: Path, hidden: str) -> None:
@@ -1116,6 +1123,13 @@ def _new() -> Iterable[Refusal]:
         ("column", f"{head},bse_z\n{row},0\n", "--unit mm", ("'bse_z'", "'base_z'")),
         ("no-column", "type,base_x\nRPS,1\n", "--unit mm", ("'base_y'",)),
         ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
+        ("points-column", "point,x,y,zz\nB1,1,2,3\nP1,4,5,6\n", "--unit mm", ("'zz'", "'z'")),
+        (
+            "points",
+            "point,x,y\nB1,1,2\nB2,a,2\nP1,4\nB1,4,5\nQQ,4,5\n",
+            "--unit mm",
+            ("line 3", "'a'", "line 4", "2 cells", "line 5", "'B1' twice", "line 6", "'QQ'"),
+        ),
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
         ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
