@@ -351,10 +351,14 @@ def test_undetermined_cameras_are_refused_with_figures() -> None:
     refuse_undetermined(few, ["a", "b", "c"])
     factor = (0.1 * few.adjusted.camera.K[0, 0] / sigmas(few)[0]) ** 2
     weak = replace(few, all_covariance=factor * few.all_covariance)
+    knots = np.array([0.0, 0.0, -0.6, 0.0, 0.0, 0.0])
+    bent = replace(few.adjusted.camera, distortion=knots, model="splined_radial")
+    folded = replace(few, adjusted=replace(few.adjusted, camera=bent))
     pair, left_out = replace(few, images=(0, 1)), ["c: 20 of its 40 corners disagree"]
     for found, names, others, named in (
         (parallel, ["a"] * 6, [], ("focal length open", "tilt the board")),
         (weak, ["a", "b", "c"], [], ("focal length open",)),
+        (folded, ["a", "b", "c"], [], ("splined lens", "stops growing", "leave out --model")),
         (pair, ["a", "b"], [], ("2 images", "(a, b)", "3")),
         (pair, ["a", "b"], left_out, ("2 images", "1 more", left_out[0], "3")),
     ):

@@ -23,7 +23,6 @@ _MIN_COVERAGE = 0.5
 _MAX_RIVAL = 2.0 / 3.0  # largest size of the second group of images, relative to the first
 _LARGE_RESIDUAL_PX = 1.0
 _MANY_LEFT_OUT = 0.05  # share of corners left out that is worth a warning
-_FOLDED_PX = 0.1
 _MAX_RATIO = 25.0  # largest ratio of squared errors to the scatter of corners
 _MAX_PIXEL_RATIO = 0.01  # pixels of sensors are square
 _MAX_PRINT_RATIO, _MAX_BEND = 0.015, 0.02  # three and two standard deviations of the priors
@@ -98,6 +97,12 @@ def refuse_undetermined(fit: RobustFit, names: Sequence[str], left_out: Sequence
             f"{np.degrees(spread(fit)):.0f} deg to each other, which leave the focal length open "
             f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
             f"board by 30 deg and more{_missing_tilts(fit)}."
+        )
+    if (angle := camera.turns_back) is not None:
+        raise NotIdentifiable(
+            "The camera could not be calibrated: found a splined lens whose radius stops growing "
+            f"{np.degrees(angle):.0f} deg from the axis, inside the image, needed boards as far as "
+            "the corners of the image; bring the board there, or leave out --model."
         )
     centre = camera.K[:2, 2]
     if not np.all((centre > 0.0) & (centre < [camera.width - 1.0, camera.height - 1.0])):
@@ -278,11 +283,7 @@ def _missing_tilts(fit: RobustFit) -> str:
 
 def _folding(camera: Camera) -> list[str]:
     """Return a warning if the lens model maps two directions to one pixel inside the image."""
-    w, h = camera.width - 1.0, camera.height - 1.0
-    corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
-    back = camera.distort(camera.undistort(corners))
-    error = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
-    if error < _FOLDED_PX:
+    if camera.reaches(camera.corners).all():
         return []
     return [
         "The lens model folds back before the corners of the image, where no board was seen: "
