@@ -33,6 +33,7 @@ from legcal.calibration.camera_calibration.diagnostics import (
     noise_correlation,
     refuse_divided,
     refuse_undetermined,
+    repeat_noise,
     warnings,
 )
 from legcal.calibration.camera_calibration.document import CameraCalibration, write_picture
@@ -139,11 +140,56 @@ def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
         squares.append(off @ np.linalg.solve(found.covariance, off) / len(off))
         assert np.median(found.corners.sigma_px) < 0.1
         # They share errors of 0.06 px over about 60 px, and have 0.03 px each.
-        length, effective = noise_correlation(found)
+        length, effective = noise_correlation(found.corners, found.adjusted.residual)
         assert 10.0 < length < 150.0
         assert effective < 0.5
-        assert noise_correlation(fitted(seen_corners(CAMERAS["plumb_bob"], 10, seed)))[0] == 0.0
+        plain = fitted(seen_corners(CAMERAS["plumb_bob"], 10, seed))
+        assert noise_correlation(plain.corners, plain.adjusted.residual)[0] == 0.0
     assert 0.4 < np.mean(squares) < 1.8
+
+
+def test_an_image_that_a_splined_lens_leaves_out_is_named() -> None:
+    seen = seen_corners(CAMERAS["equidistant"], 12, 7)
+    moved = np.where(seen.image[:, None] == 11, [30.0, 12.0], 0.0)
+    found = fitted(replace(seen, px=seen.px + moved), "splined_radial")
+    assert list(found.left_out) == [11]
+    assert "as with stabilisation or another crop" in found.left_out[11]
+
+
+def still(camera: Camera, n: int, shared: float, noise: float, length: float) -> BoardImages:
+    """Return pairs of images of a board that stands still.
+
+    Each corner has noise that is correlated over a length [px], and an error that comes back.
+    """
+    rng = np.random.default_rng(5)
+    parts = []
+    for seed in range(n):
+        one = seen_corners(camera, 1, seed, noise=1e-9)
+        same = shared * rng.standard_normal(one.px.shape)
+        for _ in range(2):
+            apart = np.linalg.norm(one.px[:, None] - one.px, axis=-1)
+            root = np.linalg.cholesky(np.exp(-apart / length))
+            error = noise * root @ rng.standard_normal(one.px.shape)
+            px = one.px + same + error
+            parts.append(replace(one, px=px, sigma_px=np.full(len(px), NOISE_PX)))
+    return together(*parts)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.06])
+def test_images_of_a_board_that_stands_still_tell_the_noise_of_corners(shared: float) -> None:
+    """What print and lens do to a corner comes back and does not count."""
+    camera, n = CAMERAS["plumb_bob"], 12
+    fit = fitted(together(*(seen_corners(camera, 1, seed) for seed in range(n))))
+    found = repeat_noise(fit, still(camera, n, shared, NOISE_PX, 1.0), range(n))
+    assert found is not None
+    assert found.pairs == n
+    assert found.noise_px == pytest.approx(NOISE_PX, rel=0.06)
+    assert found.length_px == 0.0
+    smooth = repeat_noise(fit, still(camera, n, shared, NOISE_PX, 80.0), range(n))
+    assert smooth is not None
+    assert 20.0 < smooth.length_px < 80.0  # what spans the board moves its pose instead
+    copies = still(camera, n, shared, 1e-6, 30.0)
+    assert repeat_noise(fit, copies, range(n)) is None
 
 
 def test_single_corners_and_images_that_disagree_are_left_out() -> None:

@@ -52,9 +52,9 @@ HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
 _REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # errors of the package
 FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along diagonals
-# Standard deviations, relative to the focal length: of f (some makers count by the diagonal of film,
-# others by its width, which differ by 4 % at 4:3; lenses are nominal), and of the difference between
-# fx and fy (pixels are square)
+# Standard deviations, relative to the focal length: of f (some makers count by the diagonal of
+# film, others by its width, which differ by 4 % at 4:3; lenses are nominal), and of the difference
+# between fx and fy (pixels are square)
 FOCAL_SIGMA, ASPECT_SIGMA = 0.04, 0.002
 _ROUNDING_35MM = 1.0 / np.sqrt(12.0)  # standard deviation of whole millimetres [mm]
 _NEAR_M = 0.7  # distance of machines: a focused lens stands out by the focal length over that
