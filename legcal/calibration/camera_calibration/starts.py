@@ -32,7 +32,8 @@ def from_scratch(
 ) -> AdjustedBoard | None:
     """Return the adjustment without a start; None if no start or adjustment succeeds.
 
-    A splined lens starts as an equidistant one with k1.
+    A splined lens starts as an equidistant one. Of the two poses that show a plane almost alike
+    the better one is chosen again when the distortion is known roughly.
     """
     wanted, model = model, "equidistant" if model == "splined_radial" else model
     start = _by_poses(corners, size, model)
@@ -41,8 +42,13 @@ def from_scratch(
     rough = adjust_board(*start, corners, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
     if rough is None:
         return None
+    nearest = [_pose(rough.camera, corners, a, b) for a, b in pairwise(_bounds(corners))]
+    poses = [
+        before if T is None else T
+        for (_, T), before in zip(nearest, rough.T_camera_board, strict=True)
+    ]
     camera = rough.camera if wanted == model else splined(rough.camera)
-    return _all_adjusted(camera, rough.T_camera_board, Sheet.flat(corners.points), corners)
+    return _all_adjusted(camera, poses, Sheet.flat(corners.points), corners)
 
 
 def _all_adjusted(
