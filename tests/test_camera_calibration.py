@@ -19,6 +19,7 @@ from camera_sessions import (
     WIDE_SIZE,
     corners_at_the_edge,
     drawings,
+    photographs,
     projection_errors,
     seen_corners,
     together,
@@ -480,6 +481,21 @@ def test_each_circle_is_measured_at_the_centroid_of_its_image(tmp_path: Path, sp
     assert len(number) == board.n_corners
     assert np.abs(off).max() < 0.15
     assert np.sqrt((off**2).mean()) < 0.05
+
+
+def test_an_image_with_one_row_of_corners_is_left_out_by_name(tmp_path: Path) -> None:
+    board = board_of("charuco:9x6:30mm:22mm:DICT_5X5_100")
+    paths = photographs(tmp_path, PINHOLE, 4, board=board)
+    image = np.asarray(cv2.imread(str(paths[3]), cv2.IMREAD_GRAYSCALE))
+    number, px, _ = find_corners(board, image)
+    rows = [px[number // board.grid[0] == k] for k in range(2)]
+    below = [np.polyfit(*row.T, 1) for row in rows]
+    u, v = np.meshgrid(np.arange(PINHOLE.width), np.arange(PINHOLE.height))
+    hidden = v > 0.1 * np.polyval(below[0], u) + 0.9 * np.polyval(below[1], u)
+    cv2.imwrite(str(paths[3]), np.where(hidden, 120, image).astype(np.uint8))
+    found = calibrate_camera(tmp_path, board)
+    assert found.images[3].reason == "only corners on one line of the board were found"
+    assert [image.used > 0 for image in found.images] == [True] * 3 + [False]
 
 
 def test_ten_copies_shifted_by_some_pixels_are_one_image(tmp_path: Path) -> None:

@@ -62,6 +62,7 @@ from legcal.vision.image_file import (
     read_facts,
     read_image,
 )
+from legcal.vision.point_pose import on_a_line
 from legcal.workers import Run, Workers, worker_pool
 
 _STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
@@ -248,7 +249,13 @@ def _shown_in(
     if board is None:
         raise _not_visible(stated, note)
     corners_by_image = [board_image.numbered(board) for board_image in board_images]
-    usable = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
+    enough = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
+    lines = {
+        k: "only corners on one line of the board were found"
+        for k in enough
+        if on_a_line(board.points[corners_by_image[k].number])
+    }
+    usable = [k for k in enough if k not in lines]
     if not usable:
         raise _not_visible(stated, _shown_instead(stated, photographs))
     copies, repeats = _copies(corners_by_image, usable, paths)
@@ -256,13 +263,14 @@ def _shown_in(
     if len(distinct) < MIN_IMAGES:
         same = _by_reason((paths[k].name, reason) for k, reason in copies.items())
         raise too_few_images(len(distinct), [paths[k].name for k in distinct], copies=same)
-    without = set(range(len(paths))).difference(usable) if board.dictionary else ()
+    without = set(range(len(paths))).difference(enough) if board.dictionary else ()
     mirrored = {
         k: "mirrored, left and right exchanged"
         for k in sorted(without)
         if tags_are_mirrored(board, photographs.read(k))
     }
-    return _ShownBoard(board, corners_by_image, distinct, copies | mirrored, note, repeats)
+    unused = copies | mirrored | lines
+    return _ShownBoard(board, corners_by_image, distinct, unused, note, repeats)
 
 
 def _shown_instead(board: Board, photographs: _Photographs) -> str:
