@@ -316,6 +316,20 @@ def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
     assert sigmas(fit)[:4].max() < 0.3
 
 
+@pytest.mark.parametrize(
+    ("model", "n_edge", "seeds"),
+    [("plumb_bob", 3, [49, 0, 5002]), ("splined_radial", 9, [49, 4, 5108])],
+)
+def test_no_image_is_accused_for_the_wrong_one_of_the_two_poses_of_a_plane(
+    model: DistortionModel, n_edge: int, seeds: list[int]
+) -> None:
+    """One and two boards near the corners of these sets once started with it, and kept it."""
+    seen = corners_at_the_edge(wide_camera(model), 35, n_edge, np.random.default_rng(seeds))
+    fit = robust_fit(seen, WIDE_SIZE, model)
+    assert fit is not None
+    assert fit.left_out == {}
+
+
 def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_of() -> None:
     seen = seen_corners(TRUTH, 8, 1)
     chosen = chosen_lens(seen, SIZE)

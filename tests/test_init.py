@@ -329,7 +329,7 @@ def test_without_a_camera_file_photographs_that_state_a_focal_length_give_a_roug
     assert init(monkeypatch, tmp_path, "--force") == 2  # a zoom
 
 
-SIZES: dict[str, tuple[tuple[int, int], dict[str, float | int], tuple[float, float]]] = {
+SIZES: dict[str, tuple[tuple[int, int], dict[str, Any], tuple[float, float]]] = {
     # size of the image [px], what EXIF says, least and largest focal length by it [px]
     "16:9 of a 4:3 sensor": ((1600, 900), {}, (1103.2, 1201.8)),
     "square of a 4:3 sensor": ((900, 900), {}, (764.8, 901.4)),

@@ -24,6 +24,7 @@ from legcal.vision.point_pose import closed_form_poses
 _FOCAL_LENGTHS = (0.25, 4.0, 13)  # smallest and largest, relative to the longer side; number
 _MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens
 _SMALL_PX = 1e-3  # errors of a start that do not matter
+_FAR_BETTER = 0.5  # residual of a pose, over that of the pose whose place it takes
 _ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1", "k2"), 12  # estimated first
 
 
@@ -33,7 +34,7 @@ def from_scratch(
     """Return the adjustment without a start; None if no start or adjustment succeeds.
 
     A splined lens starts as an equidistant one. Of the two poses that show a plane almost alike
-    the better one is chosen again when the distortion is known roughly.
+    the better one is chosen again when the distortion is known better.
     """
     wanted, model = model, "equidistant" if model == "splined_radial" else model
     start = _by_poses(corners, size, model)
@@ -42,13 +43,26 @@ def from_scratch(
     rough = adjust_board(*start, corners, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
     if rough is None:
         return None
-    nearest = [_pose(rough.camera, corners, a, b) for a, b in pairwise(_bounds(corners))]
-    poses = [
-        before if T is None else T
-        for (_, T), before in zip(nearest, rough.T_camera_board, strict=True)
-    ]
     camera = rough.camera if wanted == model else splined(rough.camera)
-    return _all_adjusted(camera, poses, Sheet.flat(corners.points), corners)
+    poses = _chosen_again(rough, corners)
+    found = _all_adjusted(camera, poses, Sheet.flat(corners.points), corners)
+    if found is None:
+        return None
+    poses = _chosen_again(found, corners)
+    is_other = any(T is not before for T, before in zip(poses, found.T_camera_board, strict=True))
+    return readjust(found, poses, corners) if is_other else found
+
+
+def _chosen_again(adjusted: AdjustedBoard, corners: BoardImages) -> list[RigidTransform]:
+    """Return the poses of an adjustment, another one where that explains a board far better."""
+    off = np.linalg.norm(adjusted.residual, axis=1)
+    poses = []
+    for (a, b), T in zip(pairwise(_bounds(corners)), adjusted.T_camera_board, strict=True):
+        other_off, other = _pose(adjusted.camera, corners, a, b)
+        if other is None or other_off > _FAR_BETTER * float(np.median(off[a:b])):
+            other = T
+        poses.append(other)
+    return poses
 
 
 def _all_adjusted(
