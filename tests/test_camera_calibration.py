@@ -503,7 +503,7 @@ def test_an_image_with_one_row_of_corners_is_left_out_by_name(tmp_path: Path) ->
     image = np.asarray(cv2.imread(str(paths[3]), cv2.IMREAD_GRAYSCALE))
     number, px, _ = find_corners(board, image)
     rows = [px[number // board.grid[0] == k] for k in range(2)]
-    below = [np.polyfit(*row.T, 1) for row in rows]
+    below = [np.polyfit(row[:, 0], row[:, 1], 1) for row in rows]
     u, v = np.meshgrid(np.arange(PINHOLE.width), np.arange(PINHOLE.height))
     hidden = v > 0.1 * np.polyval(below[0], u) + 0.9 * np.polyval(below[1], u)
     cv2.imwrite(str(paths[3]), np.where(hidden, 120, image).astype(np.uint8))
