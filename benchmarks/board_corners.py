@@ -4,11 +4,12 @@
         [--conditions plain,...] [--size 1280x800]
 
 For each board, camera and condition a line: photographs whose board (a half of its visible corners)
-is found, and found by OpenCV's sector-based finder (the whole of a chessboard); the share of the
-visible corners; root mean square of their errors in a coordinate, of all and of all but the worst
-hundredth [px]; that of the errors as parts of their standard deviations; that of OpenCV's finder,
-and of ours in the boards that it finds [px]; milliseconds of the processor for an image, and of
-OpenCV's finder.
+is found, and found by OpenCV: the sector-based finder (the whole of a chessboard), or ArucoDetector
+with its settings (a half of the corners of markers, at whole pixels); the share of the visible
+corners; root mean square of their errors in a coordinate, of all and of all but the worst hundredth
+[px]; that of the errors as parts of their standard deviations; that of OpenCV's sector-based
+finder, and of ours in the boards that it finds [px]; milliseconds of the processor for an image,
+those of OpenCV, and their ratio.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.board_corners import NumberedCorners, search_board
 from legcal.simulation.rendering.appearance import Appearance
-from legcal.vision.board import APRIL_TAGS, Board
+from legcal.vision.board import APRIL_TAGS, Board, dictionary
 from legcal.vision.camera import Camera
 
 BOARDS = {
@@ -116,6 +117,10 @@ def _line(board: Board, taken: list[Shot]) -> str:
     errors, pulls = list[Array](), list[Array]()
     both: tuple[list[Array], list[Array]] = [], []
     ours = theirs = 0.0
+    how = cv2.aruco.DetectorParameters()
+    how.markerBorderBits = 2 if board.kind == "aprilgrid" else 1
+    if board.kind != "chessboard":
+        detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), how)
     for shot in taken:
         start = time.process_time()
         seen = search_board(board, shot.grey).numbered(board)
@@ -125,16 +130,19 @@ def _line(board: Board, taken: list[Shot]) -> str:
         n_found += int(len(numbers) >= max(_HALF * shot.visible.sum(), 4))
         errors.append(seen.px - shot.px[numbers])
         pulls.append(errors[-1] / seen.sigma_px[:, None])
+        start = time.process_time()
+        image = np.asarray(shot.grey, dtype=np.uint8)
         if board.kind == "chessboard":
-            start = time.process_time()
-            image = np.asarray(shot.grey, dtype=np.uint8)
             flags = cv2.CALIB_CB_NORMALIZE_IMAGE
             is_there, px = cv2.findChessboardCornersSB(image, board.grid, flags=flags)
-            theirs += time.process_time() - start
-            if is_there:
-                n_theirs += 1
-                both[0].append(_from_nearest(np.asarray(px, dtype=np.float64)[:, 0], shot))
-                both[1].append(errors[-1])
+        else:
+            tags = detector.detectMarkers(image)[0]
+            is_there = 4 * len(tags) >= max(_HALF * shot.visible.sum(), 4)
+        theirs += time.process_time() - start
+        n_theirs += int(is_there)
+        if is_there and board.kind == "chessboard":
+            both[0].append(_from_nearest(np.asarray(px, dtype=np.float64)[:, 0], shot))
+            both[1].append(errors[-1])
     n_visible = sum(int(shot.visible.sum()) for shot in taken)
     error, pull = np.concatenate(errors), np.concatenate(pulls)
     text = f"{n_found:5d} {n_theirs:5d} {n_seen / max(n_visible, 1):6.3f}"
@@ -145,7 +153,8 @@ def _line(board: Board, taken: list[Shot]) -> str:
         text += f" {np.sqrt(np.mean(pull**2)):5.2f}"
     for found in both:
         text += f" {np.sqrt(np.mean(np.concatenate(found) ** 2)):6.3f}" if found else "      -"
-    return text + f" {1e3 * ours / len(taken):5.0f} {1e3 * theirs / len(taken):5.0f}"
+    text += f" {1e3 * ours / len(taken):5.0f} {1e3 * theirs / len(taken):5.0f}"
+    return text + f" {ours / max(theirs, 1e-9):5.2f}"
 
 
 def _from_nearest(px: Array, shot: Shot) -> Array:
@@ -175,7 +184,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     width, height = (int(side) for side in options.size.split("x"))
     camera = camera_of(width, height)
-    columns = "found    SB  share    rms   99 %  pull SB rms   ours    ms SB ms"
+    columns = "found    CV  share    rms   99 %  pull SB rms   ours    ms CV ms ratio"
     print(f"board      camera     condition {columns}")
     for name in options.boards.split(","):
         for kind in options.cameras.split(","):

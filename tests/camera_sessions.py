@@ -6,11 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 from boards import before
+from rendering import photograph
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages, Sheet
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.rendering.appearance import Appearance
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import ImageSize
@@ -133,6 +136,27 @@ def drawings(
         image += rng.normal(0.0, 1.5, image.shape)
         paths.append(folder / f"b{k:02d}.png")
         assert cv2.imwrite(str(paths[-1]), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return paths
+
+
+def photographs(
+    folder: Path, camera: Camera, n_images: int, *, board: Board = BOARD, seed: int = 0
+) -> list[Path]:
+    """Write photographs of a board from all sides; return their paths."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    plate = PlacedBoard(board, RigidTransform.identity()).plate
+    looks = Appearance.clean(
+        blur=0.6, gamma=1.0, electrons=15_000.0, read_noise=8.0, bits=8, samples=21
+    )
+    paths = []
+    for k in range(n_images):
+        turn = np.array([0.5 * np.cos(2.4 * k), 0.5 * np.sin(2.4 * k), rng.uniform(-0.3, 0.3)])
+        distance = rng.uniform(0.36, 0.44) * (0.55 if camera.model == "equidistant" else 1.0)
+        aside = RigidTransform.from_translation([*rng.uniform(-0.03, 0.03, 2), 0.0])
+        image = photograph([plate], camera, before(board, distance, turn) * aside, looks, rng)
+        paths.append(folder / f"b{k:02d}.png")
+        assert cv2.imwrite(str(paths[-1]), np.asarray(image))
     return paths
 
 

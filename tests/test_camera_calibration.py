@@ -15,10 +15,12 @@ from camera_sessions import (
     PINHOLE,
     SIZE,
     drawings,
+    photographs,
     seen_corners,
     together,
 )
 from command_line import run
+from lens_choice import WIDE_SIZE, corners_at_the_edge, projection_errors, wide_camera
 from thinned import thinned
 
 from legcal import calibrate_camera
@@ -27,6 +29,7 @@ from legcal.calibration.camera_calibration.diagnostics import (
     noise_correlation,
     refuse_divided,
     refuse_undetermined,
+    repeat_noise,
     warnings,
 )
 from legcal.calibration.camera_calibration.document import CameraCalibration, write_picture
@@ -35,6 +38,7 @@ from legcal.calibration.camera_calibration.projection import compare_cameras, pr
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array, BoolArray
 from legcal.perception.board_adjustment import BoardImages
+from legcal.perception.board_corners import find_corners
 from legcal.vision.board import board_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 from legcal.vision.camera_file import read_camera
@@ -132,11 +136,56 @@ def test_errors_that_corners_of_an_image_share_are_in_the_sigmas() -> None:
         squares.append(off @ np.linalg.solve(found.covariance, off) / len(off))
         assert np.median(found.corners.sigma_px) < 0.1
         # They share errors of 0.06 px over about 60 px, and have 0.03 px each.
-        length, effective = noise_correlation(found)
+        length, effective = noise_correlation(found.corners, found.adjusted.residual)
         assert 10.0 < length < 150.0
         assert effective < 0.5
-        assert noise_correlation(fitted(seen_corners(CAMERAS["plumb_bob"], 10, seed)))[0] == 0.0
+        plain = fitted(seen_corners(CAMERAS["plumb_bob"], 10, seed))
+        assert noise_correlation(plain.corners, plain.adjusted.residual)[0] == 0.0
     assert 0.4 < np.mean(squares) < 1.8
+
+
+def test_an_image_that_a_splined_lens_leaves_out_is_named() -> None:
+    seen = seen_corners(CAMERAS["equidistant"], 12, 7)
+    moved = np.where(seen.image[:, None] == 11, [30.0, 12.0], 0.0)
+    found = fitted(replace(seen, px=seen.px + moved), "splined_radial")
+    assert list(found.left_out) == [11]
+    assert "as with stabilisation or another crop" in found.left_out[11]
+
+
+def still(camera: Camera, n: int, shared: float, noise: float, length: float) -> BoardImages:
+    """Return pairs of images of a board that stands still.
+
+    Each corner has noise that is correlated over a length [px], and an error that comes back.
+    """
+    rng = np.random.default_rng(5)
+    parts = []
+    for seed in range(n):
+        one = seen_corners(camera, 1, seed, noise=1e-9)
+        same = shared * rng.standard_normal(one.px.shape)
+        for _ in range(2):
+            apart = np.linalg.norm(one.px[:, None] - one.px, axis=-1)
+            root = np.linalg.cholesky(np.exp(-apart / length))
+            error = noise * root @ rng.standard_normal(one.px.shape)
+            px = one.px + same + error
+            parts.append(replace(one, px=px, sigma_px=np.full(len(px), NOISE_PX)))
+    return together(*parts)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.06])
+def test_images_of_a_board_that_stands_still_tell_the_noise_of_corners(shared: float) -> None:
+    """What print and lens do to a corner comes back and does not count."""
+    camera, n = CAMERAS["plumb_bob"], 12
+    fit = fitted(together(*(seen_corners(camera, 1, seed) for seed in range(n))))
+    found = repeat_noise(fit, still(camera, n, shared, NOISE_PX, 1.0), range(n))
+    assert found is not None
+    assert found.pairs == n
+    assert found.noise_px == pytest.approx(NOISE_PX, rel=0.06)
+    assert found.length_px == 0.0
+    smooth = repeat_noise(fit, still(camera, n, shared, NOISE_PX, 80.0), range(n))
+    assert smooth is not None
+    assert 20.0 < smooth.length_px < 80.0  # what spans the board moves its pose instead
+    copies = still(camera, n, shared, 1e-6, 30.0)
+    assert repeat_noise(fit, copies, range(n)) is None
 
 
 def test_single_corners_and_images_that_disagree_are_left_out() -> None:
@@ -212,6 +261,52 @@ def test_two_groups_of_one_size_are_refused_and_named() -> None:
     few = replace(found, rival=(), images=found.images[:5], left_out=dict.fromkeys(range(7), "?"))
     with pytest.raises(NotIdentifiable, match="only 5 of 12 images agree"):
         refuse_divided(few, [f"{k}.jpg" for k in range(12)])
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("model", "reason"),
+    [
+        ("equidistant", ("19 images agree on it", "plumb_bob")),
+        ("splined_radial", ("of 19 images that it has not seen better", "rational_polynomial")),
+    ],
+)
+def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
+    model: DistortionModel, reason: tuple[str, ...]
+) -> None:
+    """The many in the middle suit plumb_bob, which leaves the others out."""
+    truth = wide_camera(model)
+    seen = corners_at_the_edge(truth, 19, 2, np.random.default_rng(3))
+    plain = robust_fit(seen, WIDE_SIZE, "plumb_bob")
+    assert plain is not None
+    assert {17, 18} <= set(plain.left_out)
+    assert "part of the image that the others do not" in plain.left_out[18]
+    chosen = chosen_lens(seen, WIDE_SIZE)
+    assert chosen is not None
+    fit = chosen.fit
+    assert fit.adjusted.camera.model == model
+    assert fit.left_out == {}
+    assert all(words in chosen.reason for words in reason)
+    assert chosen.validated_px is not None
+    residual_px = np.sqrt(np.mean(np.sum(fit.adjusted.residual**2, axis=1)))
+    assert residual_px < chosen.validated_px < 1.5 * residual_px
+    errors = projection_errors(truth, fit.adjusted.camera, fit.covariance)
+    assert np.quantile(errors, 0.9) < 3.0  # corners of the image may be far from any board
+    assert sigmas(fit)[:4].max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("model", "n_edge", "seeds"),
+    [("plumb_bob", 3, [49, 0, 5002]), ("splined_radial", 9, [49, 4, 5108])],
+)
+def test_no_image_is_accused_for_the_wrong_one_of_the_two_poses_of_a_plane(
+    model: DistortionModel, n_edge: int, seeds: list[int]
+) -> None:
+    """One and two boards near the corners of these sets once started with it, and kept it."""
+    seen = corners_at_the_edge(wide_camera(model), 35, n_edge, np.random.default_rng(seeds))
+    fit = robust_fit(seen, WIDE_SIZE, model)
+    assert fit is not None
+    assert fit.left_out == {}
 
 
 def test_the_simplest_lens_model_stays_where_it_fits_and_a_given_one_is_warned_of() -> None:
@@ -298,10 +393,14 @@ def test_undetermined_cameras_are_refused_with_figures() -> None:
     refuse_undetermined(few, ["a", "b", "c"])
     factor = (0.1 * few.adjusted.camera.K[0, 0] / sigmas(few)[0]) ** 2
     weak = replace(few, all_covariance=factor * few.all_covariance)
+    knots = np.array([0.0, 0.0, -0.6, 0.0, 0.0, 0.0])
+    bent = replace(few.adjusted.camera, distortion=knots, model="splined_radial")
+    folded = replace(few, adjusted=replace(few.adjusted, camera=bent))
     pair, left_out = replace(few, images=(0, 1)), ["c: 20 of its 40 corners disagree"]
     for found, names, others, named in (
         (parallel, ["a"] * 6, [], ("focal length open", "tilt the board")),
         (weak, ["a", "b", "c"], [], ("focal length open",)),
+        (folded, ["a", "b", "c"], [], ("splined lens", "stops growing", "leave out --model")),
         (pair, ["a", "b"], [], ("2 images", "(a, b)", "3")),
         (pair, ["a", "b"], left_out, ("2 images", "1 more", left_out[0], "3")),
     ):
@@ -358,6 +457,21 @@ def test_grids_of_circles_give_the_camera_that_took_them(tmp_path: Path) -> None
     assert found.rms_px < 0.1
     with pytest.raises(UsageError, match="gaps"):
         calibrate_camera(images, spec.rsplit(":", 1)[0] + ":30mm")
+
+
+def test_an_image_with_one_row_of_corners_is_left_out_by_name(tmp_path: Path) -> None:
+    board = board_of("charuco:9x6:30mm:22mm:DICT_5X5_100")
+    paths = photographs(tmp_path, PINHOLE, 4, board=board)
+    image = np.asarray(cv2.imread(str(paths[3]), cv2.IMREAD_GRAYSCALE))
+    number, px, _ = find_corners(board, image)
+    rows = [px[number // board.grid[0] == k] for k in range(2)]
+    below = [np.polyfit(row[:, 0], row[:, 1], 1) for row in rows]
+    u, v = np.meshgrid(np.arange(PINHOLE.width), np.arange(PINHOLE.height))
+    hidden = v > 0.1 * np.polyval(below[0], u) + 0.9 * np.polyval(below[1], u)
+    cv2.imwrite(str(paths[3]), np.where(hidden, 120, image).astype(np.uint8))
+    found = calibrate_camera(tmp_path, board)
+    assert found.images[3].reason == "only corners on one line of the board were found"
+    assert [image.used > 0 for image in found.images] == [True] * 3 + [False]
 
 
 def test_ten_copies_shifted_by_some_pixels_are_one_image(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Cameras: distortion both ways, their files, and cylinders seen by them (eqs 1 to 5)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -399,6 +400,23 @@ def test_a_spline_agrees_with_the_fisheye_lens_of_opencv_all_over_the_image() ->
         spline = with_intrinsics(spline, dict(zip(names, values.tolist(), strict=True)))
     assert np.linalg.norm(spline.project(rays) - pixels, axis=1).max() < 0.01
     np.testing.assert_allclose(spline.undistort(spline.distort(xy)), xy, atol=1e-9)
+
+
+def test_a_spline_that_turns_back_inside_the_image_is_refused(tmp_path: Path) -> None:
+    K = np.array([[564.0, 0.0, 651.0], [0.0, 563.4, 497.0], [0.0, 0.0, 1.0]])
+    # The corners of the image are 1.45 focal lengths away: 83 deg off the axis without a spline.
+    knots = np.array([0.0, 0.0, 0.0, -0.15, -0.4, -0.5])
+    lens = Camera(K, 1280, 960, knots, "splined_radial")
+    theta = np.linspace(0.01, 1.5, 500)
+    u = lens.distort(np.column_stack([np.tan(theta), 0.0 * theta]))[:, 0]
+    turn = np.degrees(theta[np.argmax(u)])
+    with pytest.raises(DatasetError, match="stops growing") as refused:
+        read_camera(write(tmp_path, camera_info(lens, "any")))
+    said = float(str(refused.value).partition("growing ")[2].partition(" deg")[0])
+    assert said == pytest.approx(turn, abs=1.0)
+    # The same lens before a smaller image does so outside.
+    inner = replace(lens, K=K - [[0, 0, 331.0], [0, 0, 257.0], [0, 0, 0]], width=640, height=480)
+    assert read_camera(write(tmp_path, camera_info(inner, "any"))).model == "splined_radial"
 
 
 def test_the_covariance_of_a_converted_camera_is_kept_where_it_can_be(tmp_path: Path) -> None:

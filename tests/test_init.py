@@ -13,6 +13,7 @@ from hexapod_example import HEXAPOD
 from photograph_files import exif, jpeg
 
 from legcal import load_dataset
+from legcal.vision.image_file import camera_of_photographs, read_facts
 
 PICTURE = np.zeros((48, 64), np.uint8)
 CAMERA = """image_width: 64
@@ -307,11 +308,46 @@ def test_without_a_camera_file_photographs_that_state_a_focal_length_give_a_roug
     np.testing.assert_allclose(camera.K, [[f, 0, 31.5], [0, f, 23.5], [0, 0, 1]])
     assert camera.covariance is not None
     sigma = np.sqrt(np.diagonal(camera.covariance))
-    assert sigma[0] == pytest.approx(0.04 * f, rel=0.01)
+    assert sigma[0] == pytest.approx(np.hypot(0.04, 0.5 / np.sqrt(3.0) / 26.0) * f, rel=0.01)
     assert np.sqrt(camera.covariance[0, 0] - camera.covariance[0, 1]) < 0.01 * f  # square pixels
     assert np.count_nonzero(sigma) >= 5  # the principal point and distortion
     photographs[0].write_bytes(jpeg(PICTURE, block=exif(make="Acme", model="One", focal35=52)))
     assert init(monkeypatch, tmp_path, "--force") == 2  # a zoom
+
+
+SIZES: dict[str, tuple[tuple[int, int], dict[str, Any], tuple[float, float]]] = {
+    # size of the image [px], what EXIF says, least and largest focal length by it [px]
+    "16:9 of a 4:3 sensor": ((1600, 900), {}, (1103.2, 1201.8)),
+    "square of a 4:3 sensor": ((900, 900), {}, (764.8, 901.4)),
+    "zoom 2": ((1600, 1200), {"zoom": 2.0}, (1201.8, 2403.6)),
+    "cut by a program": ((1200, 800), {"width": 1600, "height": 1200}, (866.6, 1201.8)),
+    "long lens that is near": ((1600, 1200), {"focal": 50.0, "focus": 0.5}, (1081.6, 1322.0)),
+    "short lens": ((1600, 1200), {"focal": 4.25}, (1194.0, 1209.6)),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_a_focal_length_by_exif_is_as_uncertain_as_its_zoom_format_and_focus_leave_it(
+    name: str,
+) -> None:
+    (width, height), said, (least, most) = SIZES[name]
+    photograph = read_facts(exif(make="Acme", model="One", focal35=26, **said))
+    camera = camera_of_photographs([photograph] * 3, width, height)
+    assert camera is not None
+    assert camera.covariance is not None
+    assert camera.K[0, 0] == pytest.approx(np.sqrt(least * most), rel=0.01)
+    sigma = np.sqrt(camera.covariance[0, 0]) / camera.K[0, 0]
+    open_ = (most - least) / (most + least)
+    assert sigma == pytest.approx(np.linalg.norm([open_, 0.04, 0.0111]), rel=0.02)
+    margin = said.get("width", width) - width
+    centre = np.hypot(0.02 * width, margin / np.sqrt(12.0))
+    assert np.sqrt(camera.covariance[2, 2]) == pytest.approx(centre)
+
+
+def test_a_focal_length_by_exif_that_no_sensor_has_is_not_taken() -> None:
+    assert camera_of_photographs([read_facts(exif(focal=3.99, focal35=177))], 640, 480) is None
+    zoomed = read_facts(exif(focal=3.99, focal35=177, zoom=6.0))
+    assert camera_of_photographs([zoomed], 640, 480) is not None
 
 
 def test_nothing_is_overwritten_without_force_and_nothing_is_written_into_the_photographs(

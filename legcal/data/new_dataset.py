@@ -50,6 +50,7 @@ from legcal.vision.image_file import (
 )
 
 DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
+_WIDENED = 1.2  # uncertainty of a focal length, over the usual one, that is explained
 _EXAMPLE = "examples/hexapod"
 _EXAMPLE_KIND = OutputKind("example", "", "legcal_dataset")
 # Without results of a calibration beside them
@@ -286,11 +287,16 @@ def _made_notes(
 ) -> Iterator[str]:
     """Yield notes on cameras with nothing but a focal length from photographs."""
     for path, (camera, _) in made.items():
+        assert camera.covariance is not None
+        sigma = float(camera.covariance[0, 0] ** 0.5 / camera.K[0, 0])
+        why = ""
+        if sigma > _WIDENED * FOCAL_SIGMA:
+            why = " (a digital zoom, another format than 4:3 or 3:2 or a long lens leave it open)"
         views = [view for view, camera_path in cameras.items() if camera_path == path]
         yield (
             f"The camera of {few_views(views)} is only known by the focal length in the EXIF data "
             f"of its photographs, {camera.K[0, 0]:.0f} px, taken as good to "
-            f"{100 * FOCAL_SIGMA:.0f} %: calibrate estimates it with the machine; calibrate the "
+            f"{100 * sigma:.2g} %{why}: calibrate estimates it with the machine; calibrate the "
             "camera with legcal camera for a result that does not depend on it."
         )
 

@@ -112,6 +112,11 @@ class NumberedCorners:
     sigma_px: Array  # (k,) of either coordinate [px]
     certain: bool  # whether the numbers could be no others
 
+    def choose(self, rows: IntArray) -> NumberedCorners:
+        """Return some of them."""
+        numbers, px, sigma_px = self.number[rows], self.px[rows], self.sigma_px[rows]
+        return NumberedCorners(numbers, px, sigma_px, self.certain)
+
 
 def find_corners(
     board: Board,

@@ -334,8 +334,24 @@ def camera_table(calibration: CameraCalibration, output: Path) -> Report:
         table("image", ">corners", ">residual", ">tilt", rows=images),
         table("", ">value", ">sigma", rows=numbers),
         _model_and_sheet(calibration),
-        noise,
+        noise + _repeats(calibration),
         [*warnings, f"Written to {output}."],
+    )
+
+
+def _repeats(calibration: CameraCalibration) -> str:
+    """Return in words the noise of corners where the board stands still, and what is beyond it."""
+    repeats = calibration.repeats
+    if repeats is None:
+        return ""
+    length = "without such a correlation"
+    if repeats.length_px:
+        length = f"correlated over {repeats.length_px:.0f} px"
+    shared_px = np.sqrt(max(calibration.noise_px**2 - repeats.noise_px**2, 0.0))
+    return (
+        f" In {repeats.pairs} pair{'s' * (repeats.pairs != 1)} of images in which the board stands "
+        f"still it is {repeats.noise_px:.3f} px, {length}: {shared_px:.3f} px comes back with each "
+        "image of a pose, from print, lens or processing."
     )
 
 

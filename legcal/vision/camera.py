@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.vision.distortion import DistortionModel
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ MAX_RADIUS = 10.0  # maximum radius of the search on the sensor plane
 N_DIRECTIONS, N_RADII = 16, 256  # grid for the search of folds of a lens
 _NEWTON_STEPS, _SMALL_STEP = 8, 1e-9  # maximum number, and last size, of steps of undistortion
 _STEP = 1e-6  # step of central differences of undistortion, in units of the sensor plane
+_REACHED_PX = 0.1  # error of undistortion from which on a lens model does not reach a pixel
 
 
 @dataclass(frozen=True)
@@ -208,15 +209,35 @@ class Camera:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0)) or DISTORTION_MODELS[self.model].is_fisheye
 
+    @property
+    def corners(self) -> Array:
+        """The outermost pixels of the image, (4, 2)."""
+        x, y = self.width - 1.0, self.height - 1.0
+        return np.array([[0.0, 0.0], [x, 0.0], [0.0, y], [x, y]])
+
+    def reaches(self, pixels: Array) -> BoolArray:
+        """Return a mask (n,) of pixels (n, 2) that have a ray: none where the lens folds back."""
+        off = np.linalg.norm(self.distort(self.undistort(pixels)) - pixels, axis=1)
+        return np.asarray(off < _REACHED_PX)
+
+    @property
+    def turns_back(self) -> float | None:
+        """Angle at which a splined radius stops growing inside the image [rad]; None for others."""
+        if self.model != "splined_radial":
+            return None
+        away = (self.corners - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+        radius = _splined_radius(_ANGLES, self.distortion)[0]
+        inside = np.maximum.accumulate(radius)[:-1] < np.linalg.norm(away, axis=1).max()
+        back = np.flatnonzero(inside & (np.diff(radius) <= 0.0))
+        return float(_ANGLES[back[0]]) if len(back) else None
+
     @cached_property
     def unfolded(self) -> float:
         """Radius on the sensor plane up to which the radius in the image increases.
 
         Beyond it the polynomials of a lens may fold points back into the image.
         """
-        x, y = self.width - 1.0, self.height - 1.0
-        border = np.array([[0.0, 0.0], [x, 0.0], [0.0, y], [x, y]])
-        border_radius = float(np.linalg.norm(self.undistort(border), axis=1).max())
+        border_radius = float(np.linalg.norm(self.undistort(self.corners), axis=1).max())
         most = 1.1 * (border_radius if border_radius < MAX_RADIUS else MAX_RADIUS)
         turn = np.linspace(0.0, 2.0 * np.pi, N_DIRECTIONS, endpoint=False)
         radius = np.linspace(0.0, most, N_RADII)

@@ -258,7 +258,6 @@ PARAMETERS: Mapping[str, Mapping[str, tuple[DistortionModel, str]]] = {
 _SIGMAS = (1e-12, 1e6)  # plausible standard deviations of an intrinsic [px, or none]
 _ROUNDING = 1e-9  # rounding of correlations
 _SIGMA_DIGITS = 1e-4  # relative precision of written standard deviations
-_REACHED_PX = 0.1  # error of undistortion from which on a lens model does not reach a pixel
 _SINGULAR = 1e-9  # minimum focal length, in units of the image size
 
 
@@ -707,7 +706,14 @@ def _checked(
         )
     if problems:
         raise DatasetError(problems)
-    return Camera(K, size[0], size[1], distortion, model)
+    camera = Camera(K, size[0], size[1], distortion, model)
+    if (angle := camera.turns_back) is not None:
+        raise DatasetError(
+            f"{path}: the distortion could not be used: found a spline whose radius stops growing "
+            f"{np.rad2deg(angle):.0f} deg from the axis, inside the image, needed one that grows "
+            "as far as the corners of the image; calibrate again with boards in these corners."
+        )
+    return camera
 
 
 def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
@@ -858,9 +864,8 @@ def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
     u = np.linspace(0.0, camera.width - 1.0, _SIDES[0])
     v = np.linspace(0.0, camera.height - 1.0, _SIDES[1])
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    pixels = pixels[camera.reaches(pixels)]
     xy = camera.undistort(pixels)
-    reached = np.linalg.norm(camera.distort(xy) - pixels, axis=1) < _REACHED_PX
-    xy, pixels = xy[reached], pixels[reached]
     rays = np.column_stack([xy, np.ones(len(xy))])
     r = np.linalg.norm(xy, axis=1)
     radius = np.linalg.norm((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], axis=1)

@@ -52,9 +52,14 @@ HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
 _REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # errors of the package
 FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along diagonals
-# Standard deviations, relative to the focal length: of f (whole millimetres, cropping, focus), and
-# of the difference between fx and fy (pixels are square)
+# Standard deviations, relative to the focal length: of f (some makers count by the diagonal of
+# film, others by its width, which differ by 4 % at 4:3; lenses are nominal), and of the difference
+# between fx and fy (pixels are square)
 FOCAL_SIGMA, ASPECT_SIGMA = 0.04, 0.002
+_ROUNDING_35MM = 1.0 / np.sqrt(12.0)  # standard deviation of whole millimetres [mm]
+_NEAR_M = 0.7  # distance of machines: a focused lens stands out by the focal length over that
+_FORMATS, _SAME_FORMAT = (4.0 / 3.0, 3.0 / 2.0), 0.02  # of whole sensors: longer over shorter side
+_MOST_CROP = 20.0  # of film over a sensor, the smallest having 13; some programs write nonsense
 CENTRE_SIGMA = 0.02  # standard deviation of the principal point, in units of the longer side
 DISTORTION_SIGMA = {"k1": 0.1, "k2": 0.1}  # standard deviations of the distortion of usual lenses
 
@@ -192,21 +197,41 @@ def size_change(before: tuple[int, int], after: tuple[int, int]) -> str:
 def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) -> Camera | None:
     """Return the camera of photographs of one size by their focal length on 35 mm film.
 
-    Its covariance states the uncertainty. None if they state no focal length, or several.
+    Its covariance states the uncertainty. Some phones count a digital zoom in that focal length,
+    or the cut to another format such as 16:9, others do not: f is between both, and its standard
+    deviation reaches to either. None if they state no focal length, several, or nonsense.
     """
-    stated = {(photograph.device, photograph.focal_length_35mm) for photograph in facts}
-    focal = next(iter(stated))[1] if len(stated) == 1 else None
-    if focal is None:
+    stated = {
+        (photo.device, photo.focal_length_35mm, photo.digital_zoom or 1.0, photo.taken_size)
+        for photo in facts
+    }
+    first = facts[0]
+    focal, zoom = first.focal_length_35mm, max(first.digital_zoom or 1.0, 1.0)
+    if len(stated) != 1 or focal is None:
         return None
-    f = focal * float(np.hypot(width, height)) / float(FILM_DIAGONAL)
+    if first.focal_length and focal > _MOST_CROP * zoom * first.focal_length:
+        return None
+    longer, shorter = max(width, height), min(width, height)
+    diagonal = whole = float(np.hypot(width, height))
+    if min(abs(longer / shorter - usual) for usual in _FORMATS) > _SAME_FORMAT:
+        whole = max(longer / 0.8, shorter / 0.6)  # diagonal of the 4:3 that it was cut from
+    margin = np.zeros(2)
+    if first.taken_size and size_change(first.taken_size, (width, height)) == "cropped":
+        margin = np.array(first.taken_size) - [width, height]
+        whole = max(whole, float(np.hypot(*first.taken_size)))
+    most = zoom * whole / diagonal  # by which f may be longer
+    f = focal * diagonal / float(FILM_DIAGONAL) * float(np.sqrt(most))
+    near = 1e-3 * (first.focal_length or 0.0) / (first.focus_distance or _NEAR_M)
+    parts = FOCAL_SIGMA, _ROUNDING_35MM / focal, near, (most - 1.0) / (most + 1.0)
+    sigma_f = f * float(np.linalg.norm(parts))
     K = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     camera = Camera(K, width, height)
     names = intrinsic_names(camera)
-    centre = CENTRE_SIGMA * max(width, height)
-    sigma = {"cx": centre, "cy": centre, **DISTORTION_SIGMA}
+    cx, cy = np.hypot(CENTRE_SIGMA * longer, margin / np.sqrt(12.0)).tolist()
+    sigma = {"cx": cx, "cy": cy, **DISTORTION_SIGMA}
     C = np.diag([sigma.get(name, 0.0) ** 2 for name in names])
     focals = [names.index("fx"), names.index("fy")]
-    C[np.ix_(focals, focals)] = (FOCAL_SIGMA * f) ** 2 + np.diag([(ASPECT_SIGMA * f) ** 2] * 2)
+    C[np.ix_(focals, focals)] = sigma_f**2 + np.diag([(ASPECT_SIGMA * f) ** 2] * 2)
     return Camera(K, width, height, covariance=C)
 
 

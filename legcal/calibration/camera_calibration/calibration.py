@@ -11,13 +11,14 @@ from typing import get_args
 
 import numpy as np
 
-from legcal.calibration.camera_calibration.consensus import MIN_CORNERS
+from legcal.calibration.camera_calibration.consensus import MIN_CORNERS, RobustFit
 from legcal.calibration.camera_calibration.diagnostics import (
     MIN_IMAGES,
-    coverage,
+    Repeats,
     noise_correlation,
     refuse_divided,
     refuse_undetermined,
+    repeat_noise,
     tilts,
     too_few_images,
     warnings,
@@ -61,6 +62,7 @@ from legcal.vision.image_file import (
     read_facts,
     read_image,
 )
+from legcal.vision.point_pose import on_a_line
 from legcal.workers import Run, Workers, worker_pool
 
 _STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
@@ -193,11 +195,15 @@ class _ShownBoard:
     images: Sequence[int]  # photographs with the board in distinct poses
     unused: Mapping[int, str]  # reasons why others are not used, except for lack of corners
     note: str  # difference from the stated board
+    repeats: Sequence[tuple[int, int]]  # photographs in which it stands still
 
     @property
     def table(self) -> BoardImages:
         """The corners of all used images in one table."""
-        tables = [self.corners[k] for k in self.images]
+        return self.table_of([self.corners[k] for k in self.images])
+
+    def table_of(self, tables: Sequence[NumberedCorners]) -> BoardImages:
+        """Return the corners of some images in one table."""
         return BoardImages(
             np.repeat(np.arange(len(tables)), [len(corners.number) for corners in tables]),
             np.concatenate([self.board.points[corners.number] for corners in tables]),
@@ -243,21 +249,28 @@ def _shown_in(
     if board is None:
         raise _not_visible(stated, note)
     corners_by_image = [board_image.numbered(board) for board_image in board_images]
-    usable = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
+    enough = [k for k, corners in enumerate(corners_by_image) if len(corners.number) >= MIN_CORNERS]
+    lines = {
+        k: "only corners on one line of the board were found"
+        for k in enough
+        if on_a_line(board.points[corners_by_image[k].number])
+    }
+    usable = [k for k in enough if k not in lines]
     if not usable:
         raise _not_visible(stated, _shown_instead(stated, photographs))
-    copies = _copies(corners_by_image, usable, paths)
+    copies, repeats = _copies(corners_by_image, usable, paths)
     distinct = [k for k in usable if k not in copies]
     if len(distinct) < MIN_IMAGES:
         same = _by_reason((paths[k].name, reason) for k, reason in copies.items())
         raise too_few_images(len(distinct), [paths[k].name for k in distinct], copies=same)
-    without = set(range(len(paths))).difference(usable) if board.dictionary else ()
+    without = set(range(len(paths))).difference(enough) if board.dictionary else ()
     mirrored = {
         k: "mirrored, left and right exchanged"
         for k in sorted(without)
         if tags_are_mirrored(board, photographs.read(k))
     }
-    return _ShownBoard(board, corners_by_image, distinct, copies | mirrored, note)
+    unused = copies | mirrored | lines
+    return _ShownBoard(board, corners_by_image, distinct, unused, note, repeats)
 
 
 def _shown_instead(board: Board, photographs: _Photographs) -> str:
@@ -280,13 +293,14 @@ def _not_visible(board: Board, instead: str) -> NotVisible:
 
 def _copies(
     corners: Sequence[NumberedCorners], usable: Sequence[int], paths: Sequence[Path]
-) -> dict[int, str]:
-    """Return a reason for each image with the board in the pose of an earlier image.
+) -> tuple[dict[int, str], list[tuple[int, int]]]:
+    """Return a reason for each image with the board in the pose of an earlier one, and the pairs.
 
-    Such images share the errors of corners by lens and print, and add no information, also where
-    the picture is shifted by a few pixels.
+    Such images share the errors of corners by lens and print, and add no information on the camera,
+    also where the picture is shifted by a few pixels; but they tell the noise of corners.
     """
     copies: dict[int, str] = {}
+    pairs: list[tuple[int, int]] = []
     distinct: list[int] = []
     for k in usable:
         for i in distinct:
@@ -308,10 +322,25 @@ def _copies(
                 copies[k] = f"the board stands as in {paths[i].name}, only shifted in the picture"
             else:
                 continue
+            pairs.append((i, k))
             break
         else:
             distinct.append(k)
-    return copies
+    return copies, pairs
+
+
+def _repeats(board_in_images: _ShownBoard, fitted: RobustFit) -> Repeats | None:
+    """Return the noise of corners by images in which the board stands as in a used one."""
+    number = {board_in_images.images[k]: i for i, k in enumerate(fitted.images)}
+    tables, first = list[NumberedCorners](), list[int]()
+    for pair in board_in_images.repeats:
+        if pair[0] not in number:
+            continue
+        both = [board_in_images.corners[k] for k in pair]
+        rows = np.intersect1d(both[0].number, both[1].number, return_indices=True)[1:]
+        tables += [corners.choose(these) for corners, these in zip(both, rows, strict=True)]
+        first.append(number[pair[0]])
+    return repeat_noise(fitted, board_in_images.table_of(tables), first) if first else None
 
 
 def _result(
@@ -326,7 +355,7 @@ def _result(
     }
     square = np.sum(adjusted.residual**2, axis=1)
     tilt = tilts(fitted)
-    length_px, effective = noise_correlation(fitted)
+    length_px, effective = noise_correlation(corners, adjusted.residual)
     images = []
     for k, path in enumerate(paths):
         i = used.get(k)
@@ -353,7 +382,7 @@ def _result(
         noise_px=float(np.sqrt(square.sum() / n_dof)),
         noise_length_px=length_px,
         effective_corners=effective,
-        coverage=coverage(fitted),
+        repeats=_repeats(board_in_images, fitted),
         sheet=fitted.sheet,
         sheet_covariance=fitted.all_covariance[-len(SHEET) :, -len(SHEET) :],
         error_ratio=float(np.sqrt(fitted.ratio)),

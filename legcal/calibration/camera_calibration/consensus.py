@@ -324,7 +324,7 @@ def _is_outside(px: Array, others: Array) -> bool:
     return 2 * sum(inside) < len(inside)
 
 
-_FREE = {"zoom": ("fx", "fy"), "shift": ("cx", "cy"), "lens": ("k1", "k2")}
+_FREE = {"zoom": slice(0, 2), "shift": slice(2, 4), "lens": slice(4, 6)}  # of intrinsics
 _LIKE_A_LENS = ("", "zoom", "lens")  # faults like those of a wrong lens model
 _IN_WORDS = {
     "turned": "turned by half a turn after it was taken",
@@ -377,7 +377,8 @@ def _faults(
         back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
         add(name, adjust_board(camera, [pose], back, tolerance=tolerance))
     for name, free in _FREE.items():
-        add(name, adjust_board(camera, [T], image, free, tolerance=tolerance))
+        names = intrinsic_names(camera)[free]
+        add(name, adjust_board(camera, [T], image, names, tolerance=tolerance))
     return faults
 
 

@@ -10,11 +10,13 @@ import numpy as np
 from scipy.spatial.distance import pdist, squareform
 
 from legcal.calibration.camera_calibration.consensus import RobustFit
+from legcal.calibration.camera_calibration.starts import part_of
 from legcal.data.measurements import few
 from legcal.errors import NotIdentifiable
+from legcal.files.schema import Document
 from legcal.geometry.types import Array
-from legcal.perception.board_adjustment import SHEET
-from legcal.vision.camera import Camera
+from legcal.perception.board_adjustment import SHEET, BoardImages, adjust_board
+from legcal.vision.camera import Camera, intrinsic_names
 
 MIN_IMAGES, _FEW_IMAGES = 3, 10
 _MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # relative to the focal length
@@ -23,11 +25,11 @@ _MIN_COVERAGE = 0.5
 _MAX_RIVAL = 2.0 / 3.0  # largest size of the second group of images, relative to the first
 _LARGE_RESIDUAL_PX = 1.0
 _MANY_LEFT_OUT = 0.05  # share of corners left out that is worth a warning
-_FOLDED_PX = 0.1
 _MAX_RATIO = 25.0  # largest ratio of squared errors to the scatter of corners
 _MAX_PIXEL_RATIO = 0.01  # pixels of sensors are square
 _MAX_PRINT_RATIO, _MAX_BEND = 0.015, 0.02  # three and two standard deviations of the priors
 _SIGNIFICANT = 4.0  # standard deviations
+_SAME_PX = 1e-3  # smallest noise of corners in two photographs; copies have less
 _BESIDE = 1.05  # of the smallest distance of corners on the board: next to each other
 _OPEN_PRIOR = 0.5  # sigma of an undetermined print ratio, relative to its prior
 _IMAGES_OF_PART = 2  # images with corners in a covered part of the image
@@ -35,6 +37,14 @@ _PARTS = (
     "the top left", "the top", "the top right", "the left", "the middle", "the right",
     "the bottom left", "the bottom", "the bottom right",
 )  # fmt: skip
+
+
+class Repeats(Document):
+    """The noise of corners by pairs of images in which the board stands still."""
+
+    pairs: int
+    noise_px: float  # one standard deviation of either coordinate [px]
+    length_px: float  # its correlation length in an image [px], 0 if none is seen
 
 
 def tilts(fit: RobustFit) -> Array:
@@ -49,23 +59,53 @@ def spread(fit: RobustFit) -> float:
     return float(np.arccos(np.clip(np.abs(normal @ normal.T), 0.0, 1.0).min()))
 
 
-def coverage(fit: RobustFit) -> float:
-    """Return the share of the image inside the convex hull of all corners."""
-    hull = cv2.convexHull(fit.corners.px.astype(np.float32))
-    camera = fit.adjusted.camera
-    return float(cv2.contourArea(hull)) / (camera.width * camera.height)
+def covered(px: Array) -> Array:
+    """Return the corners (k, 2) of the convex hull of pixels (n, 2) [px]."""
+    return np.asarray(cv2.convexHull(px.astype(np.float32))[:, 0])
 
 
-def noise_correlation(fit: RobustFit) -> tuple[float, float]:
+def coverage(px: Array, camera: Camera) -> float:
+    """Return the share of the image inside the convex hull of pixels (n, 2)."""
+    return float(cv2.contourArea(covered(px))) / (camera.width * camera.height)
+
+
+def repeat_noise(fit: RobustFit, repeats: BoardImages, first: Sequence[int]) -> Repeats | None:
+    """Return the noise of corners by pairs of images in which the board stands still.
+
+    Images 2 k and 2 k + 1 of *repeats* have the same corners, the board near its pose in image
+    first[k] of the fit. What print, lens and light do to a corner is the same in both. None where
+    all pairs are copies of one photograph.
+    """
+    camera, poses = fit.adjusted.camera, fit.adjusted.T_camera_board
+    starts = [poses[k] for k in np.repeat(first, 2)]
+    names = intrinsic_names(camera)
+    adjusted = adjust_board(camera, starts, repeats, names, fit.adjusted.sheet, held=True)
+    if adjusted is None:
+        return None
+    is_first, pair = repeats.image % 2 == 0, repeats.image // 2
+    off = adjusted.residual[~is_first] - adjusted.residual[is_first]
+    square = np.bincount(pair[is_first], 0.5 * np.sum(off**2, axis=1))
+    dof = 2 * np.bincount(pair[is_first]) - 6  # a pair determines how the board moved
+    differ = square > dof * _SAME_PX**2
+    if not differ.any():
+        return None
+    part, _ = part_of(repeats, is_first & differ[pair], len(starts))
+    return Repeats(
+        pairs=int(np.count_nonzero(differ)),
+        noise_px=float(np.sqrt(square[differ].sum() / dof[differ].sum())),
+        length_px=noise_correlation(part, off[differ[pair[is_first]]])[0],
+    )
+
+
+def noise_correlation(corners: BoardImages, residual: Array) -> tuple[float, float]:
     """Return the correlation length of residuals in an image [px], and the effective corners.
 
     These are as a share of all: N / sum_ij exp(-d_ij / length), for a correlation that falls
     exponentially with the distance, through that of corners next to each other on the board. The
     length is zero where that correlation is not significant.
     """
-    corners, residual = fit.corners, fit.adjusted.residual
     products, apart_px, between = list[Array](), list[Array](), list[Array]()
-    for i in range(len(fit.images)):
+    for i in range(int(corners.image[-1]) + 1):
         of_image = corners.image == i
         px, r = corners.px[of_image], residual[of_image]
         on_board = squareform(pdist(corners.points[of_image]))
@@ -98,6 +138,12 @@ def refuse_undetermined(fit: RobustFit, names: Sequence[str], left_out: Sequence
             f"{np.degrees(spread(fit)):.0f} deg to each other, which leave the focal length open "
             f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
             f"board by 30 deg and more{_missing_tilts(fit)}."
+        )
+    if (angle := camera.turns_back) is not None:
+        raise NotIdentifiable(
+            "The camera could not be calibrated: found a splined lens whose radius stops growing "
+            f"{np.degrees(angle):.0f} deg from the axis, inside the image, needed boards as far as "
+            "the corners of the image; bring the board there, or leave out --model."
         )
     centre = camera.K[:2, 2]
     if not np.all((centre > 0.0) & (centre < [camera.width - 1.0, camera.height - 1.0])):
@@ -182,10 +228,10 @@ def warnings(fit: RobustFit) -> list[str]:
             f"and {np.degrees(largest_angle):.0f} deg to each other; tilt them by 30 deg and more"
             f"{_missing_tilts(fit)}."
         )
-    covered = coverage(fit)
-    if covered < _MIN_COVERAGE:
+    share = coverage(fit.corners.px, camera)
+    if share < _MIN_COVERAGE:
         sentences.append(
-            f"Corners cover {100.0 * covered:.0f} % of the image: the distortion outside is "
+            f"Corners cover {100.0 * share:.0f} % of the image: the distortion outside is "
             f"extrapolated; bring the board to {_uncovered_parts(fit)} of the image."
         )
     sentences += _sheet(fit)
@@ -278,11 +324,7 @@ def _missing_tilts(fit: RobustFit) -> str:
 
 def _folding(camera: Camera) -> list[str]:
     """Return a warning if the lens model maps two directions to one pixel inside the image."""
-    w, h = camera.width - 1.0, camera.height - 1.0
-    corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
-    back = camera.distort(camera.undistort(corners))
-    error = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
-    if error < _FOLDED_PX:
+    if camera.reaches(camera.corners).all():
         return []
     return [
         "The lens model folds back before the corners of the image, where no board was seen: "

@@ -15,6 +15,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from legcal.brief import brief
+from legcal.calibration.camera_calibration.diagnostics import Repeats, coverage, covered
 from legcal.calibration.camera_calibration.projection import GRID, finite, grid, projection_sigma
 from legcal.files.folder import OutputFile
 from legcal.files.schema import Document
@@ -72,7 +73,7 @@ class CameraCalibration:
     # correlation length of that in an image [px], 0 if none is seen; effective share of the corners
     noise_length_px: float
     effective_corners: float
-    coverage: float  # share of the image inside the convex hull of all corners
+    repeats: Repeats | None  # noise by images in which the board stands still; None without any
     warnings: tuple[str, ...]  # warnings, one sentence each
     # (4,): bending of the board along x and y and its twist [m], relative excess width of the print
     sheet: Array
@@ -86,6 +87,11 @@ class CameraCalibration:
     corners: Array  # (n, 4): pixels and residuals of the used corners [px]
     # metadata of the used image files: distinct values by key of the camera file
     photographs: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the image inside the convex hull of all corners."""
+        return coverage(self.corners[:, :2], self.camera)
 
     @property
     def projection_sigma(self) -> Array:
@@ -130,6 +136,7 @@ class CameraCalibration:
             noise_px=self.noise_px,
             noise_length_px=self.noise_length_px,
             effective_corners=self.effective_corners,
+            repeats=self.repeats,
             coverage=self.coverage,
             images=list(self.images),
             warnings=list(self.warnings),
@@ -162,6 +169,7 @@ class CameraDocument(Document):
     noise_px: float
     noise_length_px: float
     effective_corners: float
+    repeats: Repeats | None
     coverage: float
     images: list[BoardImage]
     warnings: list[str]
@@ -198,7 +206,9 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
         "sigma": {name: _short(s) for name, s in zip(names, sigma, strict=True)},
         "names": list(names),
         "covariance": calibration.covariance.tolist(),
-        "covered": _covered(calibration),
+        "covered": [
+            [_short(x) for x in corner] for corner in covered(calibration.corners[:, :2]).tolist()
+        ],
         "images": [
             {"image": i.image, "corners": i.used, "rms_px": _short(i.rms_px)}
             for i in calibration.images
@@ -209,12 +219,6 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
     }
     text = camera_info(calibration.camera, path.stem, {CALIBRATED: block})
     CAMERA_FILE.write(path, text)
-
-
-def _covered(calibration: CameraCalibration) -> list[list[float]]:
-    """Return the corners of the convex hull of all corners of boards [px]."""
-    points = calibration.corners[:, :2].astype(np.float32)
-    return [[_short(x) for x in corner] for corner in cv2.convexHull(points)[:, 0].tolist()]
 
 
 def _short(value: float) -> float:
@@ -290,7 +294,7 @@ def _picture(calibration: CameraCalibration) -> NDArray[np.uint8]:
     validated_px = calibration.validated_px
     lines = (
         f"{camera.model}, {len(points)} corners, {calibration.rms_px:.3f} px off (rms)"
-        + ("" if validated_px is None else f", {validated_px:.3f} px in images left out"),
+        + ("" if validated_px is None else f", {validated_px:.3f} px in held-out images"),
         f"arrows: mean residual of a cell, the longest {longest:.3f} px; green: corners, brighter "
         "where more; red: none; cross: principal point; numbers: projection, 1 sigma [px]",
     )

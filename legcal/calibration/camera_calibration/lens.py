@@ -3,7 +3,8 @@
 Every model is fitted to all images before any is left out. A richer model is taken where it
 explains images that contradict the simpler one, and others no worse, where it predicts held-out
 images better by a signed-rank test over images, or where all images together make it likelier; a
-splined one, which other programs do not read, not for the last reason.
+splined one, which other programs do not read, for the last reason only beyond doubt. One whose
+radius turns back inside the image is not taken.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _OF_RING = 3  # smallest number of corners of an image in a ring
 _SIGNIFICANCE = 1e-3  # significance level of a radial trend
 _TREND_OF_SCATTER = 0.3  # radial trend worth a warning, relative to the scatter of corners
 _BETTER = 0.01  # significance level of a better prediction, and of a likelihood ratio
+_BEYOND_DOUBT = 1e-6  # significance level of the likelihood ratio of a splined model
 _MORE_IMAGES = 1.25  # ratio of agreeing images from which predictions of others do not count
 _MIN_RANKED = 4  # smallest number of images that decide
 _LARGE_GAIN = np.log(2.0)  # ratio of mean squares that decides if every image has it
@@ -141,11 +143,10 @@ def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
             gain = np.log(
                 _mean_squares(first_of_best.residual, even) / _mean_squares(first.residual, even)
             )
-            likelier = model != _SPLINED and _is_likelier(first, first_of_best, even)
-            if not _is_positive(gain) and not likelier:
+            if not _is_positive(gain) and not _is_likelier(first, first_of_best, even):
                 continue
         fit = robust_fit(corners, size, model, first)
-        if fit is None:
+        if fit is None or fit.adjusted.camera.turns_back is not None:
             continue
         if best is None or first_of_best is None:
             alone = "no richer model predicts images better"
@@ -154,8 +155,7 @@ def chosen_lens(corners: BoardImages, size: ImageSize) -> ChosenLens | None:
             best, first_of_best = ChosenLens(fit, f"{model}: {alone}"), first
             continue
         rich = ChosenLens(fit, "")
-        likelier = model != _SPLINED and _is_likelier(first, first_of_best, even)
-        reason = _lead(best, rich, is_likelier=likelier)
+        reason = _lead(best, rich, is_likelier=_is_likelier(first, first_of_best, even))
         if reason:
             best, first_of_best = replace(rich, reason=reason), first
     return best
@@ -170,7 +170,8 @@ def _is_likelier(rich: AdjustedBoard, simple: AdjustedBoard, corners: BoardImage
     dof = max(2 * len(corners.px) - 6 * len(rich.T_camera_board) - k, 1)
     ratio = max(rich.clusters.ratio(), 2.0 * rich.cost / dof, 1e-30)
     gain = 2.0 * (simple.cost - rich.cost) / ratio
-    return bool(gain > chdtri(max(k - k_simple, 1), _BETTER))
+    level = _BEYOND_DOUBT if rich.camera.model == _SPLINED else _BETTER
+    return bool(gain > chdtri(max(k - k_simple, 1), level))
 
 
 def _lead(simple: ChosenLens, rich: ChosenLens, *, is_likelier: bool) -> str:

@@ -20,7 +20,6 @@ from legcal.vision.camera import Camera, intrinsic_names, project_with_derivativ
 GRID = 17, 13  # places along both sides of the image
 _TURNS = 10  # Gauss-Newton steps of the turn between two cameras
 _LEAST_REACHED = 0.5  # of the image, for a comparison of cameras
-_FOLDED_PX = 0.1  # error of undistortion at a pixel that the lens model does not reach
 
 
 def grid(camera: Camera) -> Array:
@@ -36,9 +35,10 @@ def projection_sigma(camera: Camera, covariance: Array) -> Array:
     That of the worst direction in the image; infinite where the lens model folds back.
     """
     pixels = grid(camera)
-    rays, reached = _rays(camera, pixels)
-    _, by_ray, J = project_with_derivatives(camera, rays[reached], intrinsic_names(camera))
-    by_turn = _by_turn(rays[reached], by_ray)
+    reached = camera.reaches(pixels)
+    rays = _rays(camera, pixels[reached])
+    _, by_ray, J = project_with_derivatives(camera, rays, intrinsic_names(camera))
+    by_turn = _by_turn(rays, by_ray)
     J = J - by_turn @ _turn_of(by_turn, J, _in_the_middle(camera, pixels[reached]))
     spread = J @ covariance @ np.swapaxes(J, 1, 2)
     sigma = np.full(len(pixels), np.inf)
@@ -46,11 +46,9 @@ def projection_sigma(camera: Camera, covariance: Array) -> Array:
     return sigma
 
 
-def _rays(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """Return rays (n, 3) at pixels, and a mask of the pixels that the lens model reaches."""
-    xy = camera.undistort(pixels)
-    off = np.linalg.norm(camera.distort(xy) - pixels, axis=1)
-    return np.column_stack([xy, np.ones(len(xy))]), off < _FOLDED_PX
+def _rays(camera: Camera, pixels: Array) -> Array:
+    """Return rays (n, 3) at pixels."""
+    return np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])
 
 
 def _in_the_middle(camera: Camera, pixels: Array) -> BoolArray:
@@ -147,7 +145,7 @@ def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
             "needed one size; give two calibrations of one camera."
         )
     pixels = grid(first)
-    rays, reached = _rays(first, pixels)
+    reached = first.reaches(pixels)
     share = float(np.mean(reached))
     if share < _LEAST_REACHED:
         raise UsageError(
@@ -155,8 +153,8 @@ def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
             f"lens model of the first one reaches, needed {100.0 * _LEAST_REACHED:.0f} %; name the "
             "other camera first, or calibrate with corners all over the image."
         )
-    pixels, rays = pixels[reached], rays[reached]
-    sigma_px = None
+    pixels = pixels[reached]
+    rays, sigma_px = _rays(first, pixels), None
     if first.covariance is not None and second.covariance is not None:
         sigma = projection_sigma(first, first.covariance)
         sigma_px = np.hypot(sigma, projection_sigma(second, second.covariance))[reached]

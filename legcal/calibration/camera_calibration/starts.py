@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import pairwise
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.board_adjustment import (
@@ -16,15 +15,17 @@ from legcal.perception.board_adjustment import (
     BoardImages,
     Sheet,
     adjust_board,
-    plane_poses,
 )
 from legcal.vision.camera import DISTORTION_MODELS, Camera, intrinsic_names, splined
 from legcal.vision.distortion import DistortionModel
-from legcal.vision.image_file import ImageSize, quiet_opencv
+from legcal.vision.image_file import ImageSize
+from legcal.vision.point_pose import closed_form_poses
 
 _FOCAL_LENGTHS = (0.25, 4.0, 13)  # smallest and largest, relative to the longer side; number
 _MAX_ANGLE = 1.45  # [rad] to the axis of a fisheye lens
-_ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1"), 12  # estimated first
+_SMALL_PX = 1e-3  # errors of a start that do not matter
+_FAR_BETTER = 0.5  # residual of a pose, over that of the pose whose place it takes
+_ROUGH, _ROUGH_ITERATIONS = ("fx", "fy", "k1", "k2"), 12  # estimated first
 
 
 def from_scratch(
@@ -32,18 +33,36 @@ def from_scratch(
 ) -> AdjustedBoard | None:
     """Return the adjustment without a start; None if no start or adjustment succeeds.
 
-    A splined lens starts as an equidistant one with k1.
+    A splined lens starts as an equidistant one. Of the two poses that show a plane almost alike
+    the better one is chosen again when the distortion is known better.
     """
     wanted, model = model, "equidistant" if model == "splined_radial" else model
-    start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(corners, size, model)
-    start = start or _by_straight_lines(corners, size, model)
+    start = _by_poses(corners, size, model)
     if start is None:
         return None
     rough = adjust_board(*start, corners, _ROUGH, max_iterations=_ROUGH_ITERATIONS)
     if rough is None:
         return None
     camera = rough.camera if wanted == model else splined(rough.camera)
-    return _all_adjusted(camera, rough.T_camera_board, Sheet.flat(corners.points), corners)
+    poses = _chosen_again(rough, corners)
+    found = _all_adjusted(camera, poses, Sheet.flat(corners.points), corners)
+    if found is None:
+        return None
+    poses = _chosen_again(found, corners)
+    is_other = any(T is not before for T, before in zip(poses, found.T_camera_board, strict=True))
+    return readjust(found, poses, corners) if is_other else found
+
+
+def _chosen_again(adjusted: AdjustedBoard, corners: BoardImages) -> list[RigidTransform]:
+    """Return the poses of an adjustment, another one where that explains a board far better."""
+    off = np.linalg.norm(adjusted.residual, axis=1)
+    poses = []
+    for (a, b), T in zip(pairwise(_bounds(corners)), adjusted.T_camera_board, strict=True):
+        other_off, other = _pose(adjusted.camera, corners, a, b)
+        if other is None or other_off > _FAR_BETTER * float(np.median(off[a:b])):
+            other = T
+        poses.append(other)
+    return poses
 
 
 def _all_adjusted(
@@ -60,23 +79,42 @@ def readjust(
     return _all_adjusted(near.camera, poses, sheet, corners)
 
 
-def _by_straight_lines(
+def _by_poses(
     corners: BoardImages, size: ImageSize, model: DistortionModel
 ) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return the distortion-free camera and poses with the flattest boards, by grid search."""
-    no_distortion = np.zeros(len(DISTORTION_MODELS[model].coefficients))
-    cameras = []
+    """Return the camera without distortion, and its poses, that explain the boards best.
+
+    Focal lengths are tried one after the other; those of boards with similar tilts are found too.
+    """
+    none = np.zeros(len(DISTORTION_MODELS[model].coefficients))
+    best: tuple[Camera, list[RigidTransform]] | None = None
+    least = np.inf
     for part in np.geomspace(*_FOCAL_LENGTHS).tolist():
-        K = _matrix(part, size)
-        cameras.append(Camera(K, size.width, size.height, no_distortion, model))
-    best = min(cameras, key=lambda camera: _non_flatness(camera, corners))
-    poses = []
-    for a, b in pairwise(_bounds(corners)):
-        candidates = plane_poses(best, corners.points[a:b], corners.px[a:b], np.ones(b - a))
-        if not candidates:
-            return None
-        poses.append(candidates[0].T_camera_plane)
-    return best, poses
+        camera = Camera(_matrix(part, size), size.width, size.height, none, model)
+        angle = np.linalg.norm(corners.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
+        if DISTORTION_MODELS[model].is_fisheye and angle.max() > _MAX_ANGLE:
+            continue
+        nearest = [_pose(camera, corners, a, b) for a, b in pairwise(_bounds(corners))]
+        off = float(np.sum([np.log(off + _SMALL_PX) for off, _ in nearest]))
+        if off < least:
+            best, least = (camera, [T for _, T in nearest if T is not None]), off
+    return best
+
+
+def _pose(
+    camera: Camera, corners: BoardImages, a: int, b: int
+) -> tuple[float, RigidTransform | None]:
+    """Return the pose of the board by corners a to b, and how far half of these are off [px]."""
+    points, px = corners.points[a:b], corners.px[a:b]
+    best: tuple[float, RigidTransform | None] = np.inf, None
+    for T in closed_form_poses(points, camera.undistort(px), cv2.SOLVEPNP_IPPE):
+        P = T.apply(points)
+        off = np.inf
+        if P[:, 2].min() > 0.0:
+            off = float(np.median(np.linalg.norm(camera.project(P) - px, axis=1)))
+        if off < best[0]:
+            best = off, T
+    return best
 
 
 def _matrix(part: float, size: ImageSize) -> Array:
@@ -86,67 +124,9 @@ def _matrix(part: float, size: ImageSize) -> Array:
     return np.array([[f, 0.0, u], [0.0, f, v], [0.0, 0.0, 1.0]])
 
 
-def _non_flatness(camera: Camera, corners: BoardImages) -> float:
-    """Return the rms residual of the corners from the best homography of each board [px]."""
-    angle = np.linalg.norm(corners.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
-    if DISTORTION_MODELS[camera.model].is_fisheye and angle.max() > _MAX_ANGLE:
-        return np.inf
-    xy = camera.undistort(corners.px)
-    residuals = []
-    for a, b in pairwise(_bounds(corners)):
-        board = corners.points[a:b, :2]
-        H, _ = cv2.findHomography(board, xy[a:b])
-        if H is None:
-            return np.inf
-        flat = np.column_stack([board, np.ones(b - a)]) @ np.asarray(H, dtype=np.float64).T
-        residuals.append(camera.distort(flat[:, :2] / flat[:, 2:]) - corners.px[a:b])
-    return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-
-
 def _bounds(corners: BoardImages) -> IntArray:
     """Return the index of the first corner of each image, and the number of corners."""
     return np.searchsorted(corners.image, np.arange(corners.image[-1] + 2))
-
-
-def _by_opencv(
-    corners: BoardImages, size: ImageSize, model: DistortionModel
-) -> tuple[Camera, list[RigidTransform]] | None:
-    """Return OpenCV's calibration with two coefficients of distortion.
-
-    OpenCV's own start fails for boards with similar tilts, so a usual focal length is tried as
-    well; the answer with the smaller residuals is taken.
-    """
-    pieces = list(pairwise(_bounds(corners)))
-    points = [corners.points[a:b].astype(np.float32) for a, b in pieces]
-    px = [corners.px[a:b].astype(np.float32) for a, b in pieces]
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    answers = []
-    for guess in (0, cv2.CALIB_USE_INTRINSIC_GUESS):
-        with suppress(cv2.error), quiet_opencv():
-            answers.append(
-                cv2.calibrateCamera(
-                    points,
-                    px,
-                    (size.width, size.height),
-                    _matrix(1.0, size),
-                    np.zeros(5),
-                    flags=flags | guess,
-                )
-            )
-    answers = [answer for answer in answers if np.isfinite(answer[0])]
-    if not answers:
-        return None
-    _, K, distortion, turns, shifts = min(answers, key=lambda answer: float(answer[0]))
-    numbers = np.concatenate([np.ravel(K), np.ravel(distortion), np.ravel(turns), np.ravel(shifts)])
-    if not np.all(np.isfinite(numbers)) or min(K[0, 0], K[1, 1]) < 1.0:
-        return None
-    coefficients = np.zeros(len(DISTORTION_MODELS[model].coefficients))
-    coefficients[:2] = np.ravel(distortion)[:2]
-    poses = [
-        RigidTransform.from_components(np.ravel(t), Rotation.from_rotvec(np.ravel(w)))
-        for w, t in zip(turns, shifts, strict=True)
-    ]
-    return Camera(np.asarray(K), size.width, size.height, coefficients, model), poses
 
 
 def part_of(
