@@ -9,11 +9,12 @@ what the posterior means of all else do to it. The predicted error contains what
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import MotorZero
 from legcal.calibration.doubts import MOST_MOVED, TOLERANCE, Doubt
@@ -39,9 +40,11 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.machine.tolerance import Tolerance
+from legcal.perception.tuning import JOINT_ERROR
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
 _WELL = 1e-3  # of the largest singular value: motions of the platform by a group that count
+LEAST_JOINT_ERROR = 0.004  # of the mean leg length: images show edges no better
 RARE = 10.0  # by which a horn on another tooth must raise twice the logarithm of a likelihood
 _SURE = 2.5  # standard deviations within which an offset is a whole number of teeth
 
@@ -141,6 +144,23 @@ class GroupEstimate:
             )
             found.append(Doubt(TOLERANCE, what, remedy))
         return found
+
+
+def joint_error(machine: Machine, tolerance: Tolerance) -> float:
+    """Return how far joints may be from where the model has them, of the mean leg length.
+
+    One standard deviation, of machines with these tolerances over their workspace.
+    """
+    fitted = fitted_legs(machine)
+    legs = in_joint_frames(fitted.nominal, machine.frame_legs)
+    poses = workspace_poses(machine, legs) if machine.is_determined else None
+    if poses is None:
+        return JOINT_ERROR
+    errors = part_errors(fitted, tolerance)
+    of_parts = _platform_by_parts(machine, legs, errors.J, poses) * errors.sigma
+    moved = float(np.sqrt(np.sum(of_parts**2, axis=1).mean()))
+    own = tolerance.joints or 0.0
+    return float(np.clip(np.hypot(moved, own) / machine.size, LEAST_JOINT_ERROR, JOINT_ERROR))
 
 
 def likely_teeth(
@@ -246,12 +266,19 @@ def _serving_platform(
     poses = workspace_poses(machine, legs) if machine.is_determined else None
     if poses is None:
         return more
+    G = _platform_by_parts(machine, legs, J, poses)
+    more[chosen] = np.linalg.lstsq(G[:, chosen], G @ others, rcond=_WELL)[0]
+    return more
+
+
+def _platform_by_parts(
+    machine: Machine, legs: tuple[Leg, ...], J: Array, poses: Sequence[RigidTransform]
+) -> Array:
+    """Return motions of the platform (n, m) [m] by errors of parts; rotations as joints move."""
     parametrization = parametrization_of(machine, twists=True)
     G = platform_by_parameters(legs, parametrization, machine.frame_legs, poses) @ J
     arm = 0.5 * float(np.linalg.norm(np.ptp(machine.B_platform, axis=0)))
-    G = (G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, len(others))
-    more[chosen] = np.linalg.lstsq(G[:, chosen], G @ others, rcond=_WELL)[0]
-    return more
+    return np.asarray((G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, J.shape[1]))
 
 
 def _with_group(

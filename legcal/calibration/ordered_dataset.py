@@ -41,6 +41,7 @@ from legcal.machine.redundancy import Contradiction, contradictions
 from legcal.paper.criteria import Criteria
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs
+from legcal.perception.tuning import JOINT_ERROR
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -74,6 +75,7 @@ class OrderedDataset:
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
     # edge pairs of searched images, by row among all images
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
+    joint_error: float = JOINT_ERROR  # of the joints of the model, of the mean leg length
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -92,6 +94,7 @@ class OrderedDataset:
             keep=self.order.reorder(self.plan.keep),
             edge_pairs=self.edge_pairs,
             clicked_poses=self._clicked_poses(),
+            joint_error=self.joint_error,
         )
 
     @property

@@ -40,7 +40,7 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.recognition import place_views
-from legcal.perception.tuning import WINDOW_PX
+from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision.camera import Camera, shared_cameras
@@ -83,6 +83,7 @@ class Photographs:
     # T_base_platform by clicks, by pose, where readings do not give it
     clicked_poses: FreePosesOf = field(default_factory=dict)
     still: dict[int, Still] = field(default_factory=dict)  # static background by view
+    joint_error: float = JOINT_ERROR  # of the joints of the model, of the mean leg length
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -123,6 +124,7 @@ class Photographs:
             {} if blur is None else blur,
             self.machine.occluders,
             self.still,
+            self.joint_error,
         )
 
     def with_found(self, outlines: Outlines) -> Outlines:
