@@ -92,7 +92,7 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
         [
             Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),
             "Calibrate it:",
-            Text(printable(f"  legcal calibrate {folder} -o OUT{length}"), overflow="ignore"),
+            printable(f"  legcal calibrate {folder} -o OUT{length}"),
         ]
     )
 
