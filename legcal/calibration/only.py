@@ -9,6 +9,7 @@ what the posterior means of all else do to it. The predicted error contains what
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -40,11 +41,9 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.machine.tolerance import Tolerance
-from legcal.perception.tuning import JOINT_ERROR
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
 _WELL = 1e-3  # of the largest singular value: motions of the platform by a group that count
-LEAST_JOINT_ERROR = 0.004  # of the mean leg length: images show edges no better
 RARE = 10.0  # by which a horn on another tooth must raise twice the logarithm of a likelihood
 _SURE = 2.5  # standard deviations within which an offset is a whole number of teeth
 
@@ -149,18 +148,18 @@ class GroupEstimate:
 def joint_error(machine: Machine, tolerance: Tolerance) -> float:
     """Return how far joints may be from where the model has them, of the mean leg length.
 
-    One standard deviation, of machines with these tolerances over their workspace.
+    One standard deviation, of machines with these tolerances over their workspace; infinite where
+    readings do not determine the pose.
     """
     fitted = fitted_legs(machine)
     legs = in_joint_frames(fitted.nominal, machine.frame_legs)
     poses = workspace_poses(machine, legs) if machine.is_determined else None
     if poses is None:
-        return JOINT_ERROR
+        return math.inf
     errors = part_errors(fitted, tolerance)
     of_parts = _platform_by_parts(machine, legs, errors.J, poses) * errors.sigma
     moved = float(np.sqrt(np.sum(of_parts**2, axis=1).mean()))
-    own = tolerance.joints or 0.0
-    return float(np.clip(np.hypot(moved, own) / machine.size, LEAST_JOINT_ERROR, JOINT_ERROR))
+    return math.hypot(moved, tolerance.joints or 0.0) / machine.size
 
 
 def likely_teeth(

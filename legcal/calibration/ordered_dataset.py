@@ -6,6 +6,7 @@ never reordered later. A job restores the order of the files at its end.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -41,7 +42,6 @@ from legcal.machine.redundancy import Contradiction, contradictions
 from legcal.paper.criteria import Criteria
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs
-from legcal.perception.tuning import JOINT_ERROR
 from legcal.progress import Report
 from legcal.workers import Run
 
@@ -75,7 +75,7 @@ class OrderedDataset:
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
     # edge pairs of searched images, by row among all images
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
-    joint_error: float = JOINT_ERROR  # of the joints of the model, of the mean leg length
+    joint_error: float = math.inf  # of joints of the model where stated, of the mean leg length
 
     @cached_property
     def photographs(self) -> Photographs:
