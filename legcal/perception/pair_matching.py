@@ -219,9 +219,9 @@ class Pictures:
 
     def take(self, chosen: slice) -> Pictures:
         """Return some of the pictures."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
-        some = {name: x[chosen] for name, x in arrays.items() if isinstance(x, np.ndarray)}
-        return replace(self, **some)
+        names = (one.name for one in fields(self) if one.name not in ("size", "joint_error"))
+        arrays = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
     def blocks(self, n_poses: int) -> Iterator[Pictures]:
         """Return the pictures a few at a time, fewer for more poses, so that arrays stay small."""
