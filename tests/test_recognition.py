@@ -336,7 +336,8 @@ def test_where_joints_are_known_well_a_symmetric_machine_is_not_taken_for_its_tu
         seen = lp.picture(ends, ends, T, rng, noise=0.3)
         for joint_error in right:
             placed = place_camera([replace(seen, joint_error=joint_error)], 6)
-            right[joint_error] += (placed.pose().inv() * T).rotation.magnitude() < 0.02
+            turn = float((placed.pose().inv() * T).rotation.magnitude())
+            right[joint_error] += turn < 0.02
     assert right[0.005] == 6
     assert right[0.015] < 5
 
