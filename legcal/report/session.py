@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
@@ -17,9 +17,11 @@ from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
-from legcal.recordings.importing import Import
 from legcal.report.machine import scale_option, understood
 from legcal.report.render import Report, heading, report, table
+
+if TYPE_CHECKING:
+    from legcal.recordings.importing import Import
 
 _MOST = 200  # largest number of rows shown
 _OFTEN = 0.5  # smallest share of images with a leg without a remark
