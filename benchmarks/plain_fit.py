@@ -60,7 +60,7 @@ class PlainFit:
         sine = radius[o.radius, None] / distance
         h = np.sqrt(1.0 - sine**2) * np.cross(u, a) / distance
         h = h + o.epsilon[:, None] * sine * foot / distance
-        lens = o.constants[:, :8].reshape(-1, 2, 2, 2)  # by end, J^-T transposed
+        lens = o.lens  # by end, J^-T transposed
         normal = np.einsum("neji,nj->nei", lens, h[:, :2])
         offset = np.einsum("nei,ni->ne", o.feet, h[:, :2]) + h[:, 2:]
         offset = offset / np.linalg.norm(normal, axis=2)

@@ -26,7 +26,6 @@ from legcal import detect
 from legcal.calibration.detection import Detection
 from legcal.data.outlines import axes_from_outlines
 from legcal.geometry.types import Array, IntArray
-from legcal.vision.cylinder import angles_of_direction
 
 N_ORIENTATIONS = 6
 MIN_UPRIGHT = np.sin(np.radians(5.0))  # component of a leg along the image y axis
@@ -67,7 +66,7 @@ def axis_deviations(found: Detection) -> Iterator[tuple[str, Array]]:
     for group in np.unique(groups, axis=0):
         chosen = np.all(groups == group, axis=1)
         u, M = axes.u[chosen], axes.M[chosen]
-        psi, theta = angles_of_direction(u)
+        psi, theta = np.arctan2(u[:, 2], np.hypot(*u[:, :2].T)), np.arctan2(-u[:, 0], u[:, 1])
         quantities = {"psi": np.degrees(psi), "theta": np.degrees(np.unwrap(theta))}
         if np.abs(u[:, 1]).min() > MIN_UPRIGHT:
             M_LS = M - u * (M[:, 1] / u[:, 1])[:, None]

@@ -6,17 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from boards import before
-from rendering import photograph
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages, Sheet
-from legcal.simulation.board import PlacedBoard
-from legcal.simulation.rendering.appearance import Appearance
 from legcal.vision.board import Board
-from legcal.vision.camera import Camera, intrinsic_names, project_with_derivatives
-from legcal.vision.distortion import DistortionModel
+from legcal.vision.camera import Camera
 from legcal.vision.image_file import ImageSize
 
 SIZE = ImageSize(640, 480)
@@ -24,20 +20,6 @@ BOARD = Board("chessboard", 9, 6, 0.03)
 NOISE_PX = 0.03
 _K = np.array([[560.0, 0.0, 312.4], [0.0, 563.0, 244.9], [0.0, 0.0, 1.0]])
 _WIDE = np.array([[260.0, 0.0, 318.0], [0.0, 261.0, 237.5], [0.0, 0.0, 1.0]])
-WIDE_SIZE = ImageSize(1280, 960)
-_WIDE_BOARD = Board("chessboard", 9, 7, 1.0)
-_MIDDLE, _EDGE = (0.0, 0.55), (0.85, 1.05)  # distance from the centre, in half diagonals of 600 px
-WIDE_LENSES: dict[DistortionModel, tuple[float, list[float]]] = {
-    "plumb_bob": (1100.0, [-0.28, 0.11, 4e-4, -3e-4, -0.02]),
-    "rational_polynomial": (850.0, [0.55, -0.08, 4e-4, -3e-4, 0.01, 0.9, 0.02, 0.01]),
-    "thin_prism": (
-        850.0,
-        [0.55, -0.08, 4e-4, -3e-4, 0.01, 0.9, 0.02, 0.01, 2e-3, -4e-4, -1.5e-3, 3e-4],
-    ),
-    "equidistant": (564.0, [0.0705, -0.0234, 0.0164, -0.0014]),
-    # rectilinear in the middle and compressed at the edge, as of phones and action cameras
-    "splined_radial": (560.0, [0.022, 0.096, 0.19, 0.21, 0.12, 0.02]),
-}
 PINHOLE = Camera(np.diag([0.7, 0.7, 1.0]) @ _K, 448, 336, np.zeros(5))
 CAMERAS = {
     "plumb_bob": Camera(_K, 640, 480, np.array([-0.25, 0.1, 1e-3, -5e-4, -0.02])),
@@ -52,7 +34,7 @@ CAMERAS = {
 }
 
 
-def _with_noise(
+def with_noise(
     image: list[Array],
     points: list[Array],
     px: list[Array],
@@ -116,64 +98,7 @@ def seen_corners(
         points.append(BOARD.points[inside])
         error = root @ rng.standard_normal(at.shape) if smooth else np.zeros(at.shape)
         px.append((at + error)[inside])
-    return _with_noise(image, points, px, noise, rng)
-
-
-def wide_camera(model: DistortionModel) -> Camera:
-    """Return a camera with a lens of a model."""
-    f, coefficients = WIDE_LENSES[model]
-    K = np.array([[f, 0.0, 651.0], [0.0, 0.999 * f, 497.0], [0.0, 0.0, 1.0]])
-    return Camera(K, WIDE_SIZE.width, WIDE_SIZE.height, np.array(coefficients), model)
-
-
-def corners_at_the_edge(
-    camera: Camera, n_images: int, n_edge: int, rng: np.random.Generator
-) -> BoardImages:
-    """Return the corners of boards of which the last *n_edge* are near corners of the image."""
-    size = np.array([camera.width, camera.height])
-    centre = _WIDE_BOARD.points.mean(axis=0)
-    image: list[Array] = []
-    points, px = [], []
-    while len(image) < n_images:
-        is_edge = len(image) >= n_images - n_edge
-        turn = rng.choice([0.6, 2.5, 3.8, 5.6]) if is_edge else rng.uniform(0.0, 2.0 * np.pi)
-        away = 600.0 * rng.uniform(*(_EDGE if is_edge else _MIDDLE))
-        at = 0.5 * size + away * np.array([np.cos(turn), np.sin(turn)])
-        if not np.all((at > 30.0) & (at < size - 30.0)):
-            continue
-        ray = np.array([*camera.undistort(at), 1.0])
-        ray /= np.linalg.norm(ray)
-        lean, slope = rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(5.0, 40.0))
-        R = Rotation.from_rotvec(0.6 * np.cross([0.0, 0.0, 1.0], ray))
-        R = R * Rotation.from_rotvec(slope * np.array([np.cos(lean), np.sin(lean), 0.0]))
-        R = R * Rotation.from_rotvec([0.0, 0.0, rng.uniform(-0.4, 0.4)])
-        distance = rng.uniform(9.0, 15.0) * camera.K[0, 0] / 564.0
-        T = RigidTransform.from_components(distance * ray - R.apply(centre), R)
-        P = T.apply(_WIDE_BOARD.points)
-        ahead = P[:, 2] > 0.05 * distance
-        seen = camera.project(np.where(ahead[:, None], P, [0.0, 0.0, 1.0]))
-        back = camera.undistort(seen)  # polynomials fold far points back into the image
-        is_true = np.linalg.norm(back - P[:, :2] / P[:, 2:], axis=1) < 1e-3
-        inside = ahead & is_true & np.all((seen > 4.0) & (seen < size - 5.0), axis=1)
-        if np.count_nonzero(inside) < 16:
-            continue
-        image.append(np.full(np.count_nonzero(inside), len(image)))
-        points.append(_WIDE_BOARD.points[inside])
-        px.append(seen[inside])
-    return _with_noise(image, points, px, NOISE_PX, rng)
-
-
-def projection_errors(truth: Camera, camera: Camera, covariance: Array) -> Array:
-    """Return errors of the projection over the whole image, in stated standard deviations."""
-    u, v = np.meshgrid(np.linspace(0, truth.width - 1, 17), np.linspace(0, truth.height - 1, 13))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    xy = truth.undistort(pixels)
-    xy = xy[np.linalg.norm(truth.distort(xy) - pixels, axis=1) < 0.01]
-    off = camera.distort(xy) - truth.distort(xy)
-    rays = np.column_stack([xy, np.ones(len(xy))])
-    J = project_with_derivatives(camera, rays, intrinsic_names(camera))[2]
-    covariance = J @ covariance @ np.swapaxes(J, 1, 2)
-    return np.asarray(np.sqrt(np.sum(off**2, axis=1) / np.trace(covariance, axis1=1, axis2=2)))
+    return with_noise(image, points, px, noise, rng)
 
 
 def drawings(
@@ -208,27 +133,6 @@ def drawings(
         image += rng.normal(0.0, 1.5, image.shape)
         paths.append(folder / f"b{k:02d}.png")
         assert cv2.imwrite(str(paths[-1]), np.clip(np.rint(image), 0, 255).astype(np.uint8))
-    return paths
-
-
-def photographs(
-    folder: Path, camera: Camera, n_images: int, *, board: Board = BOARD, seed: int = 0
-) -> list[Path]:
-    """Write photographs of a board from all sides; return their paths."""
-    rng = np.random.default_rng(seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    plate = PlacedBoard(board, RigidTransform.identity()).plate
-    looks = Appearance.clean(
-        blur=0.6, gamma=1.0, electrons=15_000.0, read_noise=8.0, bits=8, samples=21
-    )
-    paths = []
-    for k in range(n_images):
-        turn = np.array([0.5 * np.cos(2.4 * k), 0.5 * np.sin(2.4 * k), rng.uniform(-0.3, 0.3)])
-        distance = rng.uniform(0.36, 0.44) * (0.55 if camera.model == "equidistant" else 1.0)
-        aside = RigidTransform.from_translation([*rng.uniform(-0.03, 0.03, 2), 0.0])
-        image = photograph([plate], camera, before(board, distance, turn) * aside, looks, rng)
-        paths.append(folder / f"b{k:02d}.png")
-        assert cv2.imwrite(str(paths[-1]), np.asarray(image))
     return paths
 
 

@@ -6,11 +6,9 @@ import contextlib
 import io
 import json
 import os
-import re
-import runpy
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.util import find_spec
@@ -50,29 +48,32 @@ def words_of(command: str, places: dict[str, Path | str]) -> list[str]:
     return [word.format(**places) for word in shlex.split(command)]
 
 
-def run(words: Sequence[str], *, inside: Path | None = None, many: bool = False) -> Outcome:
+def run(words: Sequence[str], *, inside: Path | None = None) -> Outcome:
     """Run ``legcal WORDS``, in a folder if one is given.
 
-    Images are searched in this process unless ``many`` is true: for the few of a test, starting
-    others takes longer than the work. Where the command says that a benchmark replaces it, that is
-    run as it says.
+    Images are searched in this process: for the few of a test, starting others takes longer than
+    the work.
     """
-    outcome = _run(cli.main, ["legcal", *words], inside=inside, many=many)
+    out, err = io.StringIO(), io.StringIO()
+    folder = contextlib.chdir(inside) if inside is not None else contextlib.nullcontext()
+    code: object = None
+    with (
+        patch.object(sys, "argv", ["legcal", *words]),
+        patch.object(typer.main, "get_command", _get_command),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        folder,
+        _one_processor(),
+    ):
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code
+    assert isinstance(code, int), f"{' '.join(words)} did not exit"
+    outcome = Outcome(code, out.getvalue(), err.getvalue())
     if "--json" in words and outcome.out:
         fits_schema(words, outcome.document)
-    replaced = re.search(
-        r"run python (benchmarks/\w+\.py .*)\.(\"}}\n)?$", outcome.out + outcome.err
-    )
-    if replaced is None:
-        return outcome
-    assert outcome.code == 2
-    program, *words = shlex.split(json.loads(f'"{replaced[1]}"'))
-    return _run(
-        lambda: runpy.run_path(str(ROOT / program), run_name="__main__"),
-        [program, *words],
-        inside=inside,
-        many=many,
-    )
+    return outcome
 
 
 def fits_schema(words: Sequence[str], document: dict[str, Any]) -> None:
@@ -87,30 +88,6 @@ def fits_schema(words: Sequence[str], document: dict[str, Any]) -> None:
     schema = json.loads(path.read_text(encoding="utf-8"))
     problems = Draft202012Validator(schema).iter_errors(document)
     assert [error.message for error in problems] == [], name
-
-
-def _run(
-    program: Callable[[], object], words: Sequence[str], *, inside: Path | None, many: bool
-) -> Outcome:
-    """Run a program that exits."""
-    out, err = io.StringIO(), io.StringIO()
-    folder = contextlib.chdir(inside) if inside is not None else contextlib.nullcontext()
-    processors = contextlib.nullcontext() if many else _one_processor()
-    code: object = None
-    with (
-        patch.object(sys, "argv", list(words)),
-        patch.object(typer.main, "get_command", _get_command),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        folder,
-        processors,
-    ):
-        try:
-            program()
-        except SystemExit as stop:
-            code = stop.code
-    assert isinstance(code, int), f"{' '.join(words)} did not exit"
-    return Outcome(code, out.getvalue(), err.getvalue())
 
 
 @contextlib.contextmanager

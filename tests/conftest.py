@@ -95,38 +95,13 @@ def answered_signals() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _commands_and_models_are_read_once() -> Iterator[None]:
-    """Read signatures of commands, and models and their workspaces, once a process."""
+    """Read signatures of commands, make machines and sample their workspaces once a process."""
     import typer.main
 
     from legcal.machine import configurations, loader
-    from legcal.machine.files import find_model
-    from legcal.machine.formats import read_source as read
 
     load = loader._load
-    sources: dict[bytes, Source] = {}
     machines: dict[tuple[str, ...], Machine] = {}
-
-    def as_read_before(path: Path, content: bytes) -> Source | None:
-        """Return the source of a file of this content if the URDF beside it is the same too."""
-        source = sources.get(content)
-        if source is None:
-            return None
-        urdf = path.parent / os.path.relpath(source.urdf.path, source.path.parent)
-        if not urdf.is_file() or urdf.read_bytes() != source.urdf.content:
-            return None
-        return replace(source, path=path, urdf=replace(source.urdf, path=urdf))
-
-    def read_once(model: str | Path, *stated: str | None) -> Source:
-        path = find_model(model)
-        if path.suffix != ".yaml" or not path.is_file() or any(stated):
-            return read(model, *stated)
-        content = path.read_bytes()
-        source = as_read_before(path, content)
-        if source is None:
-            source = read(model)
-            if source.file.legcal is not None and source.file.legcal.urdf is not None:
-                sources[content] = source
-        return source
 
     def load_once(source: Source) -> Machine:
         if source.file.legcal is None or source.notes or source.poses is not None:
@@ -152,7 +127,6 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
         patch.setattr(configurations, "random_poses", draw_once)
-        patch.setattr(loader, "read_source", read_once)
         patch.setattr(loader, "_load", load_once)
         yield
 

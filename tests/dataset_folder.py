@@ -1,6 +1,6 @@
 """A small dataset folder of the example hexapod, for tests to spoil."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -54,27 +54,20 @@ class Folder:
         """Write dataset.yaml, the table and the camera file."""
         (self.path / "dataset.yaml").write_text(yaml.safe_dump(self.entry, sort_keys=False))
         (self.path / "camera_info.yaml").write_text(yaml.safe_dump(self.camera))
-        lines = [[str(row.get(name, "")) for name in self.columns] for row in self.rows]
-        self.write_table([self.columns, *lines])
-        return self.path
-
-    def write_table(self, lines: Sequence[Sequence[str]]) -> Path:
-        """Write the table from its cells."""
-        text = "".join(",".join(cells) + "\n" for cells in lines)
+        rows = [[str(row.get(name, "")) for name in self.columns] for row in self.rows]
+        text = "".join(",".join(cells) + "\n" for cells in [self.columns, *rows])
         (self.path / "measurements.csv").write_text(text)
         return self.path
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Folder:
-    """Two views with two images each; reading the mechanism again is spared."""
-    monkeypatch.setattr("legcal.data.dataset.load_mechanism", lambda path: hexapod())
-    (tmp_path / "set" / "images").mkdir(parents=True)
+def small_folder(path: Path) -> Folder:
+    """Write two views with two images of nothing each."""
+    (path / "images").mkdir(parents=True)
     rows: list[dict[str, Any]] = []
     for seed, (view, number) in enumerate([("c1", 1), ("c1", 2), ("c2", 1), ("c2", 2)]):
         name = f"images/{view}_{number}.png"
         picture = np.random.default_rng(seed).integers(0, 255, (SIZE[1], SIZE[0]), dtype=np.uint8)
-        cv2.imwrite(str(tmp_path / "set" / name), picture)
+        cv2.imwrite(str(path / name), picture)
         rows.append({"view": view, "image": name, **dict(zip(JOINTS, readings(seed), strict=True))})
     pose = {"xyz": [0.9, 0.1, 0.2], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
     entry = {
@@ -87,9 +80,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Folder:
             "c2": {"camera": "camera_info.yaml", "legs": ["leg1", "leg4"]},
         },
     }
-    made = Folder(tmp_path / "set", rows, ["view", "image", *JOINTS], entry)
+    made = Folder(path, rows, ["view", "image", *JOINTS], entry)
     made.write()
     return made
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Folder:
+    """A folder to spoil; reading the mechanism again is spared."""
+    monkeypatch.setattr("legcal.data.dataset.load_mechanism", lambda path: hexapod())
+    return small_folder(tmp_path / "set")
 
 
 def dataset_of_readings(

@@ -121,39 +121,31 @@ def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outl
 def machine_session(
     name: str,
     *,
-    length: float = 0.003,
-    angle: float = float(np.deg2rad(1.0)),
     camera_shift: float = 0.003,
     camera_turn: float = float(np.deg2rad(1.0)),
     n_views: int = 3,
     n_poses: int = 6,
     camera: Camera = LENS,
-    seed: int = 0,
 ) -> MachineSession:
     """Return a session of a shipped model, or of one that is made, which is the truth.
 
     Parameters
     ----------
     name : str
-        The model.
-    length, angle : float
-        How wrong every coordinate, offset and constant length [m] and every axis [rad] of the
-        nominal legs is.
+        The model; all lengths of the nominal legs are 3 mm wrong and all axes 1 deg.
     camera_shift, camera_turn : float
         How far each camera is from where it is said to be [m], [rad].
     n_views, n_poses : int
         Number of cameras, and of poses that each of them sees alone.
     camera : Camera
         Intrinsics of all cameras.
-    seed : int
-        Of poses and errors.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     machine = true_machine(name)
     legs, fitted = geometries(machine), fitted_legs(machine)
     R, t = _poses(machine, legs, n_views * n_poses, rng)
     fitted = replace(fitted, home=platform_in_base(machine, machine.home))
-    wrong = (length, angle, camera_shift, camera_turn)
+    wrong = (0.003, float(np.deg2rad(1.0)), camera_shift, camera_turn)
     return session_of_legs(fitted, R, t, _readings(fitted, R, t), wrong, n_views, camera, rng)
 
 
@@ -331,9 +323,7 @@ def irregular_hexapod(
     *,
     camera: Camera = PINHOLE,
     legs_seen: int = 4,
-    radius: float = RADIUS,
     sigma_px: float = 0.1,
-    seed: int = 0,
     shared_poses: bool = False,
     n_views: int = 3,
     repeats: int = 1,
@@ -342,7 +332,7 @@ def irregular_hexapod(
 
     The platform comes to each place so many times in succession, with a pose of its own each time.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     T_cameras = tuple(_camera_around(angle) for angle in 0.4 + 2.1 * np.arange(n_views))
     n_rows = n_views * n_poses_per_view
     view = np.repeat(np.arange(n_views), n_poses_per_view)
@@ -369,7 +359,7 @@ def irregular_hexapod(
         [Viewpoint(f"c{v + 1}", camera, T.inv()) for v, T in enumerate(T_cameras)],
         view,
         pose,
-        {(j, "rod"): radius for j in range(6)},
+        {(j, "rod"): RADIUS for j in range(6)},
         nearest,
         span=(0.08, 0.92),
     )

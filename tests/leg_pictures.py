@@ -143,9 +143,8 @@ def pictures(
     rng: np.random.Generator,
     *,
     joint_error: float = 0.0,
-    missing: float = 0.0,
     n_clutter: int = 0,
-    noise: float = 0.0,
+    **difficulty: float,
 ) -> list[Picture]:
     """Return pictures of a machine that differs from its model by a joint error [m]."""
     A = made.A + rng.uniform(-joint_error, joint_error, made.A.shape)
@@ -157,9 +156,8 @@ def pictures(
             (true.A, true.posed(T)),
             T_base_camera,
             rng,
-            missing=missing,
             n_clutter=n_clutter,
-            noise=noise,
+            **difficulty,
         )
         for T in platforms
     ]

@@ -53,20 +53,7 @@ def closed_leg(
 
 
 def twist_of(leg: Leg, R: Array, t: Array) -> float:
-    """Return the twist with which a leg without an S joint closes at a pose.
-
-    Parameters
-    ----------
-    leg : Leg
-        The leg; its own twist does not matter.
-    R, t : (3, 3) and (3,) array
-        Rotation and position [m] of the platform's frame in that of the base.
-
-    Returns
-    -------
-    float
-        In (-pi/2, pi/2] [rad].
-    """
+    """Return the twist in (-pi/2, pi/2] with which a leg without an S joint closes at a pose."""
     sine, cosine = (
         float(leg_equations(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
         for twist in (0.0, -0.5 * np.pi)

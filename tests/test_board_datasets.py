@@ -56,21 +56,6 @@ def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: 
     assert np.bincount(dataset.corners.row).tolist() == [6, 6]
 
 
-def test_a_hand_held_view_needs_no_board(folder: Folder) -> None:
-    _hold(folder, "c1")
-    del folder.entry["board"]
-    m = load_dataset(folder.write()).measurements
-    assert [view.name for view in m.views] == ["c1-1", "c1-2", "c2"]
-
-
-def test_hand_held_views_count_in_the_order_of_the_table(folder: Folder) -> None:
-    _hold(folder, "c2")
-    folder.rows.reverse()
-    m = load_dataset(folder.write()).measurements
-    assert [m.views[v].name for v in m.view] == ["c2-1", "c2-2", "c1", "c1"]
-    assert m.image[0].endswith("c2_2.png")
-
-
 # The table of corners.
 
 MEASUREMENTS = Measurements(

@@ -37,12 +37,10 @@ from legcal.perception.board_corners import (
     shown_board,
     tags_are_mirrored,
 )
-from legcal.perception.corner_lattice import Lattice, find_lattice
 from legcal.progress import no_progress
-from legcal.simulation.board import INK, BoardPrint
 from legcal.vision.board import Board, board_document, board_of, charuco_board, parse_board
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey, reduced, rescaled
+from legcal.vision.image_file import reduced, rescaled
 from legcal.workers import in_turn
 
 PATH = Path("dataset.yaml")
@@ -125,40 +123,6 @@ def test_targets_of_kalibr_and_basalt_are_boards(tmp_path: Path, target: str, bo
             board_of(path)
 
 
-# What is printed.
-
-
-@pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize(("columns", "rows"), [(5, 4), (4, 5)])
-def test_the_print_of_a_charuco_board_is_that_of_opencv(
-    columns: int, rows: int, legacy: bool
-) -> None:
-    board = replace(CHARUCO, columns=columns, rows=rows, marker=0.03, legacy=legacy)
-    side = 40
-    theirs = np.asarray(charuco_board(board).generateImage((side * columns, side * rows))) > 127
-    v, u = np.indices(theirs.shape) + 0.5
-    sheet = BoardPrint.of(board, 2, np.zeros(2))
-    x, y = u.ravel() * 0.04 / side, v.ravel() * 0.04 / side
-    ours = sheet.reflectance(x, y).reshape(theirs.shape) > 0.5
-    assert np.mean(ours != theirs) < 1e-3
-
-
-def test_tags_are_those_of_kalibr_and_the_first_square_of_a_chessboard_is_black() -> None:
-    # Tag 0 of the family 36h11, its code row by row from the top left, y upwards.
-    sheet = BoardPrint.of(APRILGRID, 5, np.zeros(2))
-    module = 0.06 / 10
-    k = np.arange(6)
-    x, y = np.meshgrid((2.5 + k) * module, (7.5 - k) * module)
-    code = sheet.reflectance(x.ravel(), y.ravel()) > 0.5
-    assert int("".join("1" if white else "0" for white in code), 2) == 0xD5D628584
-    gap = 0.3 * 0.06
-    black = sheet.reflectance(np.array([-0.5 * gap, 0.03]), np.array([-0.5 * gap, -0.5 * gap]))
-    assert black == pytest.approx([INK, 1.0])
-    sheet = BoardPrint.of(CHESSBOARD, 2, np.zeros(2))
-    x, y = np.array([-0.015, 0.015, 0.015]), np.array([-0.015, -0.015, 0.015])
-    assert sheet.reflectance(x, y) == pytest.approx([INK, 1.0, INK])
-
-
 # Where its corners are in an image.
 
 
@@ -228,31 +192,6 @@ def test_a_hidden_corner_is_left_out_and_the_others_are_found(board: Board) -> N
     assert np.abs(px - seen_at(board, T)[number]).max() < 0.3
 
 
-def test_corners_are_found_from_a_few_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search sees three columns of a chessboard, and one tag of a grid."""
-
-    def first_columns(grey: Grey) -> Lattice:
-        found = find_lattice(grey)
-        first = found.ij[:, 0] < 3
-        return Lattice(found.ij[first], found.px[first], found.black[first])
-
-    grid, T, image = plain_picture("aprilgrid")
-    corners, columns, image = seen_at(grid, T), grid.grid[0], image.copy()
-    for first in (2 * i + 2 * j * columns for j in range(grid.rows) for i in range(grid.columns)):
-        tag = corners[[first, first + 1, first + columns + 1, first + columns]]
-        if first:
-            inside = tag.mean(axis=0) + 0.7 * (tag - tag.mean(axis=0))
-            image = cv2.fillConvexPoly(image, np.rint(inside).astype(np.int32), float(image.min()))
-    number, px, _ = find_corners(grid, image)
-    assert np.array_equal(number, np.arange(grid.n_corners))
-    assert np.abs(px - corners).max() < 0.1
-    board, T, image = plain_picture("chessboard")
-    monkeypatch.setattr("legcal.perception.board_corners.find_lattice", first_columns)
-    number, px, _ = find_corners(board, image)
-    assert np.array_equal(number, np.arange(board.n_corners))
-    assert np.abs(px - seen_at(board, T)).max() < 0.1
-
-
 def test_a_part_of_a_chessboard_is_placed_on_it_but_not_for_certain() -> None:
     board, T, image = plain_picture("chessboard")
     assert len(find_corners(replace(board, columns=5), image)[0]) == 0  # it is larger
@@ -286,12 +225,9 @@ def _shows(columns: int, rows: int) -> SeenBoard:
     [
         ((9, 6), [(8, 5)] * 2 + [(9, 6)], (9, 6), ""),
         ((9, 6), [(9, 6)] * 3 + [(8, 5), (4, 3)], (10, 7), "write --board chessboard:10x7:30mm."),
-        ((9, 6), [(6, 9)] * 2 + [(12, 3)], (10, 7), "10x7 squares (9x6 inner corners)"),
-        ((9, 6), [(5, 4), (8, 3)], (9, 6), ""),
         ((9, 6), [(7, 5)] * 3, (9, 6), "8 x 6 squares or that part of one is seen in 3 of its 3"),
         ((11, 8), [(6, 9)] * 2 + [(5, 4)], (11, 8), "10 x 7 squares or that part of one"),
         ((9, 6), [(10, 7)] * 2 + [(8, 5)], None, "a chessboard of 11 x 8 squares in 2 of its 3"),
-        ((9, 6), [], (9, 6), ""),
     ],
 )  # fmt: skip
 def test_squares_or_inner_corners_are_told_by_all_images(
@@ -306,9 +242,8 @@ def test_squares_or_inner_corners_are_told_by_all_images(
     assert bool(words) == bool(said)
 
 
-@pytest.mark.parametrize("kind", ["aprilgrid", "charuco"])
-def test_tags_of_a_mirrored_picture_are_named(kind: str) -> None:
-    board, _, image = plain_picture(kind)
+def test_tags_of_a_mirrored_picture_are_named() -> None:
+    board, _, image = plain_picture("aprilgrid")
     assert not tags_are_mirrored(board, image)
     assert tags_are_mirrored(board, image[:, ::-1])
     assert "mirrored" in str(describe_image(board, image[:, ::-1]))
@@ -324,19 +259,6 @@ def test_the_older_pattern_of_a_charuco_board_is_told_by_its_markers(legacy: boo
     shown, said = shown_board(replace(board, legacy=not legacy), [seen])
     assert shown is None
     assert ("without :legacy" if not legacy else "of the older pattern (:legacy)") in said
-
-
-@pytest.mark.parametrize("numbers", [[[0] * 6], [[0, 1, 2, 12, 13, 14], [60, 61, 62, 72, 73, 74]]])
-def test_tags_that_fit_no_layout_are_said(numbers: list[list[int]]) -> None:
-    board = Board("charuco", 7, 5, 0.04, marker=0.029, dictionary="DICT_APRILTAG_36h11")
-    x, y = np.meshgrid([60.0, 240.0, 420.0], [60.0, 240.0])
-    at, none = np.column_stack([x.ravel(), y.ravel()]), np.zeros((0, 2))
-    empty = replace(_shows(0, 0), kind="charuco", ij=none.astype(np.intp), px=none)
-    seen = [replace(empty, tags=np.array(of_image), tags_px=at) for of_image in numbers]
-    shown, said = shown_board(board, seen)
-    assert shown is None
-    expected = "the same marker (number 0) 6 times in an image"
-    assert said == expected if len(numbers) == 1 else "2 of its 2 images" in said
 
 
 def _measurements(per_view: tuple[int, ...], camera: Camera = LENS) -> Measurements:

@@ -17,9 +17,9 @@ import yaml
 from csv_rows import read_rows, write_rows
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
 from scipy.spatial.transform import RigidTransform
-from simulated import files_of, settings, simulated
+from simulated import files_of, simulated
 
-from legcal import calibrate, evaluate, load_mechanism, load_result, simulate
+from legcal import calibrate, evaluate, load_mechanism, load_result
 from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
@@ -48,15 +48,6 @@ def _change(path: Path, change: Callable[[Rows], Rows]) -> Rows:
     rows = change(read_rows(path))
     write_rows(path, rows)
     return rows
-
-
-def _edited(given: Path, folder: Path, edit: Callable[[dict[str, Any]], Any]) -> Path:
-    """Copy a dataset with its dataset.yaml edited."""
-    shutil.copytree(given, folder)
-    document = yaml.safe_load((folder / "dataset.yaml").read_text())
-    edit(document)
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-    return folder
 
 
 def _pulls(calibration: Calibration, truth: Path) -> Array:
@@ -270,50 +261,6 @@ def test_images_that_cannot_do_it_are_refused_in_one_sentence(
 
 
 # A calibration board.
-
-
-@pytest.fixture(scope="module")
-def in_the_hand(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[SimulatedDataset, Calibration]:
-    """3 x 4 images of a board and a machine, each by a camera whose pose is not given."""
-    folder = tmp_path_factory.mktemp("board")
-    given = settings(board="chessboard", hand_held=True, views=3, poses=4, seed=4)
-    made = simulate(PLANAR, folder / "set", given)
-    return made, calibrate(made.folder, output=folder / "result")
-
-
-@pytest.mark.system
-def test_a_board_joins_views_that_share_no_leg(
-    in_the_hand: tuple[SimulatedDataset, Calibration], tmp_path: Path
-) -> None:
-    """One leg a view: steps 3 and 4 have too little, yet 1 and 2 place the cameras."""
-
-    def one_leg(entry: dict[str, Any]) -> None:
-        for number, view in enumerate(entry["views"].values(), 1):
-            view["legs"] = [f"leg{number}"]
-
-    calibration = calibrate(_edited(in_the_hand[0].folder, tmp_path / "single", one_leg))
-    assert calibration.steps.legs is None
-    assert np.sqrt(np.mean(_pulls(calibration, in_the_hand[0].truth_path) ** 2)) < 2.0
-
-
-@pytest.mark.system
-def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
-    in_the_hand: tuple[SimulatedDataset, Calibration], tmp_path: Path
-) -> None:
-    made, right = in_the_hand
-    assert right.solution.T_frame_board["base"] is not None
-    board = right.dataset.machine.T_base_Rb * right.solution.T_frame_board["base"]
-    wrong = {
-        "xyz": (board.translation + np.array([0.0, 0.0, 0.2])).tolist(),
-        "quat_xyzw": board.rotation.as_quat().tolist(),
-    }
-    folder = _edited(made.folder, tmp_path / "w", lambda e: e["board"].update(T_base_board=wrong))
-    found = calibrate(folder)
-    assert any("stands 200 mm" in note for note in found.notes)
-    A, right_A = (c.solution.parameters.base_joints for c in (found, right))
-    np.testing.assert_allclose(A, right_A, atol=1e-8)
 
 
 def test_corners_that_are_too_few_are_refused(tmp_path: Path) -> None:

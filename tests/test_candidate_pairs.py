@@ -1,6 +1,5 @@
 """Straight edges of pictures, and the pairs of them that may be the outlines of a leg."""
 
-import leg_pictures as lp
 import numpy as np
 import pytest
 from rendering import Bar, Light, render
@@ -8,7 +7,6 @@ from rendering import Bar, Light, render
 from legcal.geometry.types import Array
 from legcal.perception.candidate_pairs import (
     EdgeSegments,
-    find_candidate_pairs,
     find_segments,
     segments_of_reduced,
     still_picture,
@@ -20,9 +18,9 @@ from legcal.vision.image_file import Grey
 F = 500.0
 
 
-def _camera(distortion: Array | None = None, scale: int = 1) -> Camera:
-    K = scale * np.array([[F, 0.0, 160.2], [0.0, F, 119.1], [0.0, 0.0, 1.0 / scale]])
-    return Camera(K, 320 * scale, 240 * scale, np.zeros(0) if distortion is None else distortion)
+def _camera(distortion: Array | None = None) -> Camera:
+    K = np.array([[F, 0.0, 160.2], [0.0, F, 119.1], [0.0, 0.0, 1.0]])
+    return Camera(K, 320, 240, np.zeros(0) if distortion is None else distortion)
 
 
 BARS = [
@@ -32,16 +30,8 @@ BARS = [
 SHADELESS = Light(ambient=1.0, diffuse=0.0)
 
 
-def _picture(camera: Camera, bars: list[Bar], background: float = 40.0, noise: float = 1.5) -> Grey:
-    image = render(
-        camera,
-        bars,
-        background,
-        SHADELESS,
-        blur=0.6,
-        noise=noise,
-        supersample=3 if camera.width == 320 else 1,
-    )
+def _picture(camera: Camera, bars: list[Bar]) -> Grey:
+    image = render(camera, bars, 40.0, SHADELESS, blur=0.6, noise=1.5, supersample=3)
     return np.clip(np.rint(image), 0, 255).astype(np.float32)
 
 
@@ -115,60 +105,3 @@ def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_
         assert length[1] > 0.9 * length[0]
         assert whole.covered[i] > 0.95
         assert crossed.covered[j] < 0.9
-
-
-def test_large_pictures_are_reduced_and_give_the_same_edges() -> None:
-    small, large = _camera(), _camera(scale=3)
-    found = [find_segments(_picture(camera, BARS), camera) for camera in (small, large)]
-    assert found[1].pixel <= found[0].pixel
-    for bar in BARS:
-        for line in _lines(bar):
-            one, two = (f.ends[_nearest(f, line)] for f in found)
-            offset = (np.concatenate([one, two]) @ line[:2] + line[2]) / np.linalg.norm(line[:2])
-            assert np.abs(offset).max() < 1.2 * found[0].pixel
-
-
-def _edges(width: float, length: float, *, turn: float = 0.0, same_way: bool = False) -> Array:
-    """Return two parallel edges about the origin, in pixels."""
-    x, y = 0.5 * length, 0.5 * width
-    lines = np.array([[[x, y], [-x, y]], [[-x, -y], [x, -y]]])
-    if same_way:
-        lines[1] = lines[1, ::-1]
-    c, s = np.cos(turn), np.sin(turn)
-    return np.asarray(lp.PIXEL * lines @ np.array([[c, s], [-s, c]]))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_outlines_of_legs_are_pairs_with_their_axes_and_widths(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    made, T = lp.machine(6, rng), lp.camera(rng)
-    targets = lp.pieces(made.A, made.posed(lp.platform(rng)))
-    for k in range(len(targets)):
-        lines = lp.edges(targets, T)[k]
-        pairs = find_candidate_pairs(lp.segments(lines))
-        assert len(pairs) == 1
-        X = T.inv().apply(targets.ends[k])
-        ends = X[:, :2] / X[:, 2:]
-        aside = (ends - pairs.middle[0]) @ pairs.normal[0]
-        assert np.abs(aside).max() < 0.2 * lp.PIXEL  # the axis is not quite in the middle
-        middle = X.mean(axis=0)
-        normal = np.cross(X[0], X[1])
-        flat = np.linalg.norm(normal[:2]) / np.linalg.norm(normal)
-        width = 2.0 * targets.radius[k] / (middle[2] * flat)
-        assert pairs.width[0].mean() == pytest.approx(width, rel=0.02)
-        assert 2.0 * pairs.half_length[0] == pytest.approx(
-            np.linalg.norm(ends[1] - ends[0]), rel=0.05
-        )
-
-
-def test_a_pair_at_which_light_changes_the_same_way_twice_counts_less() -> None:
-    opposite, same = (
-        find_candidate_pairs(lp.segments(_edges(12.0, 80.0, same_way=way))) for way in (False, True)
-    )
-    assert 0.0 < same.merit[0] < opposite.merit[0]
-    turned = find_candidate_pairs(lp.segments(_edges(12.0, 80.0, turn=1.6)))
-    assert abs(float(turned.along[0] @ [np.cos(1.6), np.sin(1.6)])) == pytest.approx(1.0)
-    np.testing.assert_allclose(turned.merit, opposite.merit)
-    np.testing.assert_allclose(turned.width, opposite.width)
-    nothing = find_segments(np.full((240, 320), 90.0, dtype=np.float32), _camera())
-    assert len(nothing) == len(find_candidate_pairs(nothing)) == 0

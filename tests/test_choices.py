@@ -61,22 +61,16 @@ def test_every_parameter_of_a_machine_can_be_named(model: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "mean", "sigma"),
+    "stated",
     [
-        ("0.3500±0.0001", 0.35, 1e-4),
-        ("0.35+-1e-4", 0.35, 1e-4),
-        ("0.35 +/- 0.0001", 0.35, 1e-4),
-        ("350±0.1mm", 0.35, 1e-4),
-        ("350 ± 0.1 mm", 0.35, 1e-4),
-        ("35cm±100um", 0.35, 1e-4),
-        ("-1.5e-2±.01", -0.015, 0.01),
+        {"leg1.offset": (0.35, 1e-4)},
+        {"leg1.offset": {"value": 0.35, "sigma": 1e-4}},
+        *({"leg1.offset": text} for text in ("0.3500±0.0001", "0.35 +/- 0.0001", "35cm±100um")),
+        *([f"leg1.offset={text}"] for text in ("0.35+-1e-4", "350±0.1mm", "350 ± .1 mm")),
     ],
 )
-def test_a_prior_is_written_as_people_write_it(text: str, mean: float, sigma: float) -> None:
-    by_option = choose([f"leg1.offset={text}"]).priors["leg1.offset"]
-    by_name = choose({"leg1.offset": text}).priors["leg1.offset"]
-    assert by_option == by_name
-    assert (by_option.mean, by_option.sigma) == (mean, sigma)
+def test_a_prior_is_written_as_people_write_it(stated: Priors) -> None:
+    assert choose(stated).priors == {"leg1.offset": Prior(0.35, 1e-4)}
 
 
 def test_a_length_is_between_two_joints_and_that_of_a_rod_is_its_own() -> None:
@@ -98,17 +92,6 @@ def test_a_length_is_between_two_joints_and_that_of_a_rod_is_its_own() -> None:
     for text in ("MEASURED±SIGMAmm", "MEASURED+-0.05mm"):
         with pytest.raises(UsageError, match="replace MEASURED by the measured value"):
             choose([f"leg1.base:leg3.base={text}"], parameters=delta)
-
-
-def test_the_four_ways_to_state_a_prior_are_one() -> None:
-    expected = {"leg1.offset": Prior(0.35, 1e-4)}
-    for priors in (
-        {"leg1.offset": (0.35, 1e-4)},
-        {"leg1.offset": {"value": 0.35, "sigma": 1e-4}},
-        {"leg1.offset": "0.35±0.0001"},
-        ["leg1.offset=0.35±0.0001"],
-    ):
-        assert choose(priors).priors == expected
 
 
 def test_units_are_those_of_the_parameter() -> None:
@@ -182,14 +165,10 @@ def test_the_block_of_a_dataset_says_what_a_call_can_say(folder: Folder) -> None
     ("value", "found"),
     [
         ((0.35, float("inf")), "sigma inf"),
-        ((float("nan"), 0.1), "value nan"),
         ((10**400, 0.1), "beyond 1e308"),
         ((True, 0.1), "needed a value and its sigma"),
-        (("0.35", "0.1"), "needed a value and its sigma"),
         ({"mean": 0.35, "sigma": 0.1}, "needed a value and its sigma"),
-        (0.35, "0.35"),
         (None, "no value"),
-        ("350±1", "350 m"),
     ],
 )
 def test_values_that_are_no_prior_are_refused(value: object, found: str) -> None:

@@ -10,9 +10,7 @@ from fuzzing.running import count_cases, drawn_cases
 from made_inputs import ROOT, made_input
 
 from legcal import LegcalError, load_mechanism
-from legcal.errors import DatasetError
 from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
-from legcal.vision.camera_file import read_camera
 
 
 def test_mutated_files_are_used_or_refused_in_time_and_memory() -> None:
@@ -63,15 +61,3 @@ def test_a_hyphen_inside_a_name_is_part_of_it(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
     machine = load_mechanism(tmp_path / "models/hexapod.yaml")
     assert "leg1-prismatic=a@b+c" in machine.urdf.joints
-
-
-def test_cameras_are_as_large_as_the_largest_sensors(tmp_path: Path) -> None:
-    text = (made_input("plain") / "camera_info.yaml").read_text()
-    for width, height, is_read in ((12_000, 8_300, True), (12_000, 8_400, False)):
-        path = tmp_path / f"{height}.yaml"
-        path.write_text(text.replace("width: 64", f"width: {width}").replace("48", f"{height}"))
-        if is_read:
-            assert read_camera(path).width == width
-            continue
-        with pytest.raises(DatasetError, match="12000 x 8400 px, needed at most 30000"):
-            read_camera(path)

@@ -4,7 +4,6 @@ Refusals of single cells and keys are in tests/refusal_table.py; here are those 
 Python alone shows, and every kind and every fault of an image file.
 """
 
-import re
 import struct
 from pathlib import Path
 
@@ -16,22 +15,18 @@ from dataset_folder import (
     ROOT,
     SIZE,
     Folder,
-    dataset_of_readings,
     folder,
-    hexapod,
     readings,
 )
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
-from legcal.errors import DatasetError, LegcalError, Place
+from legcal.errors import DatasetError
 from legcal.geometry.types import Image
-from legcal.machine.model import Machine
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import (
     BadImage,
-    decode_image,
     image_size,
     inspect_image,
     read_image,
@@ -91,46 +86,6 @@ def test_views_keep_their_camera_pose_and_legs(folder: Folder) -> None:
     assert c2.T_base_camera is None
     (note,) = dataset.notes
     assert "view c9 has no row" in note
-
-
-def test_mechanism_is_a_path_before_it_is_a_shipped_name(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loaded: list[Path] = []
-
-    def load(path: Path) -> Machine:
-        loaded.append(path)
-        return hexapod()
-
-    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load)
-    monkeypatch.setattr("legcal.data.dataset.shipped_names", lambda: ["shipped"])
-    (folder.path / "model").touch()
-    for named in ("model", "shipped", "../elsewhere/model.yaml"):
-        folder.entry["mechanism"] = named
-        read(folder)
-    assert loaded[0] == folder.path / "model"
-    assert loaded[1].name == "shipped.yaml"
-    assert folder.path not in loaded[1].parents
-    assert loaded[2] == folder.path / "../elsewhere/model.yaml"
-
-
-def test_problems_of_cameras_and_legs_are_listed_at_once(folder: Folder) -> None:
-    folder.entry["views"]["c1"]["camera"] = "none.yaml"
-    folder.entry["views"]["c2"]["legs"] = ["leg9", "leg8"]
-    folder.write()
-    with pytest.raises(DatasetError) as refusal:
-        load_dataset(folder.path)
-    problems = refusal.value.problems
-    assert all(
-        word in problem
-        for problem, word in zip(problems, ("none.yaml", "leg9", "leg8"), strict=True)
-    )
-
-
-@pytest.mark.parametrize("name", ["none", "images", "images/c1_1.png"])
-def test_what_is_no_dataset_is_refused(folder: Folder, name: str) -> None:
-    with pytest.raises(DatasetError, match="the dataset could not be read: found no"):
-        load_dataset(folder.path / name)
 
 
 # --- measurements.csv
@@ -201,13 +156,6 @@ def test_links_are_followed_inside_the_folder_and_not_out_of_it(folder: Folder) 
         read(folder)
 
 
-@pytest.mark.parametrize("image", ["../set/images/c1_1.png", "images/a\0b.png"])
-def test_paths_that_leave_the_folder_or_cannot_be_are_refused(folder: Folder, image: str) -> None:
-    folder.rows[2]["image"] = image
-    with pytest.raises(DatasetError, match=r"row 3 .*found (it also in|a path that cannot)"):
-        read(folder)
-
-
 def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folder) -> None:
     path = folder.path / "images/c1_2.png"
     path.write_bytes(path.read_bytes()[:-30])
@@ -217,31 +165,6 @@ def test_an_image_that_was_not_checked_is_refused_where_it_is_read(folder: Folde
     for row, words in ((1, r"image .*c1_2\.png could not be read"), (3, "found an empty cell")):
         with pytest.raises(DatasetError, match=f"row {row + 1}: .*{words}"):
             dataset.image_reader([row])(0)
-
-
-def test_an_image_is_decoded_once_until_its_file_changes(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decoded = list[Path]()
-
-    def decode(path: Path, camera: Camera, named: Place) -> object:
-        decoded.append(path)
-        return decode_image(path, camera, named)
-
-    monkeypatch.setattr("legcal.data.dataset.decode_image", decode)
-    read = load_dataset(folder.write()).image_reader([0, 1])
-    first = [read(k) for k in (0, 1)]
-    again = [read(k) for k in (0, 1)]
-    assert len(decoded) == 2
-    assert all(one.dtype == np.float32 for one in again)
-    np.testing.assert_array_equal(again, first)
-    again[0][:] = 0.0
-    np.testing.assert_array_equal(read(0), first[0])
-    decoded[0].write_bytes(decoded[1].read_bytes())
-    np.testing.assert_array_equal(read(0), first[1])
-    decoded[0].unlink()
-    with pytest.raises(DatasetError, match="needed the file there"):
-        read(0)
 
 
 # --- image files
@@ -323,32 +246,3 @@ def test_orientation_in_the_exif_data_does_not_turn_the_pixels(tmp_path: Path) -
     assert turned is not None
     assert turned.shape == (W, H)
     np.testing.assert_allclose(read_image(path, CAMERA), picture(), atol=4.0)
-
-
-@pytest.mark.parametrize(
-    ("hidden", "named"),
-    [
-        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
-        ("leg\\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
-        ("leg1_", ()),
-    ],
-)
-def test_arms_without_a_visible_rod_are_told_before_images_are_looked_at(
-    hidden: str, named: tuple[str, ...], tmp_path: Path
-) -> None:
-    urdf = (ROOT / "urdf/delta.urdf").read_text()
-    bare = re.sub(rf'(<link name="{hidden}\w*">).*?</link>', r"\1</link>", urdf, flags=re.DOTALL)
-    (tmp_path / "delta.urdf").write_text(bare)
-    model = (ROOT / "models/delta.yaml").read_text().replace("../urdf/", "")
-    (tmp_path / "delta.yaml").write_text(model)
-    arms = ("arm1", "arm2", "arm3")
-    angles = np.array([[0.3, 0.2, 0.1], [0.1, 0.4, 0.3]])
-    entry = {"encoder_sigma": dict.fromkeys(arms, 1e-4)}
-    made = dataset_of_readings(tmp_path, angles, entry, "delta.yaml", arms)
-    if not named:
-        load_dataset(made, check_images=False)
-        return
-    with pytest.raises(LegcalError) as caught:
-        load_dataset(made)
-    (said,) = caught.value.problems
-    assert all(word in said for word in named), said

@@ -15,7 +15,6 @@ from legcal.data.image_choice import dataset_at, split_images
 from legcal.data.image_tables import (
     Order,
     canonical_order,
-    inverse,
     reorder_measurements,
 )
 from legcal.data.measurements import Measurements
@@ -61,18 +60,6 @@ def test_canonical_order_forgets_the_order_of_the_files(seed: int) -> None:
     assert [view.name for view in found.views] == ["left", "right"]
     assert [found.views[v].name for v in found.view] == ["left"] * 4 + ["right"] * 4
     assert found.image == ("", "", "a", "c", "", "", "b", "d")
-
-
-@FAST
-@given(SEEDS)
-def test_reordered_rows_keep_their_views_labels_poses_and_readings(seed: int) -> None:
-    order = _shuffled(seed)
-    mixed = reorder_measurements(_session(), order)
-    for new, old in enumerate(order.rows):
-        assert _names(mixed)[new] == _names(_session())[old]
-        np.testing.assert_array_equal(mixed.q[new], _session().q[old, order.legs])
-    assert np.all(np.diff(mixed.first_rows) > 0)
-    np.testing.assert_array_equal(inverse(order.rows)[order.rows], np.arange(8))
 
 
 @FAST

@@ -11,27 +11,17 @@ import numpy as np
 import pytest
 from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
-from simulated import settings, simulated
+from simulated import simulated
 
 import legcal
-from legcal import calibrate, simulate
+from legcal import calibrate
 from legcal.calibration.result import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.machine.model import Machine
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
-LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
-SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]
 READINGS = np.random.default_rng(7).uniform(0.035, 0.12, (9, 3))
-
-
-def planar(folder: Path, base: Any, platform: Any, home: Any) -> Machine:
-    """Return a 3-RPR with given joints."""
-    return made(
-        folder, name="3-rpr", type="3-RPR", base_joints=base, platform_joints=platform,
-        offsets=250, travel=[0, 250], radius={"tube": 12, "rod": 8}, home=home,
-    )  # fmt: skip
 
 
 def tripod(folder: Path, platform_radius: float) -> Machine:
@@ -58,10 +48,6 @@ def errors(calibration: Calibration, folder: Path, result: Path) -> tuple[float,
     return before, after
 
 
-def notes(calibration: Calibration) -> str:
-    return " ".join(calibration.notes)
-
-
 def with_pose(folder: Path, machine: Machine, last: Any) -> Path:
     """Write ordinary readings of a 3-RPR, and another one."""
     joints = [leg.prismatic for leg in machine.legs]
@@ -69,19 +55,6 @@ def with_pose(folder: Path, machine: Machine, last: Any) -> Path:
         writer = csv.writer(file)
         writer.writerows([joints, *READINGS.tolist(), list(last)])
     return folder / "poses.csv"
-
-
-@pytest.mark.system
-def test_collinear_joints_of_a_3_rpr_are_found(tmp_path: Path) -> None:
-    model = planar(tmp_path, LINE, SHORT_LINE, {"xyz": [20, 330, 0], "rpy_deg": [0, 0, 10]})
-    five = settings(poses=5, shared_poses=True, seed=1)
-    folder = simulate(model, tmp_path / "set", five).folder
-    calibration = calibrate(folder, output=tmp_path / "out")
-    before, after = errors(calibration, folder, tmp_path / "out")
-    assert calibration.verdict.trustworthy
-    assert calibration.platform is not None
-    assert after < 3.0 * calibration.platform.sigma.mean_displacement
-    assert before > 10.0 * after
 
 
 @pytest.mark.system

@@ -15,20 +15,19 @@ import numpy as np
 import pytest
 from command_line import run
 from csv_rows import read_rows, write_rows
+from hexapod_example import Spoiled, spoiled
 from lxml import html
 from outline_tables import assert_same
-from rendering import SIZE, RepeatedImages, repeated_images
 from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor, load_dataset
 from legcal.calibration.detection import Detection, Examination
-from legcal.data.outlines import QUALITY, Outlines, join_outlines, read_observations, unmeasured
+from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
 from legcal.perception.overlays import (
-    PartMarks,
     marks_of_image,
 )
 from legcal.viewer.click_server import ClickServer
@@ -39,17 +38,17 @@ from legcal.vision.visibility import PredictedLeg, predict_legs
 
 pytestmark = pytest.mark.usefixtures("without_remedies")
 
-BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
+BLANK = "images/blank.png"
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> RepeatedImages:
-    """A hexapod in two poses; one picture shows nothing, and another view only shows grey."""
-    made = repeated_images(tmp_path_factory.mktemp("detect") / "hexapod", n_images=2)
-    made.pictures[BLANK] = np.full_like(made.pictures[BLANK], 90.0)
-    made.pictures[ASIDE] = made.pictures[BLANK]
+def session(tmp_path_factory: pytest.TempPathFactory) -> Spoiled:
+    """Three photographs of the example, one that shows nothing, and another view of nothing."""
+    made = spoiled(tmp_path_factory.mktemp("detect") / "hexapod", 3, ("c1",))
     made.entry["views"]["c2"] = dict(made.entry["views"]["c1"])
-    made.rows.append({**made.rows[0], "view": "c2", "image": ASIDE})
+    for view, name in (("c1", BLANK), ("c2", "images/aside.png")):
+        made.rows.append({**made.rows[0], "view": view, "image": name})
+        cv2.imwrite(str(made.path / name), np.full((384, 512), 90, dtype=np.uint8))
     made.write()
     return made
 
@@ -60,12 +59,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def examined(rendered: RepeatedImages, folder: Path) -> Examination:
-    before = sorted(rendered.path.rglob("*"))
+def examined(session: Spoiled, folder: Path) -> Examination:
+    before = sorted(session.path.rglob("*"))
     with pytest.MonkeyPatch.context() as patch:  # trying mistakes would take most of the time
         patch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
-        found = doctor(rendered.path, output=folder)
-    assert sorted(rendered.path.rglob("*")) == before
+        found = doctor(session.path, output=folder)
+    assert sorted(session.path.rglob("*")) == before
     return found
 
 
@@ -75,30 +74,19 @@ def found(examined: Examination) -> Detection:
     return examined.detection
 
 
-def _one_view(rendered: RepeatedImages, folder: Path) -> RepeatedImages:
-    """Write the same view with two images."""
-    entry = json.loads(json.dumps(rendered.entry))
-    del entry["views"]["c2"]
-    rows = [dict(row) for row in rendered.rows[:2]]
-    pictures = {row["image"]: rendered.pictures[row["image"]] for row in rows}
-    made = RepeatedImages(folder / "set", rendered.machine, entry, rows, pictures)
-    made.write()
-    return made
-
-
 @pytest.fixture(scope="module")
-def of_one_view(rendered: RepeatedImages, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is found in that view, to be copied."""
+def of_one_view(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two photographs of one view and, in the folder out, what is found in them: to be copied."""
     folder = tmp_path_factory.mktemp("one")
-    detect(_one_view(rendered, folder).path, output=folder / "out")
-    return folder / "out"
+    detect(spoiled(folder / "set", 2, ("c1",)).write(), output=folder / "out")
+    return folder
 
 
 @pytest.fixture
-def one_image(rendered: RepeatedImages, of_one_view: Path, tmp_path: Path) -> RepeatedImages:
-    """That view and, beside it in the folder out, what is found in it: to be changed."""
-    shutil.copytree(of_one_view, tmp_path / "out")
-    return _one_view(rendered, tmp_path)
+def out(of_one_view: Path, tmp_path: Path) -> Path:
+    """A copy of what is found in them, beside a copy of the folder set; to be changed."""
+    shutil.copytree(of_one_view, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "out"
 
 
 def test_folder_json_and_summary_tell_the_same(
@@ -132,7 +120,7 @@ def test_folder_json_and_summary_tell_the_same(
     for file in files:
         picture = cv2.imread(str(out / file))
         assert picture is not None
-        assert picture.shape[0] > 3 * SIZE[1]  # enlarged, with a legend
+        assert picture.shape[0] > 3 * 384  # enlarged, with a legend
         assert f'href="{file}"' in page
     assert "http:" not in page.replace("http://www.w3.org/2000/svg", "")  # a name, not an address
     assert "https:" not in page
@@ -159,7 +147,7 @@ def test_the_page_holds_the_table_the_photographs_and_where_lost_outlines_should
     names, o = found.dataset.machine.leg_names, found.outlines
     seen = {
         f"{names[o.leg[i]]}\n{o.part[i]}\n{o.edge[i]}": o.h[i]
-        for i in np.flatnonzero(o.row == 2).tolist()  # of the same pose
+        for i in np.flatnonzero(o.row == 0).tolist()  # at the same readings
     }
     cam = found.dataset.measurements.views[0].camera
     lines = [(seen[key], cam.undistort(np.array(px))) for key, px in blank["expected"].items()]
@@ -192,7 +180,7 @@ def test_a_served_page_answers_its_own_browser_alone(
         for path in ("/detection.json", "/../detect.py", f"/x/../{picture}"):
             assert ask("GET", path)[0] == 404
         assert ask("GET", "/", Host="example.org")[0] == 404  # a name that leads here
-        table = "view,image,joint,u,v,sigma\nc1,images/p1_1.png,leg1.base,5,6,\n"
+        table = f"view,image,joint,u,v,sigma\nc1,{BLANK},leg1.base,5,6,\n"
         assert ask("POST", "/save", body=table)[0] == 403  # another page of the browser
         known = {TOKEN_HEADER: server.token}
         code, answer = ask("POST", "/clicks?image=0", body=table, **known)
@@ -209,56 +197,50 @@ def test_a_served_page_answers_its_own_browser_alone(
 
 
 def test_the_written_table_is_read_as_what_was_found(
-    rendered: RepeatedImages, found: Detection, folder: Path
+    session: Spoiled, found: Detection, folder: Path
 ) -> None:
-    dataset = load_dataset(rendered.path)
+    dataset = load_dataset(session.path)
     path, legs = folder / "observations.csv", dataset.machine.legs
     assert_same(read_observations(path, legs, dataset.measurements), found.outlines)
     for name in QUALITY:
         assert np.all(np.isfinite(getattr(found.outlines, name)[found.outlines.used]))
 
 
-def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
-    one_image: RepeatedImages, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
+def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(out: Path) -> None:
+    dataset = out.parent / "set"
     rows = read_rows(out / "observations.csv")
     rows[3] |= {"verdict": "rejected", "reason": "a cable", "source": "edited"}
     write_rows(out / "observations.csv", rows)
     edited = (out / "observations.csv").read_bytes()
     with pytest.raises(UsageError, match=r"found a table that was changed since .* copy it into"):
-        detect(one_image.path, output=out)
+        detect(dataset, output=out)
     assert (out / "observations.csv").read_bytes() == edited
-    (one_image.path / "observations.csv").write_bytes(edited)
-    found = detect(one_image.path, output=out)
+    (dataset / "observations.csv").write_bytes(edited)
+    found = detect(dataset, output=out)
     assert found.outlines.reason[3] == Rejection(Reason.OTHER, "a cable")
     assert found.outlines.source.count("edited") == 1
     kept = read_rows(out / "observations.csv")[3]
     assert (kept["verdict"], kept["source"], kept["contrast"]) == ("rejected", "edited", "")
 
 
-def test_an_earlier_detection_is_replaced_and_other_files_are_kept(
-    one_image: RepeatedImages, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
+def test_an_earlier_detection_is_replaced_and_other_files_are_kept(out: Path) -> None:
+    drawn, table = out / "overlays" / "c1", out.parent / "set" / "measurements.csv"
     (out / "overlays" / "mine.txt").write_text("mine")
-    del one_image.rows[1]
-    one_image.write()
-    detect(one_image.path, output=out)
-    assert [path.name for path in (out / "overlays" / "c1").iterdir()] == ["p0_0.jpg"]
+    first, second = (Path(row["image"]).stem for row in read_rows(table))
+    write_rows(table, read_rows(table)[:1])
+    detect(table.parent, output=out)
+    assert [path.name for path in drawn.iterdir()] == [f"{first}.jpg"]
     assert (out / "overlays" / "mine.txt").read_text() == "mine"
-    one_image.rows[0]["image"] = "images/p0_1.png"
-    one_image.write()
-    (out / "overlays" / "c1" / "p0_1.jpg").write_text("of somebody else")
-    with pytest.raises(UsageError, match=r"overlays/c1/p0_1.jpg, which legcal did not write"):
-        detect(one_image.path, output=out)
-    assert (out / "overlays" / "c1" / "p0_0.jpg").exists()
+    write_rows(table, [{**row, "image": f"images/{second}.png"} for row in read_rows(table)])
+    (drawn / f"{second}.jpg").write_text("of somebody else")
+    with pytest.raises(UsageError, match=rf"c1/{second}.jpg, which legcal did not write"):
+        detect(table.parent, output=out)
+    assert (drawn / f"{first}.jpg").exists()
 
 
 # What is drawn over images.
 
 A, B, RADIUS = np.array([-0.30, 0.22, 0.8]), np.array([0.25, 0.21, 0.9]), 0.012
-NAMES = ("leg1",)
 
 
 def camera(model: str) -> Camera:
@@ -296,12 +278,9 @@ def outlines(cam: Camera) -> Outlines:
     )
 
 
-def marked(cam: Camera, found: Outlines) -> PartMarks:
-    (part,) = marks_of_image(cam, found, predicted(cam), NAMES)
-    return part
-
-
-def curves(part: PartMarks) -> dict[str, Array]:
+def curves(cam: Camera, found: Outlines) -> dict[str, Array]:
+    """Return what is drawn over an image, by kind."""
+    (part,) = marks_of_image(cam, found, predicted(cam), ("leg1",))
     return {mark.kind: mark.points for mark in part.marks}
 
 
@@ -309,7 +288,7 @@ def curves(part: PartMarks) -> dict[str, Array]:
 def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model: str) -> None:
     cam = camera(model)
     found = outlines(cam)
-    drawn = curves(marked(cam, found))
+    drawn = curves(cam, found)
     assert list(drawn) == ["edge 1", "edge 2", "axis"]
     u = (B - A) / np.linalg.norm(B - A)
     for i, kind in enumerate(("edge 1", "edge 2")):
@@ -320,7 +299,7 @@ def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model:
     apart = np.linalg.norm(drawn["axis"][:, None] - on_axis, axis=2).min(axis=1)
     assert apart.max() < 0.2  # of points a third of a pixel apart
     moved = replace(found, ends=found.ends + np.array([0.0, 3.0]))  # beside their lines
-    beside = curves(marked(cam, moved))["edge 1"]
+    beside = curves(cam, moved)["edge 1"]
     assert np.abs(cam.line_offset(found.h[0], cam.undistort(beside))).max() < 1e-6
     normal = np.cross(u, A)
     assert np.abs(cam.line_offset(normal, cam.undistort(drawn["axis"]))).max() < 1e-6
@@ -328,32 +307,6 @@ def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model:
         drawn["axis"][0] + np.linspace(0.0, 1.0, 40)[:, None] * np.diff(drawn["axis"][[0, -1]].T).T
     )
     assert np.abs(chord - drawn["axis"]).max() > 1.0  # the lens bends it
-
-
-def test_what_is_not_used_is_drawn_with_its_reason_and_what_is_missing_where_it_should_be() -> None:
-    cam = camera("plumb_bob")
-    found = outlines(cam)
-    one = replace(
-        found, used=np.array([True, False]), reason=(USED, Rejection(Reason.CONTRAST, "2.1"))
-    )
-    part = marked(cam, one)
-    assert list(curves(part)) == ["edge 1", "rejected"]
-    assert (part.name, part.reason) == ("leg1", "edge 2: low contrast")
-    lost = replace(
-        found,
-        h=np.full((2, 3), np.nan),
-        ends=np.full((2, 2, 2), np.nan),
-        used=np.zeros(2, dtype=np.bool_),
-        reason=(Rejection(Reason.NO_PAIR),) * 2,
-    )
-    part = marked(cam, lost)
-    assert [mark.kind for mark in part.marks] == ["predicted", "predicted"]
-    assert part.reason == "no convincing pair of edges"
-    h = predicted(cam)[0].outlines[0]
-    for mark, line in zip(part.marks, h, strict=True):
-        assert np.abs(cam.line_offset(line, cam.undistort(mark.points))).max() < 1e-6
-    of_body = replace(one, part=("leg1_tube",) * 2, edge=np.array([3, 4]))
-    _, body = marks_of_image(cam, join_outlines([one, of_body]), predicted(cam), NAMES)
-    assert [mark.kind for mark in body.marks] == ["body", "rejected"]
-    gone = replace(lost, reason=(Rejection(Reason.OUTSIDE),) * 2)
-    assert marks_of_image(cam, gone, predicted(cam), NAMES) == []
+    weak = Rejection(Reason.CONTRAST, "2.1")
+    one = replace(found, used=np.array([True, False]), reason=(USED, weak))
+    assert list(curves(cam, one)) == ["edge 1", "rejected"]

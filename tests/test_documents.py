@@ -1,6 +1,5 @@
 """Code blocks and commands of the README and the pages: run, or held against what they are for."""
 
-import importlib
 import re
 import shlex
 import shutil
@@ -14,7 +13,7 @@ import typer
 from command_line import run
 from csv_rows import read_rows
 from evidence import records
-from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
+from hexapod_example import HEXAPOD, ROOT, TRUTH
 from pydantic import BaseModel
 
 from legcal import evaluate, load_mechanism
@@ -158,37 +157,6 @@ def test_every_yaml_of_a_page_is_what_reading_takes() -> None:
             block = parse_yaml((HEXAPOD / "dataset.yaml").read_bytes(), path, "example") | content
             validate(DatasetEntry, block, path)
     assert kinds == set(FORMATS)
-
-
-@pytest.mark.system
-def test_the_tutorial_is_a_notebook_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("myst_nb", reason="myst-nb (extra docs) is not installed")
-    nbformat = importlib.import_module("nbformat")
-    monkeypatch.syspath_prepend(ROOT / "docs")
-    notebook = importlib.import_module("conf").notebook_of(ROOT / "docs/tutorial.md")
-    nbformat.validate(notebook)
-    blocks = [text for language, text, _ in _blocks(ROOT / "docs/tutorial.md")
-              if language.startswith("{code-cell}")]  # fmt: skip
-    cells = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
-    assert len(cells) == len(blocks) > 10
-    assert all(cell in block for cell, block in zip(cells, blocks, strict=True))
-    assert not any(".md)" in cell.source for cell in notebook.cells)
-
-
-@pytest.mark.system
-def test_the_first_commands_of_the_site_run(
-    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    line = next(t for language, t, _ in _blocks(ROOT / "docs/method.md") if language == "console")
-    assert run(monkeypatch, *_words(_commands(line)[0])) == 0
-    monkeypatch.chdir(tmp_path)
-    block = next(text for language, text, _ in _blocks(ROOT / "docs/index.md") if language == "sh")
-    for line in _commands(block):
-        assert run(monkeypatch, *_words(line)) == 0
-        for name in ("observations.csv", ".legcal-cache.json"):  # so that it is quick
-            shutil.copy(example_run.folder / name, "hexapod")
 
 
 def _write_files_as_people_have_them() -> None:

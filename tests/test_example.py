@@ -24,15 +24,6 @@ def test_the_example_is_copied_and_loads(
     assert len(load_dataset(copy).measurements.image) == 45
 
 
-def test_a_folder_with_files_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    assert run(monkeypatch, "example", "-o", str(tmp_path)) == 2
-    assert "found a folder with files" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
 def test_an_installation_without_the_example_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""Residuals by a second route, derivatives of all clients by differences, steps densely."""
+"""Residuals by a second route, derivatives of all clients by differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 from camera_sessions import CAMERAS, seen_corners
 from dense_fit import (
-    allowed,
     by_differences,
     jacobian,
-    jacobians,
     projected_move,
     residuals,
-    violations,
 )
 from fit_sessions import (
     BOARD,
@@ -42,11 +39,7 @@ from legcal.calibration.location import fit as location_fit
 from legcal.calibration.location.fit import fit
 from legcal.calibration.location.tool_poses import PoseNoise
 from legcal.errors import DidNotConverge
-from legcal.estimation import solver
-from legcal.estimation.loss import PseudoHuber
 from legcal.estimation.problem import EstimationProblem, linearize
-from legcal.estimation.solver import normal_equations
-from legcal.geometry.types import Array
 from legcal.perception import board_adjustment, view_fit
 from legcal.perception.board_adjustment import adjust_board
 from legcal.perception.placement import Search, group_views
@@ -56,8 +49,6 @@ from legcal.vision.cylinder import outlines_of_axis
 
 CARRIED = ("delta", "delta-round-arms", "3-prs")  # whose joints at A move
 WITH_BODIES = "hexapod", "delta", "3-rps"
-K = 0.1
-LOSS = PseudoHuber(K**-0.5)
 CHOICES = {
     "hexapod": Choices(
         free=frozenset({"c1.fx", "c1.cy", "c1.k1"}),
@@ -137,18 +128,6 @@ def test_offsets_are_those_of_the_camera_s_lines_from_the_cylinder(camera: Camer
     assert np.abs(offsets).max() > 1.0
     linear = linearize(problem, state)
     np.testing.assert_allclose(linear.prior_r, 0.5, rtol=1e-9)  # 1 % off, known to 2 %
-
-
-@pytest.mark.parametrize("name", ["hexapod", "nategh-agheli"])
-def test_readings_are_closures_of_legs(name: str) -> None:
-    problem, state = _problem(name)
-    e, poses = problem.readings, state.platform_pose.motions
-    r = linearize(problem, state)["readings"].r[:, 0]
-    legs = [poses[k].apply(state.B[j]) - state.A[j] for k, j in zip(e.pose, e.leg, strict=True)]
-    closure = np.linalg.norm(legs, axis=1) - e.length - state.lengths[e.leg]
-    np.testing.assert_allclose(r * e.sigma, closure, atol=1e-14)
-    q = _session(name).measurements.q[e.pose, e.leg]
-    np.testing.assert_array_equal(e.length, problem.legs.sign[e.leg] * q)
 
 
 def test_corners_are_where_the_camera_projects_them() -> None:
@@ -258,104 +237,6 @@ def test_problems_of_other_clients_have_them_too(
     size = np.abs(expected).max(axis=0)
     assert np.all(size > 0.0)
     assert np.abs((J - expected) / size).max() < 1e-5
-
-
-@pytest.mark.parametrize("name", ["tricept", "3-prs"])
-def test_poses_follow_every_parameter_as_finite_differences_do(name: str) -> None:
-    problem, state = _problem(name)
-    J = jacobian(problem, linearize(problem, state))
-    assert problem.constraint is not None
-    motion = problem.constraint.tangent(problem, state)
-    assert motion is not None
-    n = problem.n_named
-    steps = np.zeros((n, problem.size))
-    steps[:, :n] = np.eye(n)
-    expected = by_differences(
-        problem, state, lambda s: residuals(problem, s), steps, projected_move
-    )
-    steps[:, problem.n_kept :] = motion.Q[:n].reshape(n, -1)
-    size = np.abs(expected).max(axis=0)
-    assert np.all(size > 0.0)
-    assert np.abs((J @ steps.T - expected) / size).max() < 1e-6
-
-
-@pytest.mark.parametrize(
-    ("name", "is_held"),
-    [("tricept", False), ("3-rpr", True)],
-)
-def test_a_step_is_that_of_the_whole_system_inside_the_constraints(
-    name: str, is_held: bool
-) -> None:
-    problem, state = _problem(name)
-    if is_held:
-        held = np.random.default_rng(1).normal(size=(problem.n_kept, 2))
-        problem = replace(problem, held_directions=np.linalg.qr(held)[0].T)
-    linear = linearize(problem, state)
-    H, g = np.zeros((problem.size, problem.size)), np.zeros(problem.size)
-    for kind, J in jacobians(problem, linear).items():
-        is_robust = kind != "priors" and problem.factor(kind).robust
-        r = linear.prior_r[:, None] if kind == "priors" else linear[kind].r
-        for ri, Ji in zip(r, J.reshape(*r.shape, problem.size), strict=True):
-            w, k = (1.0 / np.sqrt(1.0 + K * (ri @ ri)), K) if is_robust else (1.0, 0.0)
-            H += Ji.T @ (w * np.eye(len(ri)) - k * w**3 * np.outer(ri, ri)) @ Ji
-            g += w * Ji.T @ ri
-    N = allowed(problem, state)
-    assert N.shape[1] == problem.n_unknowns - len(problem.held_directions)
-    inside = N.T @ H @ N
-    scale = 1.0 / np.sqrt(np.diag(inside))
-    free = np.linalg.solve(scale[:, None] * inside * scale, scale * (N.T @ g))
-    expected = -N @ (scale * free)
-    step, predicted = normal_equations(problem, state, linear, LOSS).step(0.0)
-    assert predicted == pytest.approx(-0.5 * g @ expected, rel=1e-6)
-    wrong = step - expected
-    assert wrong @ H @ wrong < 1e-10 * predicted
-
-
-@pytest.mark.parametrize("name", ["3-upu-tilted", "tricept"])
-def test_angles_of_axes_follow_their_turns_as_finite_differences_do(name: str) -> None:
-    session = machine_session(name, n_poses=2)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    state = problem.begin(session.start)
-    step = np.where(np.arange(problem.size) < problem.n_kinematic, 0.1, 0.0)
-    state = problem.moved(state, step)  # far from nominal, where turns do not simply add up
-    J, h = problem.jacobian(state), 1e-6
-    for j in range(problem.n_named):
-        by_h = np.where(np.arange(problem.size) == j, h, 0.0)
-        ahead, behind = (
-            problem.coordinates(problem.moved(state, sign * by_h)) for sign in (1.0, -1.0)
-        )
-        np.testing.assert_allclose(J[:, j], (ahead - behind) / (2.0 * h), rtol=0.0, atol=2e-9)
-
-
-@pytest.mark.parametrize("name", ["tricept", "3-rpr"])
-def test_constraints_hold_at_every_state_that_the_solver_looks_at(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    session = machine_session(name)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    looked_at: list[State] = []
-
-    def watched(problem: FitProblem, state: State, known: object = None) -> object:
-        looked_at.append(state)
-        return linearize(problem, state)
-
-    monkeypatch.setattr(solver, "linearize", watched)
-    begin = problem.begin(session.start)
-    found = solver.minimise(problem, begin, PseudoHuber(3.0))
-    assert len(looked_at) >= 4
-    for state in looked_at:
-        assert np.abs(violations(problem, state) - _heights(problem, begin)).max() < 1e-12
-        turned = state.platform_pose.R @ np.swapaxes(state.platform_pose.R, 1, 2)
-        assert np.abs(turned - np.eye(3)).max() < 1e-14
-    assert found.cost < 1e-12
-
-
-def _heights(problem: FitProblem, begin: State) -> Array:
-    """Return what the violations of a planar machine are where its platform has its height."""
-    heights = np.zeros_like(violations(problem, begin))
-    if not problem.legs.spatial:
-        heights[-3 * problem.n_elements :][2::3] = begin.platform_pose.t[:, 2]
-    return heights
 
 
 def test_poses_that_do_not_come_to_rest_on_their_constraints_are_refused() -> None:

@@ -11,16 +11,12 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
-from dataset_folder import Folder, folder
+from dataset_folder import folder
 from pool_work import row_zero_after_row_five
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import load_dataset
-from legcal.errors import DatasetError, OutOfResources
+from legcal.errors import OutOfResources
 from legcal.files.folder import result_folder, write_atomically
-from legcal.files.schema import parse_yaml
 from legcal.signals import raise_if_stopped, stopped_by_signals
 from legcal.workers import Run, worker_pool
 
@@ -131,15 +127,6 @@ def two_processes() -> Iterator[Run]:
             yield run
 
 
-def test_what_goes_to_another_process_and_back_is_the_same_bit_by_bit(two_processes: Run) -> None:
-    rng = np.random.default_rng(0)
-    rotations = Rotation.random(64, rng=rng)
-    motions = tuple(RigidTransform.from_components(rng.normal(size=(64, 3)), rotations))
-    found = list(two_processes(motions.__getitem__, range(64)))
-    for one, other in zip(motions, found, strict=True):
-        assert one.as_matrix().tobytes() == other.as_matrix().tobytes()
-
-
 def test_libraries_have_one_thread_in_each_process_and_as_many_as_before_in_this_one(
     two_processes: Run,
 ) -> None:
@@ -208,19 +195,3 @@ def test_output_that_cannot_be_printed_is_said_on_stderr(words: str, stdout: str
     assert done.returncode == 1
     assert done.stderr.startswith("legcal: The output could not be printed: found ")
     assert done.stderr.count("\n") == 1
-
-
-# Values that no other test is about; more refusals are in refusal_table.py.
-
-
-@pytest.mark.parametrize("name", ["", "c\n1", "\x1b[31m"])
-def test_a_view_whose_name_a_table_cannot_hold_is_refused(folder: Folder, name: str) -> None:
-    folder.entry["views"][name] = folder.entry["views"]["c2"]
-    with pytest.raises(DatasetError, match="needed printable characters"):
-        load_dataset(folder.write())
-
-
-@pytest.mark.parametrize("value", ["!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"])
-def test_a_value_that_is_not_of_its_tag_is_found_by_its_line(value: str) -> None:
-    with pytest.raises(DatasetError, match=r"line 2, column 4: .* which is no \w+, needed YAML"):
-        parse_yaml(f"a: 1\nb: {value}\n".encode(), Path("x.yaml"), "file")

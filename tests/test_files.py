@@ -15,6 +15,7 @@ from legcal.files.folder import result_folder, write_atomically
 from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
 
 RESULT = '{"legcal_result": 1}'
+PIPE = "a pipe"
 REPLACED = {"calibrated.urdf": "new", "notes.txt": "mine", "result.json": RESULT}
 
 
@@ -107,16 +108,13 @@ def test_a_folder_on_another_file_system_is_filled(
     assert contents(out) == REPLACED
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, ValueError])
-def test_an_interrupted_block_leaves_everything_as_it_was(
-    out: Path, stop: type[BaseException]
-) -> None:
+def test_an_interrupted_block_leaves_everything_as_it_was(out: Path) -> None:
     def interrupt(_: Path) -> None:
-        raise stop
+        raise KeyboardInterrupt
 
     before = contents(out)
     for destination in (out, out.parent / "none" / "deep"):
-        with pytest.raises(stop):
+        with pytest.raises(KeyboardInterrupt):
             write_result(destination, interrupt)
     assert contents(out) == before
     assert list(out.parent.iterdir()) == [out]
@@ -149,17 +147,20 @@ REFUSED: dict[str, tuple[dict[str, str | None], str, str]] = {  # files, destina
     "a file": ({"out": "mine"}, "out", "out: .*found a file"),
     "below a file": ({"file": "mine"}, "file/out", "file is a file"),
     "other files": ({"notes.txt": "mine"}, "", r"other files and no result\.json"),
-    "no JSON": ({"notes.txt": "mine", "result.json": "{"}, "", r"result\.json that is damaged"),
     "other JSON": (
         {"notes.txt": "mine", "result.json": '{"a": 1}'},
         "",
         r"result\.json that is damaged",
     ),
-    "a list": ({"notes.txt": "mine", "result.json": "[]"}, "", r"result\.json that is damaged"),
     "a folder in the way": (
         {"out/result.json": RESULT, "out/calibrated.urdf/a.txt": "mine"},
         "out",
         r"calibrated\.urdf, which is a folder",
+    ),
+    "a pipe in the way": (
+        {"out/result.json": RESULT, "out/calibrated.urdf": PIPE},
+        "out",
+        r"calibrated\.urdf, which is a pipe or a device",
     ),
     "a broken link": ({"link": None}, "link", "a broken link"),
 }
@@ -173,22 +174,14 @@ def test_a_place_that_is_not_free_is_refused_and_stays(case: str, tmp_path: Path
         path.parent.mkdir(parents=True, exist_ok=True)
         if text is None:
             path.symlink_to(tmp_path / "none")
+        elif text == PIPE:
+            os.mkfifo(path)
         else:
             path.write_text(text)
     before = contents(tmp_path)
     with pytest.raises(UsageError, match=named):
         write_result(tmp_path / destination)
     assert contents(tmp_path) == before
-
-
-def test_a_pipe_in_the_way_of_a_result_is_refused_and_stays(tmp_path: Path) -> None:
-    write_result(tmp_path / "out")
-    pipe = tmp_path / "out/calibrated.urdf"
-    pipe.unlink()
-    os.mkfifo(pipe)
-    with pytest.raises(UsageError, match=r"calibrated\.urdf, which is a pipe or a device"):
-        write_result(tmp_path / "out")
-    assert pipe.is_fifo()
 
 
 @pytest.mark.parametrize(
@@ -237,11 +230,3 @@ def test_places_that_take_no_files_are_refused_before_any_work(
 )
 def test_quantities_are_in_si(text: str, units: dict[str, float], value: float) -> None:
     assert parse_quantity(text, units, "--x") == pytest.approx(value, rel=1e-15)
-
-
-@pytest.mark.parametrize(
-    "text", ["2", "2deg", "mm", "", "2 mm mm", "nan mm", "inf", "1e999m", "-2mm"]
-)
-def test_a_quantity_without_its_unit_or_below_zero_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"--x .*(number and its unit.*0\.5mm|negative '-2mm')"):
-        parse_quantity(text, LENGTH, "--x")

@@ -1,32 +1,24 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
-from dataclasses import replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
-from layouts import Layout, LegLayout, MachineSpec, write_machine
+from layouts import Layout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, segments
-from machines import ROOT, SHIPPED_URDF, SHIPPED_YAML, of_types, read_table
+from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
 from outline_sessions import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
-from legcal.calibration.identify.session import REACHED, recorded_session
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.scale import explaining_missing_scale
-from legcal.data.image_choice import dataset_at
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
-from legcal.descriptions.new_model import create_model
 from legcal.errors import LegcalError, NotIdentifiable, UsageError
 from legcal.geometry.motions import look_at, pose_distance
 from legcal.geometry.types import Array
@@ -34,7 +26,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
-from legcal.perception.free_poses import find_free_poses, require_standing_joints
+from legcal.perception.free_poses import find_free_poses
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
 from legcal.simulation.dataset import simulate
@@ -49,11 +41,6 @@ KINDS: dict[str, tuple[list[str], list[str], int]] = {
     "5-SPS": (["SS"] * 5, ["actuated"] * 5, 6),
     "6-UPS by hand": (["US"] * 6, ["passive"] * 6, 6),
     "3-RPS, two motors": (["RS"] * 3, ["actuated"] * 2 + ["passive"], 3),
-}
-LAYOUTS = {
-    "hung from the base": Layout(),
-    "hung from the platform": Layout((LegLayout(hung="platform", sphere=False),)),
-    "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True),)),
 }
 
 
@@ -73,27 +60,6 @@ def without_motors(machine: Path, *left: str) -> Path:
             text = text.replace(f"{line}\n", "", 1)
     machine.write_text(text if left else text.replace("name_mot:\n", "name_mot: []\n"))
     return machine
-
-
-def _usual(kind: str, layout: str) -> bool:
-    """Say whether a kind is tried in a layout: each in one, each layout with one at least."""
-    return [*KINDS].index(kind) % len(LAYOUTS) == [*LAYOUTS].index(layout)
-
-
-@pytest.mark.parametrize(
-    ("kind", "layout"), [pair for pair in product(KINDS, LAYOUTS) if _usual(*pair)]
-)
-def test_what_moves_freely_is_said_of_every_layout(kind: str, layout: str, tmp_path: Path) -> None:
-    types, kinds, mobility = KINDS[kind]
-    machine = load_mechanism(write_machine(tmp_path, drawn(kind), LAYOUTS[layout]))
-    assert [leg.type for leg in machine.legs] == [f"{t[0]}P{t[1]}" for t in types]
-    assert [leg.kind.value for leg in machine.legs] == kinds
-    n_motors = kinds.count("actuated")
-    assert (machine.mobility, len(machine.motors)) == (mobility, n_motors)
-    assert not machine.is_determined
-    assert f"mobility {mobility}" in machine.undetermined
-    said = [note for note in machine.diagnostics if "do not determine the pose" in note]
-    assert len(said) == 1
 
 
 # --- ranks --------------------------------------------------------------------------------------
@@ -181,22 +147,8 @@ def by_hand(n_motors: int, folder: Path) -> Machine:
     return load_mechanism(without_motors(path, *motors))
 
 
-def test_poses_in_place_of_those_that_readings_do_not_give_differ(tmp_path: Path) -> None:
-    few = dataset_at(legcal.load_dataset(ROOT / "examples/hexapod"), np.arange(4))
-    session = recorded_session(replace(few, machine=by_hand(3, tmp_path)))
-    t = session.t_reached
-    assert len(t) == REACHED
-    apart = np.linalg.norm(t[:, None] - t, axis=2)[np.triu_indices(REACHED, 1)]
-    assert apart.min() > 1e-4
-
-
-@pytest.mark.parametrize(
-    ("n_motors", "by_clicks"),
-    [pytest.param(3, False, marks=pytest.mark.system), (0, True)],
-)
-def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_path: Path) -> None:
-    machine = by_hand(n_motors, tmp_path)
-    rng = np.random.default_rng(n_motors)
+def test_poses_are_found_by_clicks(tmp_path: Path) -> None:
+    machine, rng = by_hand(0, tmp_path), np.random.default_rng(0)
     true = [
         look_at(1.1 * np.array([np.cos(a), np.sin(a), 0.4]), np.array([0.0, 0.0, 0.2]))
         for a in (0.4, 2)
@@ -218,7 +170,6 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_
     B = np.array([one.apply(machine.B_platform) for one in T])[[0, 1, 2, 2]]
     A = np.broadcast_to(machine.A_base, B.shape)
     view, pose = np.array([0, 1, 0, 1]), np.array([0, 1, 2, 2])
-    q = machine.sign * (np.linalg.norm(B - A, axis=2) - machine.q0)
     cylinders = [leg.cylinders for leg in machine.legs]
     every = np.arange(machine.n_legs)
     pairs = {
@@ -239,26 +190,20 @@ def test_poses_are_found_near_rough_cameras(n_motors: int, by_clicks: bool, tmp_
         ("a", "b", "c", "d"),
         view,
         pose,
-        np.where(np.isin(every, machine.motors), q, np.nan),
+        np.full((4, machine.n_legs), np.nan),
         2e-6,
     )
-    clicked: dict[int, tuple[RigidTransform, ...]] = {}
-    if by_clicks:  # on all joints of each picture; cameras follow from those of the base
-        place = np.meshgrid(range(4), (0, 1), every, indexing="ij")
-        image, end, leg = (x.ravel() for x in place)
-        X = np.where(end[:, None] == 0, A[image, leg], B[image, leg])
-        shown = [
-            CAMERA.project(true[view[r]].inv().apply(x)) for r, x in zip(image, X, strict=True)
-        ]
-        px = np.array(shown) + 3.0 * rng.normal(size=(len(X), 2))
-        landmarks = Landmarks(image, leg, end, px, np.full(len(X), 3.0))
-        measurements, _ = place_by_landmarks(Path("a.csv"), machine, measurements, landmarks)
-        rough = [one.T_base_camera for one in measurements.views if one.T_base_camera is not None]
-        assert max(pose_distance(*both)[0] for both in zip(rough, true, strict=True)) < 0.04
-        clicked = platforms_by_landmarks(machine, measurements, landmarks)
-        assert [min(pose_distance(x, T[k])[0] for x in clicked[k]) < 0.05 for k in range(3)] == [
-            True
-        ] * 3
+    # Clicks on all joints of each picture; cameras follow from those of the base.
+    image, end, leg = (x.ravel() for x in np.meshgrid(range(4), (0, 1), every, indexing="ij"))
+    X = np.where(end[:, None] == 0, A[image, leg], B[image, leg])
+    shown = [CAMERA.project(true[view[r]].inv().apply(x)) for r, x in zip(image, X, strict=True)]
+    px = np.array(shown) + 3.0 * rng.normal(size=(len(X), 2))
+    landmarks = Landmarks(image, leg, end, px, np.full(len(X), 3.0))
+    measurements, _ = place_by_landmarks(Path("a.csv"), machine, measurements, landmarks)
+    rough = [one.T_base_camera for one in measurements.views if one.T_base_camera is not None]
+    assert max(pose_distance(*both)[0] for both in zip(rough, true, strict=True)) < 0.04
+    clicked = platforms_by_landmarks(machine, measurements, landmarks)
+    assert max(min(pose_distance(x, T[k])[0] for x in clicked[k]) for k in range(3)) < 0.05
     search = Search(
         lambda row: np.zeros((960, 1280), dtype=np.uint8),
         measurements,
@@ -301,14 +246,6 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     assert {why for why, out in zip(found.outlines.reason, open_ones, strict=True) if out} == {
         Rejection(Reason.FEW_LEGS)
     }
-
-
-def five_carriages(folder: Path) -> Machine:
-    """A Hexaglide that has lost a carriage, so that its motors leave a freedom."""
-    table = yaml.safe_load((ROOT / "models/tables/hexaglide.yaml").read_text()) | {"type": "5-PSS"}
-    del table["actuators"]["rail6"], table["base_joints"][5], table["platform_joints"][5]
-    (folder / "five.yaml").write_text(yaml.safe_dump(table))
-    return create_model(read_table(folder / "five.yaml"), folder).machine
 
 
 @pytest.mark.system
@@ -365,13 +302,6 @@ def test_a_page_to_click_on_is_written_where_no_image_can_be_searched(
     assert "data-place" in (tmp_path / "found" / "index.html").read_text()
 
 
-def test_images_are_not_searched_where_neither_poses_nor_base_joints_are_known(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(NotIdentifiable, match=r"joints at A that move.*5 motors.*observations"):
-        require_standing_joints(five_carriages(tmp_path))
-
-
 def test_no_images_are_kept_aside_where_readings_give_no_poses(
     folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -391,14 +321,6 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
         refine(session.legs, session.measurements, some, session.start)
     first = refusal.value.problems[0]
     assert ("no measured length" in first and "board on the platform" in first) == says
-
-
-def test_of_arms_one_length_is_to_be_measured() -> None:
-    session = machine_session("servo-hexapod", n_views=1, n_poses=1)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    with pytest.raises(NotIdentifiable) as refusal, explaining_missing_scale(problem):
-        raise NotIdentifiable("It is not determined.")
-    assert "state it (--length)" in refusal.value.problems[0]
 
 
 def test_legs_and_a_board_on_the_platform_calibrate_what_is_moved_by_hand(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What ``legcal inspect`` and ``legcal evaluate`` say of machines."""
+"""What ``legcal inspect`` and ``legcal evaluate`` say and draw of machines, hostile names too."""
 
 import io
 import json
@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from command_line import run
 from csv_rows import read_rows, write_rows
+from hexapod_example import ROOT
 from machines import created_hexapod, regular
 from rich.console import Console
 from scipy.spatial.transform import Rotation
@@ -21,9 +23,10 @@ from legcal.calibration.evaluation import Evaluation
 from legcal.descriptions.new_model import create_model
 from legcal.errors import DidNotConverge, ModelError
 from legcal.machine.inspection import machine_document
+from legcal.machine.model import readings_at
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import geometries
-from legcal.report.calibration import accuracy_table
+from legcal.machine.picture import draw_machine
 from legcal.report.machine import inspect_table
 
 
@@ -65,26 +68,6 @@ def test_a_result_folder_that_is_not_whole_is_called_so(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text('{"legcal_result": 1, "mach')
     with pytest.raises(ModelError, match=r"no whole result.json of a calibration, needed both"):
         load_mechanism(tmp_path)
-
-
-def test_the_table_shows_millimetres_axes_and_twists_in_80_columns() -> None:
-    text = _printed(inspect_table(_described("hexapod")))
-    assert "A in base [mm]" in text
-    assert "mobility 6, 6 motors" in text
-    row = next(line for line in text.splitlines() if line.startswith("leg5"))
-    numbers = ["0.00", "270.00", "0.00", "0.00", "195.00", "0.00", "345.00"]
-    assert row.split() == ["leg5", "SPU", *numbers, "+", "q", "10"]
-    tilted = _described("3-upu-tilted")
-    text = _printed(inspect_table(tilted))
-    assert "axis at base" in text
-    assert f"{np.degrees(tilted['legs'][1]['twist']):.3f}" in text
-    assert "axis at base" not in _printed(inspect_table(_described("3-rpr")))
-    for leg in tilted["legs"]:
-        leg["name"] = f"actuator_{leg['name']}"
-    text = _printed(inspect_table(tilted))
-    for heading in ("A in base [mm]", "R [mm]"):
-        below = text[text.index(heading) :].splitlines()[1:4]
-        assert [line.split()[0] for line in below] == [leg["name"] for leg in tilted["legs"]]
 
 
 @pytest.mark.parametrize(
@@ -141,24 +124,12 @@ def test_readings_that_one_model_does_not_reach_are_left_out_and_named(tmp_path:
     assert 0 < n < 6
     assert len(off) == 2 * n  # both views show every pose
     assert len(found.displacement) == document["poses"] == 6 - n
-    assert {rows[k]["pose"] for k in everything if k not in off}.isdisjoint(
-        rows[k]["pose"] for k in off
-    )
-    swapped = compared(everything, made.truth_path, other)
-    assert [row - 1 for row in swapped.unreached] == off
-    shown = _printed(accuracy_table(found))
-    assert f"{n} of 6 poses are left out" in shown
-
     rest = compared([k for k in everything if k not in off], other, made.truth_path)
     assert rest.document()["left_out"] == 0
     np.testing.assert_allclose(rest.displacement, found.displacement, atol=1e-9)
     with pytest.raises(DidNotConverge, match="no row whose readings both reach") as refusal:
         compared(off, other, made.truth_path)
     assert refusal.value.exit_code == 1
-    (short, *legs) = truth.legs
-    shorter_than_nothing = replace(truth, legs=(replace(short, q0=-1.0), *legs))
-    with pytest.raises(DidNotConverge, match="no row whose readings both reach"):
-        evaluate(shorter_than_nothing, truth, dataset=made.folder)
 
 
 def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good_home(
@@ -179,3 +150,56 @@ def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good
     content["legcal"]["home"] = {"xyz": xyz, "quat_xyzw": quat}
     made.yaml_path.write_text(yaml.safe_dump(content))
     assert not any("singular" in note for note in load_mechanism(made.yaml_path).diagnostics)
+
+
+def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    svg = tmp_path / "machine.svg"
+    created = created_hexapod(tmp_path)
+    model, urdf = created.yaml_path, created.machine.urdf_path
+    urdf.write_text(re.sub(r'radius="[^"]*"', 'radius="0.0123456"', urdf.read_text()))
+    assert run(monkeypatch, "inspect", model, "--picture", svg) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    machine = load_mechanism(model)
+    q = 1e3 * readings_at(machine, machine.home)[1]
+    assert f"leg2 0.00 to 170.00 250.00 to 420.00 {q:.2f} {q + 250.0:.2f}" in said
+    assert "platform at (0.00, 0.00, 300.00) mm in the base" in said
+    assert "12.35" in said
+    assert svg.read_bytes() == draw_machine(machine).markup().encode()
+    assert run(monkeypatch, "inspect", model, "--picture", svg) == 0
+    svg.write_text("mine")
+    for place, word in ((svg, "another file"), (tmp_path / "machine.png", ".svg")):
+        capsys.readouterr()
+        assert run(monkeypatch, "inspect", model, "--picture", place) == 2
+        assert word in capsys.readouterr().err
+    assert svg.read_text() == "mine"
+
+
+def test_hostile_names_do_nothing_in_a_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Escape sequences, changes of direction and markup in names of files and links."""
+    odd = "\x1b]0;me\x07[red]\u202e"
+    urdf = (ROOT / "urdf/3-rpr.urdf").read_text()
+    folder = tmp_path / odd
+    folder.mkdir()
+    (folder / f"{odd}.urdf").write_text(urdf.replace('"platform"', '"plat[red]form"'))
+    entry = yaml.safe_load((ROOT / "models/3-rpr.yaml").read_text())
+    entry["legcal"] |= {"urdf": f"{odd}.urdf", "platform": "plat[red]form"}
+    model = folder / f"{odd}.yaml"
+    model.write_text(yaml.safe_dump(entry))
+    for words in (
+        ("inspect", model, "--picture", folder / f"{odd}.svg", "--write", folder / "copy"),
+        ("evaluate", model, model),
+        ("inspect", folder / "none"),
+        ("new", "--template", "-o", folder, "--name", "mine"),
+        ("new", "--family", "delta", "-o", folder),
+    ):  # fmt: skip
+        code = run(monkeypatch, *words)
+        said = capsys.readouterr()
+        for text in (said.out, said.err):
+            assert not {"\x1b", "\x07", "\u202e"} & set(text), words
+        assert code == (2 if "none" in str(words[1]) else 0), said.err
+    drawn = (folder / f"{odd}.svg").read_text()
+    assert not {"\x1b", "\u202e"} & set(drawn)

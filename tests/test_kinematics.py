@@ -1,29 +1,37 @@
-"""Kinematics of closed chains against closed forms, finite differences and another reader."""
+"""Kinematics of closed chains, their homes, and how far they are from singular poses."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import Layout, LegLayout, write_machine
-from machines import MACHINES, displaced, of_types
-from scipy.spatial.transform import RigidTransform
+import yaml
+from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
+from machines import (
+    MACHINES,
+    displaced,
+    of_types,
+    ring,
+    write_home,
+)
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
+from legcal.errors import DidNotConverge, ModelError, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
+from legcal.machine.closing import singularity
 from legcal.machine.configurations import Configurations, random_configurations
 from legcal.machine.equations import pose_equations
 from legcal.machine.kinematics import (
     Follower,
-    follow,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
 )
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, joint_values, slider_columns, vectors_A_to_B
+from legcal.machine.model import Machine, platform_pose, readings_at, slider_columns, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
 DRAWN = 5
@@ -40,13 +48,6 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def free_motions(machine: Machine, configuration: Array) -> Array:
-    """Return a basis of the motions of the closed chain, (nv, n)."""
-    jacobian = machine.chain.linearize(configuration)[1]
-    values, right = np.linalg.svd(jacobian)[1:]
-    return np.asarray(right[int(np.sum(values > 1e-7)) :].T)
-
-
 def without_a_motor(name: str) -> Machine:
     machine = machine_of(name)
     legs = list(machine.legs)
@@ -54,7 +55,7 @@ def without_a_motor(name: str) -> Machine:
     return replace(machine, legs=tuple(legs), motor_rank=machine.motor_rank - 1)
 
 
-# --- a shipped machine of each kind --------------------------------------------------------------
+# A shipped machine of each kind
 
 
 def test_random_configurations_are_closed_inside_the_travel_and_unflipped(name: str) -> None:
@@ -97,28 +98,6 @@ def test_forward_kinematics_inverts_inverse_kinematics_from_any_start(name: str)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
-def test_closed_forms_have_the_derivatives_of_the_closures(name: str) -> None:
-    machine, drawn = machine_of(name), drawn_of(name)
-    columns = slider_columns(machine, machine.motors)[1]
-    for configuration, T in zip(drawn.configurations[:3], drawn.poses[:3], strict=True):
-        motions = free_motions(machine, configuration)
-        local = machine.chain.twist(machine.base, machine.platform) @ motions
-        R = T.rotation.as_matrix()
-        twist = np.concatenate([R @ local[3:], R @ local[:3]])  # as the legs' equations have it
-        q = joint_values(machine, configuration)[list(machine.motors)]
-        at = q[None] if machine.actuators else None
-        found = pose_equations(machine.legs, R[None], T.translation[None], q=at)
-        rates = found.by_pose[0] @ twist
-        if machine.actuators:  # rods keep their lengths
-            assert np.abs(rates + found.by_q[0] @ motions[columns]).max() < 1e-9
-            continue
-        assert np.abs(rates[~found.measured]).max(initial=0.0) < 1e-9  # no constraint is broken
-        signs = machine.sign[list(machine.motors)]
-        np.testing.assert_allclose(
-            rates[found.measured], signs[:, None] * motions[columns], atol=1e-9
-        )
-
-
 @pytest.mark.parametrize("name", ["hexapod", "3-upu"])  # closed by points, and by frames
 def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: str) -> None:
     chain = machine_of(name).chain
@@ -136,65 +115,7 @@ def test_the_jacobian_of_the_closures_is_the_derivative_of_their_residual(name: 
     np.testing.assert_allclose(jacobian, numeric, atol=1e-8)
 
 
-# --- closed forms and other routes --------------------------------------------------------------
-
-
-def test_a_3_rpr_agrees_with_its_distance_equations() -> None:
-    machine, drawn = machine_of("3-rpr"), drawn_of("3-rpr")
-    A, B = machine.A_base, machine.B_platform
-    for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        x, y, _ = T.translation
-        angle = T.rotation.as_rotvec()[2]
-        c, s = np.cos(angle), np.sin(angle)
-        across = x + c * B[:, 0] - s * B[:, 1] - A[:, 0]
-        along = y + s * B[:, 0] + c * B[:, 1] - A[:, 1]
-        np.testing.assert_allclose(np.hypot(across, along), q + machine.q0, atol=1e-12)
-
-
-def test_a_planar_platform_stays_in_its_plane(tmp_path: Path) -> None:
-    description = MACHINES["3-RPR, tilted plane"]()
-    machine = load_mechanism(write_machine(tmp_path, description, Layout(virtual="planar")))
-    n = description.normal
-    assert n is not None
-    drawn = random_configurations(machine, 5, 2)
-    for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        axis = (T * machine.home.inv()).rotation.as_rotvec()
-        assert np.abs(np.cross(axis, n)).max() < 1e-12
-        assert abs((T.translation - machine.home.translation) @ n) < 1e-12
-        lengths = np.linalg.norm(vectors_A_to_B(machine, T), axis=1)
-        np.testing.assert_allclose(lengths, machine.sign * q + machine.q0, atol=1e-12)
-
-
-# --- the same machine in other trees, far from home ---------------------------------------------
-
-
-def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
-    """Return a layout whose spherical joints turn anywhere, with the same axes in every tree."""
-    legs = [
-        LegLayout(seed=10 * seed + j, flip_axes=True, hung=hung, sphere=sphere) for j in range(6)
-    ]
-    return Layout(tuple(legs))
-
-
-@pytest.mark.parametrize(
-    ("leg_type", "seed"),
-    [("SS", 2), pytest.param("US", 6, marks=pytest.mark.system)],
-)
-def test_random_readings_give_the_same_poses_in_every_tree(
-    leg_type: str, seed: int, tmp_path: Path
-) -> None:
-    machine = of_types([leg_type] * 6, seed=seed)
-    cut = load_mechanism(write_machine(tmp_path / "cut", machine, _square(seed)))
-    layout = _square(seed, hung="platform", sphere=False)
-    other = load_mechanism(write_machine(tmp_path / "other", machine, layout))
-    columns = slider_columns(other, other.motors)[0]
-    drawn = random_configurations(cut, 8, 1)
-    for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        found = forward_kinematics(other, q)
-        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
-    closed = follow(other, other.home_configuration, q)
-    assert np.abs(other.chain.residual(closed)).max() < 1e-12
-    np.testing.assert_allclose(closed[columns], q, rtol=0.0, atol=1e-12)
+# The same machine in other trees, far from home
 
 
 def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
@@ -207,7 +128,7 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
         forward_kinematics_many(other, readings)
 
 
-# --- refusals -----------------------------------------------------------------------------------
+# Refusals
 
 
 def _with_reading(q: object) -> Array:
@@ -231,27 +152,6 @@ def test_readings_that_no_pose_has_are_refused(
         (forward_kinematics if rows.ndim == 1 else forward_kinematics_many)(hexapod, rows)
 
 
-@pytest.mark.parametrize(
-    ("name", "step", "found"),
-    [
-        ("hexapod-rod", (0, 0, 0, 0, 0, 0.02), r"leg '\w+' would be .* mm off its constant length"),
-        ("3-rps", (0, 0, 0.1, 0, 0, 0), r"would be .* mm off the plane normal to its axis"),
-        ("3-upu", (0, 0, 0.1, 0, 0, 0), r"would be .* mm twisted at its end"),
-        ("3-rpr", (0, 0, 0, 0, 0, 0.002), r"the platform would be 2 mm out of its plane"),
-        ("tricept", (0, 0.1, 0, 0, 0, 0), r"would be .* mm off the direction that it has in the"),
-    ],
-)
-def test_poses_that_legs_forbid_are_refused(name: str, step: tuple[float, ...], found: str) -> None:
-    machine = machine_of(name)
-    there = displaced(machine.home, step)
-    with pytest.raises(UsageError, match=f"The platform cannot take this pose: .*{found}"):
-        inverse_kinematics(machine, there)
-    if name == "3-rps":
-        q = inverse_kinematics(machine, machine.home)
-        with pytest.raises(UsageError, match=r"followed from its start: found leg .* mm off"):
-            forward_kinematics(machine, q, start=displaced(machine.home, [0, 0, 0.3, 0, 0, 0]))
-
-
 @pytest.mark.parametrize(("name", "found"), [("hexapod", "6 and 5"), ("3-rps", "3 and 2")])
 def test_too_few_motors_are_refused_with_both_numbers(name: str, found: str) -> None:
     loose = without_a_motor(name)
@@ -268,3 +168,238 @@ def test_a_travel_that_home_cannot_enter_is_refused_once() -> None:
     machine = replace(machine, legs=(*machine.legs[:6], far))
     with pytest.raises(DidNotConverge, match=r"found 0 of 3 inside the travel.*check legcal\.home"):
         random_configurations(machine, 3, 1)
+
+
+# Home
+
+
+CARRIED = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0) for k in range(6)]))
+
+
+def check_closed(machine: Machine) -> None:
+    configuration = machine.home_configuration
+    assert np.abs(machine.chain.residual(configuration)).max() < 1e-12
+    np.testing.assert_allclose(
+        platform_pose(machine, configuration).as_matrix(), machine.home.as_matrix(), atol=1e-12
+    )
+    R, t = machine.home.rotation.as_matrix(), machine.home.translation
+    found = pose_equations(machine.legs, R[None], t[None])  # of which readings change some
+    assert np.abs(found.values[0, ~found.measured]).max(initial=0.0) < 2e-13
+
+
+@pytest.mark.parametrize(
+    ("description", "carried"),
+    [("6-UPS", True), ("3-RPR, tilted plane", False), ("3-UPU", True), ("Tricept", False)],
+)
+def test_a_rounded_home_closes(description: str, carried: bool, tmp_path: Path) -> None:
+    drawn = MACHINES[description]()
+    rounded = RigidTransform.from_matrix(np.round(drawn.home.as_matrix(), 4))
+    assert np.abs(rounded.as_matrix() - drawn.home.as_matrix()).max() > 1e-6
+    path = write_machine(tmp_path, drawn, CARRIED if carried else Layout())
+    document = yaml.safe_load(path.read_text())
+    xyz, quat = rounded.translation.tolist(), rounded.rotation.as_quat().tolist()
+    document["legcal"]["home"] = {"xyz": xyz, "quat_xyzw": quat}
+    path.write_text(yaml.safe_dump(document))
+    machine = load_mechanism(path)
+    check_closed(machine)
+    T = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
+    np.testing.assert_allclose(T.as_matrix(), machine.home.as_matrix(), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "3-upu", "tricept"])
+def test_without_a_home_one_at_mid_travel_above_the_base_is_found(
+    name: str, tmp_path: Path
+) -> None:
+    machine = load_mechanism(write_home(tmp_path, name, None))
+    check_closed(machine)
+    assert any("legcal.home is not given" in note for note in machine.diagnostics)
+    motors, q = list(machine.motors), readings_at(machine, machine.home)
+    middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
+    np.testing.assert_allclose(q[motors], middle[motors], atol=1e-9)
+    for leg, value in zip(machine.legs, q, strict=True):
+        if leg.kind is LegKind.PASSIVE:
+            assert leg.travel[0] <= value <= leg.travel[1]
+    assert machine.home.apply(machine.B_platform)[:, 2].mean() > -1e-9
+    assert machine.home.rotation.magnitude() < np.deg2rad(60.0)
+
+
+def test_that_there_is_no_home_at_all_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("legcal.machine.home.TRIALS", 8)
+    path = write_machine(tmp_path, of_types(["US"] * 6 + ["SS"]), Layout(home=False))
+    urdf = path.with_suffix(".urdf")
+    limits = r'(<joint name="leg4_slider".*?)<limit lower="\S+" upper="\S+"'
+    longer = re.sub(limits, r'\1<limit lower="3.0" upper="3.1"', urdf.read_text())
+    urdf.write_text(longer)
+    with pytest.raises(DidNotConverge, match=r"no home pose was found.*write legcal\.home"):
+        load_mechanism(path)
+
+
+AXIS = r"leg 'leg\d' .*\d mm off the plane normal to its axis"
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "found"),
+    [
+        ("hexapod-rod", (0, 0, 0, 0, 0, 0.05), r"leg '\w+' .*\d mm off its constant length"),
+        ("3-rps", (0, 0, 0.2, 0, 0, 0), AXIS),
+        ("3-upu", (0, 0, 0.2, 0, 0, 0), r"leg 'leg\d' .*\d mm twisted at its end"),
+        ("tricept", (0.2, 0, 0, 0, 0, 0), r"leg '\w+' .*\d mm off the direction that it has in"),
+        ("3-rpr", (0, 0, 0, 0, 0, 0.05), r"the platform .*50 mm out of its plane"),
+    ],
+)
+def test_poses_and_homes_that_legs_forbid_are_refused_by_leg_and_amount(
+    name: str, step: tuple[float, ...], found: str, tmp_path: Path
+) -> None:
+    machine = machine_of(name)
+    there = displaced(machine.home, step)
+    with pytest.raises(UsageError, match=f"The platform cannot take this pose: .*{found}"):
+        inverse_kinematics(machine, there)
+    with pytest.raises(ModelError, match=rf"legcal\.home could not be used: found {found}"):
+        load_mechanism(write_home(tmp_path, name, there))
+    if name == "3-rps":
+        q = inverse_kinematics(machine, machine.home)
+        with pytest.raises(UsageError, match=r"followed from its start: found leg .* mm off"):
+            forward_kinematics(machine, q, start=displaced(machine.home, [0, 0, 0.3, 0, 0, 0]))
+
+
+@pytest.mark.parametrize(("z", "reading"), [(5.0, r"46\d\d"), (0.75, r"4\d\d"), (0.02, r"-2\d\d")])
+def test_a_home_further_out_than_the_travel_is_refused_with_both_numbers(
+    z: float, reading: str, tmp_path: Path
+) -> None:
+    path = write_home(tmp_path, "hexapod", RigidTransform.from_translation([0.0, 0.0, z]))
+    found = rf"legcal\.home could not be used: found leg 'leg\d' at {reading}\."
+    with pytest.raises(
+        ModelError, match=rf"{found}.*[25] more legs.*travel of .* to .* mm"
+    ) as caught:
+        load_mechanism(path)
+    assert len(caught.value.problems) == 1
+
+
+# The singularity measure
+
+
+RING = [10.0, 110.0, 130.0, 230.0, 250.0, 350.0]
+
+
+def _turned(machine: Machine, degrees: float, height: float = 0.4) -> RigidTransform:
+    """Return home turned about z, from the attitude in which base and platform are symmetric."""
+    turn = Rotation.from_euler("z", degrees, degrees=True) * machine.home.rotation
+    return RigidTransform.from_components([0.0, 0.0, height], turn)
+
+
+def _lines(machine: Machine, T: RigidTransform) -> Array:
+    """Return the unit leg lines, moments first, about the mean platform joint in mean lengths."""
+    vectors = vectors_A_to_B(machine, T)
+    lengths = np.linalg.norm(vectors, axis=1)
+    u = vectors / lengths[:, None]
+    arms = T.rotation.apply(machine.B_platform - machine.B_platform.mean(axis=0))
+    return np.hstack([np.cross(arms, u) / lengths.mean(), u])
+
+
+@pytest.mark.parametrize("name", ["hexapod", "6-sps", "nategh-agheli"])
+def test_a_hexapod_has_the_smallest_singular_value_of_its_leg_lines(name: str) -> None:
+    machine = machine_of(name)
+    for step in ([0.0] * 6, [0.1, 0.2, -0.1, 0.02, 0.03, 0.01]):
+        T = displaced(machine.home, step)
+        values = np.linalg.svd(_lines(machine, T), compute_uv=False)
+        assert singularity(machine, T) == pytest.approx(values[-1], rel=1e-9)
+
+
+@pytest.mark.parametrize("quarter", [90.0, -90.0])
+def test_a_symmetric_hexapod_is_singular_after_a_quarter_turn(quarter: float) -> None:
+    # Fichter: at 90 degrees about the normal all leg lines belong to one linear complex
+    machine = machine_of("hexapod")
+    for height in (0.3, 0.5):
+        assert singularity(machine, _turned(machine, quarter, height)) < 1e-6  # digits
+        for degrees in (quarter - 20.0, quarter + 20.0):
+            assert singularity(machine, _turned(machine, degrees, height)) > 0.05
+    assert singularity(machine, _turned(machine, 0.0, height=0.0)) < 1e-12  # flat on its base
+
+
+def _hexapod(A: Array, B: Array, home: RigidTransform) -> MachineSpec:
+    """Return a 6-UPS with joints A on the base and B on the platform."""
+    axis = np.array([1.0, 0.0, 0.0])
+    legs = [LegSpec("US", a, home.apply(b), base_axis=axis) for a, b in zip(A, B, strict=True)]
+    return MachineSpec(tuple(legs), home)
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+def test_the_measure_does_not_depend_on_size_or_frames(constrained: bool, tmp_path: Path) -> None:
+    def machine(scale: float, shift: float, inside: float) -> MachineSpec:
+        """Return a machine scaled, in another frame of the base, and of the platform [m]."""
+        if constrained:
+            drawn = of_types(["RS"] * 3)
+        else:
+            home = RigidTransform.from_components([0.0, 0.0, 0.4], Rotation.from_euler("z", 0.4))
+            B = ring([50.0, 70.0, 170.0, 190.0, 290.0, 310.0], 0.2)
+            drawn = _hexapod(ring(RING, 0.3), B, home)
+        legs = tuple(
+            replace(leg, A=scale * leg.A + shift, B_home=scale * leg.B_home + shift)
+            for leg in drawn.legs
+        )
+        place = scale * drawn.home.translation + shift + inside * np.array([1.0, -0.5, 2.0])
+        return MachineSpec(legs, RigidTransform.from_components(place, drawn.home.rotation))
+
+    found = []
+    for k, numbers in enumerate(
+        [(1.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 2.0, 0.0), (1.0, 0.0, 0.3)]
+    ):
+        loaded = load_mechanism(write_machine(tmp_path / str(k), machine(*numbers), Layout()))
+        found.append(singularity(loaded, loaded.home))
+    assert found[0] > 1e-3
+    np.testing.assert_allclose(found[1:], found[0], rtol=1e-7)
+
+
+def test_forward_kinematics_does_not_pass_a_singular_attitude() -> None:
+    machine = machine_of("hexapod")
+
+    def side(T: RigidTransform) -> float:
+        return float(np.sign(np.linalg.det(_lines(machine, T))))
+
+    here, beyond = side(machine.home), _turned(machine, 100.0)
+    assert side(beyond) == -here
+    follower = Follower(machine)
+    for degrees in (20.0, 40.0, 60.0, 75.0):
+        wanted = _turned(machine, degrees)
+        reached = follower.move_to(inverse_kinematics(machine, wanted))
+        np.testing.assert_allclose(reached.as_matrix(), wanted.as_matrix(), atol=1e-9)
+    # the same lengths have a pose on this side: it is found, and not the one beyond
+    back = forward_kinematics(machine, inverse_kinematics(machine, beyond))
+    assert side(back) == here
+    assert (back.rotation * beyond.rotation.inv()).magnitude() > 0.1
+    there = forward_kinematics(machine, inverse_kinematics(machine, beyond), start=beyond)
+    np.testing.assert_allclose(there.as_matrix(), beyond.as_matrix(), atol=1e-9)
+    with pytest.raises(DidNotConverge, match="or the mechanism is singular"):
+        follower.move_to(np.array([0.5, 0.07, 0.07, 0.07, 0.07, 0.07]))
+    np.testing.assert_allclose(
+        follower.pose.as_matrix(), _turned(machine, 75.0).as_matrix(), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "turn", "place_beyond", "turn_beyond"),
+    [
+        ("nategh-agheli", (0.24, 0.02, 0.31), (-0.61, 0.61, 0.88),
+         (0.26, 0.02, 0.29), (-0.66, 0.66, 0.95)),
+        ("6-sps", (0.27, -0.01, 0.51), (-2.58, -1.44, -0.58),
+         (0.34, -0.01, 0.52), (-3.28, -1.82, -0.73)),
+    ],
+)  # fmt: skip
+def test_readings_from_a_little_beyond_a_singularity_are_met_on_this_side(
+    name: str,
+    place: tuple[float, ...],
+    turn: tuple[float, ...],
+    place_beyond: tuple[float, ...],
+    turn_beyond: tuple[float, ...],
+) -> None:
+    """A single Newton step from here ends beyond."""
+    machine = machine_of(name)
+    here, beyond = (
+        RigidTransform.from_components(t, Rotation.from_rotvec(r) * machine.home.rotation)
+        for t, r in ((place, turn), (place_beyond, turn_beyond))
+    )
+    found = forward_kinematics(machine, inverse_kinematics(machine, beyond), start=here)
+    sides = [np.sign(np.linalg.det(_lines(machine, T))) for T in (here, beyond, found)]
+    assert sides[0] == -sides[1] == sides[2]

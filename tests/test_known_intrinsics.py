@@ -125,33 +125,6 @@ def test_intrinsics_of_exact_pictures_are_found() -> None:
     assert np.abs(given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)).max() < 1e-7
 
 
-def test_a_covariance_says_what_lies_between_exact_and_free() -> None:
-    given, sigma, unknown = session(), np.append(SIGMA[:4], np.zeros(5)), FREE[:4]
-    exact, free = fitted(given, LENS), fitted(given, LENS, Choices(free=frozenset(unknown)))
-    tight, stated, wide = (
-        fitted(given, replace(LENS, covariance=_covariance(factor * sigma)))
-        for factor in (1e-4, 1.0, 1e4)
-    )
-    n = len(exact.estimates.names)
-    assert exact.estimates.names == tight.estimates.names[:n]
-    for narrow, broad in ((exact, tight), (wide, free)):
-        np.testing.assert_allclose(narrow.estimates.sigma[:n], broad.estimates.sigma[:n], rtol=1e-3)
-        np.testing.assert_allclose(
-            given.legs.vector(narrow.legs), given.legs.vector(broad.legs), atol=1e-7
-        )
-    assert np.all(stated.estimates.sigma[:n] > tight.estimates.sigma[:n])
-    assert np.all(stated.estimates.sigma[:n] < wide.estimates.sigma[:n])
-    # As many priors as unknowns.
-    dof = {found.quality.dof for found in (exact, tight, stated)}
-    assert dof == {free.quality.dof + len(unknown)}
-    priors = [stated.estimates.prior_sigma[name] for name in unknown]
-    assert priors == pytest.approx(SIGMA[:4].tolist())
-    at = [stated.estimates.names.index(name) for name in unknown]
-    assert np.all(stated.estimates.sigma[at] < SIGMA[:4])
-    weak = {name for direction in wide.estimates.weak for name, _ in direction.parts}
-    assert weak.isdisjoint(unknown)
-
-
 def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
     camera = replace(LENS, covariance=COVARIANCE)
     choices = Choices(

@@ -17,7 +17,6 @@ from legcal.calibration.result import Calibration, Verdict
 from legcal.calibration.verdict import judge
 from legcal.data.dataset import load_dataset
 from legcal.data.landmarks import Landmarks, joint_name
-from legcal.errors import DatasetError
 from legcal.geometry.motions import components, pose_distance
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import readings_at
@@ -83,27 +82,6 @@ def test_noise_of_clicks_leaves_a_rough_pose_that_wins(tmp_path: Path) -> None:
     assert turned < np.deg2rad(2.0)
 
 
-def test_a_click_on_another_joint_is_named_with_its_distance(tmp_path: Path) -> None:
-    folder = dataset(tmp_path, "hexapod")
-    true = camera_beside(folder, 0.7)
-    seen = seen_from(folder, 0, true)
-    shown, clicked = "leg5.base", "leg1.base"
-    clicks = {joint: px for joint, px in seen.items() if joint != shown}
-    clicks[clicked] = seen[shown]
-    write_clicks(folder, {0: clicks})
-    with pytest.raises(DatasetError) as refused:
-        load_dataset(folder, check_images=False)
-    (what,) = refused.value.problems
-    apart = np.linalg.norm(seen[shown] - seen[clicked])
-    assert f"the click on {clicked} in 0.png (view c1) is {apart:.0f} px" in what
-    assert f"perhaps it shows {shown}" in what
-    opened = load_dataset(folder, check_images=False, check_clicks=False)  # as to correct them
-    assert what in opened.notes
-    assert opened.measurements.views[0].T_base_camera is None
-    assert opened.landmarks is not None
-    assert len(opened.landmarks) == len(clicks)
-
-
 @pytest.mark.parametrize("unknown", ["no motors", "three empty"])
 def test_base_joints_place_the_camera_where_readings_give_no_pose(
     unknown: str, tmp_path: Path
@@ -126,20 +104,6 @@ def test_base_joints_place_the_camera_where_readings_give_no_pose(
     loaded = load_dataset(folder, check_images=False)
     assert not loaded.machine.is_determined
     assert any("leg4_prismatic" in note for note in loaded.notes) == (unknown != "no motors")
-
-
-def test_readings_are_left_open_of_all_rows_or_none_and_not_of_what_moves_joints(
-    tmp_path: Path,
-) -> None:
-    folder = dataset(tmp_path, "hexapod")
-    cell("measurements.csv", 2, leg1_prismatic="")(folder)
-    with pytest.raises(DatasetError, match=r"row 2 .*column leg1_prismatic.*an empty cell"):
-        load_dataset(folder, check_images=False)
-    folder = dataset(tmp_path, "linear-delta")
-    motor = load_mechanism("linear-delta").motor_names[0]
-    cell("measurements.csv", None, **{motor: ""})(folder)
-    with pytest.raises(DatasetError, match=rf"column {motor}.*moves joints at the base"):
-        load_dataset(folder, check_images=False)
 
 
 @pytest.fixture(scope="module")

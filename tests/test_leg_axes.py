@@ -1,24 +1,32 @@
-"""Axes and their covariances from outlines."""
+"""Axes and their covariances, from outlines and from the table of the paper."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hexapod_sessions import PaperSession, disturbed_hexapod, paper_session
-from staged_sessions import exact_session
+from scipy.spatial.transform import Rotation
 
 from legcal.data.outlines import (
     LegAxes,
     Outlines,
     axes_from_outlines,
-    join_axes,
-    outline_derivative,
+    axes_of_table,
 )
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
-from legcal.geometry.types import Array
-from legcal.simulation.observe import OutlineNoise, shifted_outlines
+from legcal.geometry.types import Array, IntArray
+from legcal.simulation.observe import (
+    OutlineNoise,
+    TableNoise,
+    shifted_outlines,
+    table_of,
+    table_of_lines,
+)
 from legcal.vision.camera import Camera, sample_camera
+from legcal.vision.cylinder import (
+    direction_of_angles,
+)
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 
@@ -59,19 +67,6 @@ def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> 
         assert abs(axes.u[i] @ (axes.M[i] - 0.5 * (A + B))) < 0.1 * np.linalg.norm(B - A)
 
 
-def test_normals_follow_offsets_as_finite_differences_say() -> None:
-    session = _session(LENS)
-    outlines = session.outlines
-    _, derivative = outline_derivative(LENS, outlines.h, outlines.ends)
-    step = 1e-3
-    for end in range(2):
-        offset = step * np.eye(2)[end]
-        plus, _ = shifted_outlines(LENS, outlines.h, outlines.ends, offset)
-        minus, _ = shifted_outlines(LENS, outlines.h, outlines.ends, -offset)
-        found = (plus - minus) / (2.0 * step)
-        assert np.allclose(found, derivative[:, end], rtol=1e-4, atol=1e-7)
-
-
 def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     session = _session(LENS)
     outlines = session.outlines
@@ -91,23 +86,6 @@ def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     assert np.allclose(np.cov(samples.T), np.eye(4), atol=0.1)
 
 
-def test_tube_and_rod_of_a_leg_are_joined_with_the_weight_of_their_covariances() -> None:
-    axes = exact_session(n_poses=2).axes
-    moved = replace(axes, M=axes.M + 1e-4 * axes.basis[:, 0], covariance=3.0 * axes.covariance)
-    both = LegAxes(
-        *(
-            np.concatenate([getattr(axes, name), getattr(moved, name)])
-            for name in ("row", "leg", "u", "M", "basis", "covariance")
-        )
-    )
-    joined = join_axes(both, both.row)
-    assert np.array_equal(joined.row, axes.row)
-    assert np.array_equal(joined.leg, axes.leg)
-    shift = np.sum((joined.M - axes.M) * axes.basis[:, 0], axis=1)
-    assert np.allclose(shift, 0.25e-4, atol=1e-10)
-    assert np.allclose(joined.covariance, 0.75 * axes.covariance, rtol=1e-6)
-
-
 def test_legs_with_one_used_outline_are_passed_over_and_none_with_two_is_refused() -> None:
     session = _session(sample_camera())
     outlines = session.outlines
@@ -118,3 +96,67 @@ def test_legs_with_one_used_outline_are_passed_over_and_none_with_two_is_refused
     assert (int(axes.row[0]), int(axes.leg[0])) == (0, int(outlines.leg[2]))
     with pytest.raises(NotVisible, match="no leg has both outlines in any image"):
         _axes(session, replace(outlines, used=outlines.edge == 1))
+
+
+# Axes with the noise of Table 1
+
+
+def _indices(n: int) -> tuple[IntArray, IntArray]:
+    return np.arange(n, dtype=np.intp), np.zeros(n, dtype=np.intp)
+
+
+def _observed(u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | None) -> LegAxes:
+    """Return axes with the noise of Table 1 as the method takes them from the table."""
+    return axes_of_table(*table_of(*_indices(len(u)), u, A, noise, rng))
+
+
+def _random_lines(n: int, seed: int = 0) -> tuple[Array, Array]:
+    """Return n directions well away from the plane y = 0, and points before the camera."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(n, 3))
+    u[:, 1] = np.copysign(0.3 + np.abs(u[:, 1]), u[:, 1])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], (n, 3))
+
+
+def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z() -> None:
+    rng = np.random.default_rng(0)
+    psi, theta = rng.uniform(-1.5, 1.5, 50), rng.uniform(-3.1, 3.1, 50)
+    turns = Rotation.from_euler("xz", np.stack([psi, theta], axis=-1))
+    u = direction_of_angles(psi, theta)
+    assert np.allclose(u, turns.apply([0.0, 1.0, 0.0]), atol=1e-15)
+
+
+def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
+    n = 4000
+    u = np.tile([0.2, -0.95, 0.24], (n, 1))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    A = np.tile([0.1, 0.2, 0.9], (n, 1))
+    noise = TableNoise()
+    axes = _observed(u, A, noise, np.random.default_rng(0))
+    exact = _observed(u, A, noise, None)
+    M, basis, covariance = exact.M[0], exact.basis[0], exact.covariance[0]
+    beta = (axes.M - M) @ basis.T
+    alpha = (axes.u / (axes.u @ u[0])[:, None]) @ basis.T
+    found = np.cov(np.hstack([alpha, beta]).T)
+    scale = np.sqrt(np.diag(covariance))
+    assert np.allclose(
+        found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.1
+    )
+
+
+def test_the_table_of_a_line_leads_back_to_it() -> None:
+    u, A = _random_lines(200, seed=3)
+    u[:4] = [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1e-9, -1.0, 0.0], [1e-5, 1e-4, 1.0]]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    found = table_of_lines(u, A)
+    turns = Rotation.from_euler("xz", found[:, :2])
+    assert np.allclose(turns.apply([0.0, 1.0, 0.0]), u, atol=1e-14)
+    points = np.stack([found[:, 2], np.zeros(len(u)), found[:, 3]], axis=-1)
+    assert np.allclose(distance_to_line(A[4:], u[4:], points[4:]), 0.0, atol=1e-14)
+
+
+def test_table_1_does_not_exist_for_a_leg_parallel_to_the_image_x_axis() -> None:
+    u, A = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.1, 0.9]])
+    with pytest.raises(NotVisible, match="parallel to the image x axis"):
+        table_of(*_indices(1), u, A, TableNoise(), None)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fit_sessions import machine_session
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
-from machines import exechon, exechon_and_ups, four_upu, of_types, two_upr_two_sps
+from machines import exechon, exechon_and_ups, four_upu, of_types, planar, two_upr_two_sps
 from scipy.linalg import null_space
 
 from legcal.calibration.joint_fit.fit import refine
@@ -26,6 +26,11 @@ KINDS: dict[str, MachineSpec] = {
     "Tricept": of_types(["US", "US", "US", "U"], [A, A, A, P]),
     "SP": of_types(["SS", "US", "SS", "S", "SS"], [A, A, A, A, P]),
     "5-UPS + rod": of_types(["US"] * 6, [A] * 5 + [C]),
+    "6-UPS by hand": of_types(["US"] * 6, [P] * 6),
+    "3-RPS, two motors": of_types(["RS"] * 3, [A, A, P]),
+    "7-UPS": of_types(["US"] * 7),
+    "4-RPR": planar(kinds=(A,) * 4),
+    "2-RPS + 2-SPS + rod": of_types(["RS", "RS", "SS", "SS", "SS"], [A] * 4 + [C]),
 }
 
 
@@ -73,8 +78,7 @@ def _twists(leg: LegSpec, *, with_slider: bool = True) -> Array:
     return np.array(found)
 
 
-# Each kind in one layout: test_model_layouts.py compares them. More motors than freedoms are in
-# test_redundant.py.
+# Each kind in one layout: test_model_layouts.py compares them.
 @pytest.mark.parametrize(("kind", "layout"), list(zip(KINDS, cycle(LAYOUTS), strict=False)))
 def test_freedoms_are_those_of_the_screws_of_the_joints(
     kind: str, layout: str, tmp_path: Path

@@ -12,6 +12,7 @@ from legcal.calibration.documents import Kinematic, ParameterRow
 from legcal.calibration.result import joints_in_links
 from legcal.calibration.verification import possible_changes
 from legcal.geometry.types import Array
+from legcal.machine.leg import LINKS
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
@@ -22,7 +23,6 @@ from legcal.machine.parameters import (
     parametrization_of,
     vector_of,
 )
-from legcal.vision.board import LINKS
 
 OBLIQUE = "nategh-agheli"  # its R_b is turned against its base link by 170 deg
 
@@ -71,7 +71,7 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
     ]  # fmt: skip
     kinematic = Kinematic(names=list(found.names), covariance=covariance.tolist(), held=[])
     axes = nominal_axes(machine.leg_names, legs)
-    blocks = joints_in_links(machine, rows, kinematic, axes)
+    blocks = joints_in_links(machine, rows, kinematic)
 
     def joints_with(step: Array) -> Array:
         """Return all base joints and all platform joints in their links (2, n_legs, 3)."""

@@ -5,15 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 
 from legcal import load_mechanism
 from legcal.calibration.location.tool_poses import read_tool_poses
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description, assemble
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
-from legcal.descriptions.table import read_columns
 from legcal.errors import ModelError
 from legcal.machine.kinematics import forward_kinematics_many
+from legcal.machine.model import Machine, readings_at
 
 BASE = [(289.8, 77.6), (-77.6, 289.8), (-212.1, 212.1), (-212.1, -212.1), (-77.6, -289.8),
         (289.8, -77.6)]  # fmt: skip
@@ -21,11 +22,13 @@ PLATFORM = [(106.1, 106.1), (38.8, 144.9), (-144.9, 38.8), (-144.9, -38.8), (38.
             (106.1, -106.1)]  # fmt: skip
 
 
-def wide(header: str, *more: str, leg: str = "", size: float = 1.0, mark: str = "") -> str:
+def wide(
+    header: str, *more: str, leg: str = "", size: float = 1.0, mark: str = "", at: float = 0.0
+) -> str:
     """Return a row for each leg; semicolons in the header make commas of points."""
     rows = []
     for j, (A, B) in enumerate(zip(BASE, PLATFORM, strict=True), 1):
-        numbers = [f"{size * x:g}{mark}" for x in (*A, 0.0, *B, 0.0)]
+        numbers = [f"{size * x:g}{mark}" for x in (*A, 0.0, *B, at)]
         rows.append([*([leg.format(j)] if leg else []), *numbers, *more])
     return joined(header, rows)
 
@@ -48,7 +51,18 @@ def joined(header: str, rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([*([header] if header else []), *lines]) + "\n"
 
 
+POINTS = "Point,X [mm],Y [mm],Z [mm]"
+B_AND_P = points(POINTS, "B{}", "P{}")
 SIX = "{0} X [mm];{0} Y [mm];{0} Z [mm];{1} X [mm];{1} Y [mm];{1} Z [mm]"
+
+
+def one_row(base: str, platform: str) -> str:
+    points = {f"{base}{j + 1}": A for j, A in enumerate(BASE)}
+    points |= {f"{platform}{j + 1}": B for j, B in enumerate(PLATFORM)}
+    header = ",".join(f"{name}{axis}" for name in points for axis in "xyz")
+    return header + "\n" + ",".join(f"{x:g},{y:g},0" for x, y in points.values()) + "\n"
+
+
 TABLES = {  # content, and the radii of tube and rod in it [mm]
     "German": (wide("Zylinder;" + SIX.format("Boden", "Plattform"), leg="Zylinder {}"), ()),
     "title, blank line, units, remarks": (
@@ -61,14 +75,8 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
     "units below": (
         wide("Nr.;unten x;unten y;unten z;oben x;oben y;oben z;Länge min;Länge max;Ø Rohr;Ø Stange"
              "\n" + ";mm" * 10, "380.0", "500.0", "28", "16", leg="{}"), (14, 8)),
-    "remark": (wide(f"Leg,{SIX.format('Base', 'Top').replace(';', ',')},Notes", "ok", leg="Leg {}"),
-               ()),
     "cylinder and side": (
         points("Joint,X (mm),Y (mm),Z (mm)", "Cylinder {} bottom", "Cylinder {} top"), ()),
-    "unit after a slash": (
-        points("Gelenk;x/mm;y/mm;z/mm", "Gelenk {} unten", "Gelenk {} oben"), ()),
-    "compounds, number in brackets": (
-        points("Name,X_mm,Y_mm,Z_mm", "Bodengelenk ({})", "Plattformgelenk ({})"), ()),
     "units in cells": (
         wide("leg,bx,by,bz,px,py,pz,min length,max length,rod diameter,tube diameter",
              "380 mm", "500 mm", "16 mm", "28 mm", leg="{}", mark=" mm"), (14, 8)),
@@ -78,15 +86,11 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
         "Stand Mai;;;;;;;;;;\n;Boden;;;Plattform;;;Länge min;Länge max;Ø Rohr;Ø Stange\n"
         + wide("Bein;X;Y;Z;X;Y;Z;;;;", "380", "500", "28", "16", leg="{}")
         .replace("\n", "\n;mm;mm;mm;mm;mm;mm;mm;mm;mm;mm\n", 1), (14, 8)),
-    "title of two cells": (
-        wide("Projekt: Hexapod;;;Datum: 3.2.2026;;;\n" + SIX.format("B", "P")), ()),
     "line below": (wide(SIX.format("b", "p")) + "gemessen mit Messschieber;;;;;\n", ()),
     "metres and millimetres": (
         wide("leg,base x [m],base y [m],base z [m],platform x [m],platform y [m],platform z [m],"
              "min length [m],max length [mm],diameter [mm]", "0.38", "500", "20", leg="{}",
              size=1e-3), (10, 10)),
-    "column of units": (points("Joint\tX\tY\tZ\tunité", "A{} (socle)", "B{} (plateau)", "mm"),
-                        ()),
     "side and number": (points("Seite;Nr;X [mm];Y [mm];Z [mm]", "Boden|{}", "Plattform|{}"), ()),
     "shortest and longest": (
         wide("Bein;" + SIX.format("Basis", "Plattform") + ";kürzeste Länge;längste Länge;Radius",
@@ -129,6 +133,10 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
     "axis first": (
         wide("Jambe,X base,Y base,Z base,X plate-forme,Y plate-forme,Z plate-forme", leg="J{}"),
         ()),
+    "letters": (wide("bx,by,bz,px,py,pz"), ()),
+    "one row": (one_row("B", "P"), ()),
+    "platform first": ("\n".join([POINTS, *B_AND_P.splitlines()[:0:-1]]), ()),
+    "points by side": (points(POINTS, "Base joint {}", "Platform joint {}"), ()),
 }  # fmt: skip
 
 
@@ -228,17 +236,6 @@ def test_other_workbooks_are_refused(content: bytes, tmp_path: Path) -> None:
         described(path, "mm", ())
 
 
-def test_axes_of_joints_are_no_coordinates_of_their_centres(tmp_path: Path) -> None:
-    path = tmp_path / "own.csv"
-    header = "type," + ",".join(f"{name}_{x}" for name in ("base_axis", "base") for x in "xyz")
-    joints = [(0, 1, 0, 100, 0, 0), (-0.866, -0.5, 0, -50, 86, 0), (0.866, -0.5, 0, -50, -86, 0)]
-    rows = [f"RPS,{','.join(map(str, one))},{one[3] / 2},{one[4] / 2},0" for one in joints]
-    path.write_text("\n".join([f"{header},platform_x,platform_y,platform_z", *rows]))
-    found = read_columns(path, "mm")
-    assert found["base_axes"] == [list(one[:3]) for one in joints]
-    assert found["base_joints"] == [list(one[3:]) for one in joints]
-
-
 @pytest.mark.parametrize("mark", [";", " "])
 @pytest.mark.parametrize("heading", ["ID", "Label", "Name", "Foto-Nr."])
 def test_the_column_of_photographs_is_the_one_that_says_so(
@@ -276,3 +273,97 @@ def test_poses_of_a_tracker_beside_whole_lengths_in_mm_are_read(tmp_path: Path) 
         machine.legs[0].prismatic,
         "x",
     }
+
+
+# --- by the command
+
+ENDS = ("--min-length", "380", "--max-length", "500")
+OPTIONS = ("--type", "UPS", *ENDS, "--leg-radius", "10", "--height", "400")
+
+
+def new(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, text: str, *words: str, name: str = "own.csv"
+) -> int:
+    (folder / name).write_text(text)
+    return run(monkeypatch, "new", folder / name, "-o", folder / "made", *words)
+
+
+def made(folder: Path) -> Machine:
+    return load_mechanism(folder / "made/models/own.yaml")
+
+
+def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = wide("bx,by,bz,px,py,pz", at=395.5)
+    words = ("--unit", "mm", "--type", "UPS", *ENDS)
+    for more in ((), ("--height", "400")):
+        assert new(monkeypatch, tmp_path, text, *words, *more) == 2
+        said = capsys.readouterr().err
+        assert said.count("legcal: ") == said.count("\n") == 1
+        assert "look like coordinates of the base" in said
+        assert "platform_in: base" in said
+
+    def stating(side: str) -> str:
+        head, *rows = text.splitlines()
+        return "\n".join([f"{head},platform_in", *(f"{row},{side}" for row in rows)])
+
+    assert new(monkeypatch, tmp_path, stating("base"), *words) == 0
+    machine = made(tmp_path)
+    np.testing.assert_allclose(machine.home.translation, [0, 0, 0.3955], atol=1e-12)
+    np.testing.assert_allclose(machine.B_platform[0], [0.1061, 0.1061, 0], atol=1e-12)
+    assert "coordinates of the base at home" in " ".join(capsys.readouterr().out.split())
+    assert new(monkeypatch, tmp_path, stating("platform"), *words, "--force") == 0
+    np.testing.assert_allclose(made(tmp_path).B_platform[0], [0.1061, 0.1061, 0.3955], atol=1e-12)
+
+
+def test_a_platform_that_is_turned_in_its_link_is_level_and_turned_back_at_its_height(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = wide("bx,by,bz,px,py,pz").splitlines()
+    turned = [lines[0]]
+    for line in lines[1:]:
+        *base, x, y, z = line.split(",")
+        turned.append(",".join([*base, y, str(-float(x)), z]))  # by -90 deg
+    assert new(monkeypatch, tmp_path, "\n".join(turned), "--unit", "mm", *OPTIONS) == 0
+    machine = made(tmp_path)
+    assert machine.home.rotation.as_euler("xyz", degrees=True)[2] == pytest.approx(90.0)
+    q = readings_at(machine, machine.home)
+    assert np.ptp(q) < 1e-3
+
+
+REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--type", "UPS"),
+     ("'leg1', 'leg2', 'leg3', 'leg4', 'leg5', 'leg6'", "min_length")),
+    (wide("bx,by,bz,px,py,pz"), OPTIONS, ("--unit mm",)),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[2:]), ("type", "--type UPS")),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--base-radius", "9"),
+     ("--base-radius", "--family only")),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[:-2], "--height", "700"),
+     ("'leg1', 'leg2'", "close at home", "380 to 500 mm")),
+    (wide("bx,by,bz,px,py,pz [Zoll]"), OPTIONS, ("Zoll", "mm, um, nm, cm, m, in, ft")),
+    (wide("bx,by,bz,qx,qy,qz"), ("--unit", "mm", *OPTIONS), ("'qx'", "'platform_x'")),
+    (B_AND_P.replace("P3,-144.9,38.8,0\n", ""), OPTIONS, ("platform_x",)),
+    (points(POINTS, "{}", "{}"), OPTIONS, ("'1'", "B1 and P1")),
+    (wide("bx,by,bz,px,py,pz").partition("\n")[2], OPTIONS, ("numbers in the first line",)),
+    (wide("u,v,w,r,s,t"), OPTIONS, ("columns 'u', 'v', 'w', 'r', 's', 't'", "columns 'base_x'")),
+    (one_row("B", "P") * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
+    (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--max-length", "500", "--type", "UPS"),
+     ("max_length alone",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "words", "named"), REFUSED)
+def test_what_tables_lack_is_said_once(
+    text: str,
+    words: Sequence[str],
+    named: Sequence[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert new(monkeypatch, tmp_path, text, *words) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in named), said
+    assert "leg2'" not in said or "'leg1'" in said.split("leg2'")[0]
+    assert not (tmp_path / "made").exists()

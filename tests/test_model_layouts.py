@@ -1,7 +1,6 @@
 """Equal machines give equal analyses and poses, whatever tree they are written in."""
 
 import pickle
-import re
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -14,7 +13,6 @@ from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
-from outside_machines import OUTSIDE, missing, scaled
 
 from legcal.errors import OutOfClass, UsageError
 from legcal.geometry.lines import normal_basis
@@ -263,12 +261,6 @@ def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
         _close(leg.B, expected_B(description, j))
 
 
-def test_by_how_much_a_slider_may_miss_its_joint_grows_with_the_machine(tmp_path: Path) -> None:
-    """Ten times as much is refused: see ``OUTSIDE``."""
-    path = write_machine(tmp_path, scaled(missing("RS", 4e-6), 25.0), Layout())
-    assert load_mechanism(path).home.translation[2] == pytest.approx(0.6 * 25.0, rel=1e-4)
-
-
 # --- what a file does not name ------------------------------------------------------------------
 
 UNNAMED = {
@@ -312,21 +304,6 @@ def test_base_platform_and_legs_are_taken_from_the_bodies(
 # --- the loaded machine -------------------------------------------------------------------------
 
 
-def test_the_shipped_hexapod_loads_by_name_by_yaml_and_by_urdf() -> None:
-    for model in ("hexapod", SHIPPED_YAML, SHIPPED_URDF):
-        machine = load_mechanism(model)
-        assert machine.name == "hexapod"
-        assert machine.leg_names == tuple(f"leg{j}" for j in range(1, 7))
-        assert {leg.type for leg in machine.legs} == {"SPU"}
-        assert machine.frame_legs == (0, 2, 4)
-        assert machine.diagnostics == ()
-        np.testing.assert_allclose(machine.q0, 0.345, atol=1e-15)
-        np.testing.assert_allclose(machine.legs[0].travel, (-0.004, 0.144))
-        assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.01}
-    centre = load_mechanism("tricept").legs[3]
-    assert {(c.side, c.radius) for c in centre.cylinders} == {("base", 0.04), ("platform", 0.03)}
-
-
 def test_legs_may_be_reordered_and_a_machine_pickled() -> None:
     machine = load_mechanism("hexapod")
     names = ("leg3", "leg1", "leg2", "leg6", "leg5", "leg4")
@@ -358,16 +335,3 @@ def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(
     assert load_mechanism(path).urdf_path == path.with_suffix(".urdf")
     monkeypatch.chdir(tmp_path)  # where a folder has the name of a shipped model
     assert load_mechanism("hexapod").yaml_path == SHIPPED_YAML
-
-
-@pytest.mark.parametrize("name", ["u-off", "turning-motor"])
-def test_a_refused_leg_says_what_was_found_and_what_is_needed(name: str, tmp_path: Path) -> None:
-    write, named = OUTSIDE[name]
-    write(tmp_path)
-    with pytest.raises(OutOfClass, match=re.escape(named[0])) as refused:
-        load_mechanism(tmp_path / "machine.yaml")
-    fact = refused.value.facts[0]
-    assert fact.found
-    assert fact.needed
-    assert fact.remedy
-    assert fact.file

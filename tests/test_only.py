@@ -1,7 +1,6 @@
 """``--only``: tolerances as priors, one group of parameters, horns on other teeth."""
 
 import csv
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,17 +13,13 @@ from simulated import simulated
 from legcal import calibrate, load_dataset, load_mechanism
 from legcal.calibration.identify.identifiability import identifiability
 from legcal.calibration.joint_fit.parameter_choices import Group
-from legcal.calibration.joint_fit.part_errors import PartSigma, part_errors, with_zeros
-from legcal.calibration.joint_fit.predicted import WHITE
+from legcal.calibration.joint_fit.part_errors import part_errors, with_zeros
 from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.calibration.only import joint_error
 from legcal.calibration.result import Calibration
 from legcal.errors import UsageError
-from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, in_joint_frames, vector_of
 from legcal.machine.tolerance import TYPICAL, Tolerance
-from legcal.planning.places import default_setting
-from legcal.planning.request import plan
 from legcal.simulation.settings import Distribution, ParameterErrors, Spread
 
 TOOTH = 2.0 * np.pi / 25
@@ -140,22 +135,7 @@ def test_the_posterior_of_parts_is_bayes_rule() -> None:
 def test_identify_says_how_well_a_group_will_be_known(only: Group) -> None:
     machine = replace(load_mechanism("3-rpr"), tolerance=TYPICAL["bought"])
     report = identifiability(machine, [machine.leg_names], 2, only=only)
-    _states(machine, report.parts or (), report.notes, only)
-
-
-@pytest.mark.system
-def test_a_plan_says_how_well_a_group_will_be_known() -> None:
-    only: Group = "zeros"
-    machine = replace(load_mechanism("3-rpr"), tolerance=TYPICAL["bought"])
-    setting = replace(default_setting(machine), draws=1)
-    planned = plan(machine, images=2, cameras=1, noise=WHITE, setting=setting, only=only)
-    _states(machine, planned.parts, planned.notes, only)
-
-
-def _states(
-    machine: Machine, parts: Sequence[PartSigma], notes: Sequence[str], only: Group
-) -> None:
-    n = len(machine.motors) if only == "zeros" else 0
+    n, parts = len(machine.motors) if only == "zeros" else 0, report.parts or ()
     assert [one.part for one in parts] == list(machine.leg_names)[:n]
     assert all(0.0 < one.sigma < one.tolerance for one in parts)
-    assert sum("Expected of the zeros" in note for note in notes) == bool(n)
+    assert sum("Expected of the zeros" in note for note in report.notes) == bool(n)

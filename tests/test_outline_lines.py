@@ -1,28 +1,18 @@
 """Sub-pixel lines: pixels beside an outline, the limb model, and blocks fitted to it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array
 from legcal.perception.blocks import (
-    COMMON_BIAS,
-    TILT_BIAS,
-    BlockFit,
     BlockLine,
     Blocks,
-    fit_blocks,
-    fit_lines,
 )
 from legcal.perception.limb import (
     MATTE_DIRECTIONS,
-    N_AMPLITUDES,
-    N_POWERS,
     powers,
     profile_functions,
-    simple_functions,
 )
 from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import (
@@ -48,16 +38,7 @@ LENS = Camera(
     300,
     np.array([-0.2, 0.05, 0.001, -0.001, 0.0]),
 )
-V = np.array([1.5, -2.0])
 DEEP = 3.5
-
-
-def edge_at(angle: float, epsilon: float = 1.0, length: float = 200.0) -> Edge:
-    """Return an outline through the middle of the image, at an angle to its rows."""
-    along = np.array([np.cos(angle), np.sin(angle)])
-    normal = np.array([-along[1], along[0]])
-    band = Band(-0.5 * length / 500.0 * along, along, normal, 500.0, length)
-    return Edge(band, V, epsilon, 20.0, np.zeros(10, dtype=np.bool_))
 
 
 def numbered(axis: int) -> Samples:
@@ -70,40 +51,6 @@ def read(
 ) -> Profiles:
     depths = DEEP, np.full(len(edges), inner)
     return read_profiles(numbered(axis), LENS, edges, [e.v for e in edges], depths, 8, most)
-
-
-@pytest.mark.parametrize(
-    ("angle", "epsilon", "place"),
-    [(0.1, 1.0, None), (1.5, -1.0, None), (2.4, -1.0, None), (5.0, 1.0, None),
-     (np.pi / 2, 1.0, (399.0, 150.0)), (0.0, 1.0, (200.0, 299.0))],
-)  # fmt: skip
-def test_distances_are_those_of_the_pixels_that_are_read(
-    angle: float, epsilon: float, place: tuple[float, float] | None
-) -> None:
-    """Those inside the image, up to a depth, also where an outline is on its border."""
-    one = edge_at(angle, epsilon)
-    if place is not None:
-        there = LENS.undistort(np.array(place))
-        one = replace(one, band=replace(one.band, origin=one.band.origin + there))
-    columns, rows = read([one], 0), read([one], 1)
-    xy = LENS.undistort(np.stack([columns.grey, rows.grey], axis=-1).astype(np.float64))
-    h = one.band.line(*V)
-    distance = epsilon * LENS.line_offset(np.broadcast_to(h, (*xy.shape[:-1], 3)), xy)
-    seen = columns.window >= 0.5
-    np.testing.assert_allclose(
-        columns.d[seen], distance[seen], atol=0.02 if place is None else 0.05
-    )
-    if place is not None:
-        assert np.count_nonzero(seen) > 50
-        return
-    assert np.count_nonzero(seen) > 500
-    assert distance[seen].min() < -DEEP + 0.3
-    assert distance[seen].max() > DEEP - 0.3
-    t, _ = one.band.coordinates(xy)
-    np.testing.assert_allclose(columns.position, t.mean(axis=1) / one.band.length, atol=0.02)
-    shallow = read([one], inner=1.0)
-    assert shallow.d[shallow.window >= 0.5].max() <= 1.0
-    assert shallow.d[shallow.window >= 0.5].min() < -3.0
 
 
 # Sums over pixels, and their noise.
@@ -144,77 +91,10 @@ def test_both_sides_are_equally_noisy_when_weighted(behind: float) -> None:
 
 # Blocks one by one, and lines through them.
 
-HALF_WIDTH_PX = 14.0
-
-
-def simple(d: Array, blur: float, half_width: float = HALF_WIDTH_PX) -> tuple[Array, Array]:
-    """Return the functions of single blocks (..., 5) at distances, and their slopes."""
-    values, slopes = simple_functions(np.array([half_width]), np.array([blur]))
-    at, _ = powers(np.asarray(d, dtype=np.float64) / blur)
-    return at @ values[0].T, at @ slopes[0].T
-
-
-def block_fit(d: Samples, grey: Samples, weight: Samples, blur: float = 0.6) -> BlockFit:
-    """Return the fit of blocks of one edge."""
-    sums = PixelBins.of(d, weight, blur).sums(grey)
-    edge = np.zeros(len(d), dtype=np.intp)
-    return fit_blocks(sums, np.array([HALF_WIDTH_PX]), np.array([blur]), edge)
-
-
-def limb_blocks(
-    shift: float, blur: float, amplitude: list[float], noise: float, n: int = 200
-) -> tuple[Samples, Samples]:
-    """Return distances from a line and the grey levels of outlines ``shift`` further inside."""
-    rng = np.random.default_rng(1)
-    d = rng.uniform(-4.0, 4.0, (n, 120)).astype(np.float32)
-    values, _ = simple(d.astype(np.float64) - shift, blur)
-    grey = values @ np.array(amplitude) + noise * rng.standard_normal(d.shape)
-    return d, grey.astype(np.float32)
-
-
-def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
-    d, grey = limb_blocks(0.0, 0.6, [20.0, 0.0, 120.0, 60.0, 0.0], noise=3.0)
-    weight = np.ones(d.shape, dtype=np.float32)
-    fit = block_fit(d, grey, weight)
-    assert np.std(fit.shift) == pytest.approx(np.sqrt(np.median(fit.variance)), rel=0.2)
-    assert np.sqrt(np.median(fit.noise)) == pytest.approx(3.0, rel=0.05)
-
-
-def fit_straight(position: Array, shift: Array, variance: Array) -> BlockLine | None:
-    return fit_lines(np.array([0, len(position)]), position, shift, variance)[0]
-
 
 def fitted(line: BlockLine | None) -> BlockLine:
     assert line is not None
     return line
-
-
-def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
-    rng = np.random.default_rng(0)
-    position = np.linspace(0.0, 1.0, 50)
-    shift = 0.2 + 0.02 * rng.standard_normal(50)
-    shift[20:35] += 0.7
-    shift[47:] += 0.8  # and an end that bends away
-    line = fitted(fit_straight(position, shift, np.full(50, 4e-4)))
-    np.testing.assert_allclose(line.ends, 0.2, atol=0.03)
-    assert not np.any(line.kept[20:35])
-    assert line.inlier_share == pytest.approx(0.64, abs=0.03)
-    assert line.last == pytest.approx(46 / 49)
-
-
-def test_covariance_agrees_with_monte_carlo() -> None:
-    rng, position_range = np.random.default_rng(2), (0.3, 0.6)
-    position = np.linspace(*position_range, 40)
-    lines = [
-        fitted(fit_straight(position, 0.1 * rng.standard_normal(40), np.full(40, 0.01)))
-        for _ in range(200)
-    ]
-    ends = np.array([[(1 - p) * f.ends[0] + p * f.ends[1] for p in position_range] for f in lines])
-    claimed = np.mean([f.covariance for f in lines], axis=0)
-    bias = COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2)
-    seen = np.cov(ends.T) + bias
-    np.testing.assert_allclose(np.diag(claimed), np.diag(seen), rtol=0.5)
-    assert np.all(np.diag(claimed) > 0.8 * np.diag(seen))
 
 
 # All blocks of outlines together.
@@ -263,24 +143,6 @@ def outline(
     )  # fmt: skip
     read.noise[:] = max(noise, 0.3) ** 2  # as the blocks by themselves show it
     return read
-
-
-@pytest.mark.parametrize("blur", [0.35])
-def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
-    d, half_width = np.linspace(-4.0, 4.0, 81), single(HALF_WIDTH, 1)
-
-    def profile(d: Array, blur: float) -> Array:
-        values, _, _ = profile_functions(half_width, single(blur, 1), DEPTH)
-        return np.asarray(values[0] @ powers(d / blur)[0].T)
-
-    _, slopes, widenings = profile_functions(half_width, single(blur, 1), DEPTH)
-    U = powers(d / blur)[0].T
-    step = 1e-3
-    by_distance = (profile(d + step, blur) - profile(d - step, blur)) / (2.0 * step)
-    np.testing.assert_allclose(by_distance, slopes[0] @ U, atol=0.01)
-    by_blur = (profile(d, blur * np.exp(step)) - profile(d, blur * np.exp(-step))) / (2.0 * step)
-    np.testing.assert_allclose(by_blur, widenings[0] @ U, atol=0.01)
-    assert slopes.shape == (1, N_AMPLITUDES, N_POWERS)
 
 
 @pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
@@ -378,13 +240,6 @@ def test_limbs_are_where_the_background_ends_not_where_stripes_begin(start: floa
     edges, width = rod_edges(start), 2.0 * start
     found = limb_shifts(rod_picture(4.0), UPRIGHT, edges, 0.5, np.array([-width]), np.array([2.0]))
     np.testing.assert_allclose(found, -start, atol=0.5)
-
-
-def test_lone_steps_are_limbs_whatever_their_width_should_be() -> None:
-    found = limb_shifts(
-        rod_picture(-9.0), UPRIGHT, rod_edges(1.5), 0.5, np.array([0.0]), np.array([2.0])
-    )
-    np.testing.assert_allclose(found, -1.5, atol=0.5)
 
 
 def test_surfaces_that_reflect_stripes_are_told_from_matte_ones() -> None:

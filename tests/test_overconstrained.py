@@ -14,14 +14,12 @@ import numpy as np
 import pytest
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, MachineSpec, write_machine
-from machines import exechon, four_upu, two_upr_two_sps
-from scipy.spatial.transform import Rotation
+from machines import exechon, two_upr_two_sps
 from thinned import thinned
 
 from legcal import identifiability
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.variables import LegConstraints, start_from
+from legcal.calibration.joint_fit.variables import start_from
 from legcal.errors import OutOfClass
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
@@ -40,7 +38,6 @@ KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, pa
     "exechon": (exechon, 3, 19 - 7),
     "2-UPR + 2-SPS": (two_upr_two_sps, 4, 24 - 7),
 }
-ENDS = "base", "platform"
 LAYOUTS = (
     Layout(),
     Layout((LegLayout(cut="mid"),)),
@@ -126,20 +123,6 @@ def test_true_machines_close_and_fits_find_them(kind: str, tmp_path: Path) -> No
         assert np.abs(np.concatenate([leg.A - exact.A, leg.B - exact.B])).max() < 1e-7
 
 
-def test_axes_that_must_stay_parallel_turn_together(tmp_path: Path) -> None:
-    machine = load_mechanism(write_machine(tmp_path, four_upu(), LAYOUTS[0]))
-    legs, found = geometries(machine), parametrization_of(machine, twists=True)
-    step = 3e-3 * np.random.default_rng(1).uniform(-1.0, 1.0, len(found))
-    moved = moved_legs(legs, found.place, step)
-    tied = on_ties(moved, legs, machine_ties(machine), found.place, np.ones(len(found)))
-    # The platform keeps one direction: a rotation takes all its axes to those of the base.
-    base, platform = (np.array([getattr(leg, f"{end}_axis") for leg in tied]) for end in ENDS)
-    sign = np.sign(np.einsum("ji,ji->j", base, platform))[:, None]
-    turn = Rotation.align_vectors(base, sign * platform)[0]
-    assert np.abs(turn.apply(sign * platform) - base).max() < 1e-9
-    assert max(abs(leg.twist or 0.0) for leg in tied) < 1e-11
-
-
 def tilted(end: str, angle: float) -> MachineSpec:
     """Return an Exechon with an axis of leg 1 turned out of its place [rad]."""
     machine = exechon()
@@ -171,18 +154,3 @@ def test_a_file_of_nine_decimals_is_refused_for_its_digits(tmp_path: Path) -> No
     urdf.write_text(re.sub(r"-?\d\.\d{9,}", lambda x: f"{float(x[0]):.9f}", urdf.read_text()))
     with pytest.raises(OutOfClass, match=r"2 of the 5 constraints .* with all digits"):
         load_mechanism(path)
-
-
-def test_free_poses_that_the_legs_cannot_follow_stay(tmp_path: Path) -> None:
-    machine = load_mechanism(write_machine(tmp_path, two_upr_two_sps(), LAYOUTS[0]))
-    session = wrong_but_tied(machine_session(str(machine.yaml_path)), machine)
-    problem = build_fit(session.legs, session.measurements, session.outlines)
-    state = problem.projected(problem.begin(session.truth))
-    t = state.platform_pose.t.copy()
-    t[0], t[1, 0], t[2] = np.inf, 1e3, t[2] + 0.01
-    there = LegConstraints(problem.parameters).with_poses(state, state.platform_pose._replace(t=t))
-    moved = np.linalg.norm(there.platform_pose.t - state.platform_pose.t, axis=1)
-    assert moved[0] == 0.0
-    assert moved[2] > 1e-3
-    assert moved[3:].max() < 1e-9
-    assert np.isfinite(moved).all()

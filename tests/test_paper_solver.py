@@ -8,40 +8,23 @@ from threading import Timer
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from random_legs import closed_leg
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.lines import axis_angles, normal_basis, turned_axis
-from legcal.geometry.types import Array
+from legcal.geometry.lines import normal_basis
 from legcal.machine.equations import leg_equations
-from legcal.machine.leg import EquationKind, JointType
+from legcal.machine.leg import EquationKind
 from legcal.paper.equations import (
-    angles_of,
     axis_frames,
-    axis_slope,
-    change_of_distance,
     closure_of_leg,
-    distance_of_ends,
     end_of_leg,
-    end_on_axis,
-    end_on_ray,
-    gibbs_of,
-    joint_on_axis,
     leg_across_axis,
-    mean_distance,
-    point_on_ray,
-    turned_frame,
 )
 from legcal.paper.least_squares import (
     LeastSquares,
     Term,
-    derivatives,
-    evaluated,
     solve_least_squares,
-    undetermined,
 )
 
 
@@ -88,13 +71,6 @@ def test_an_outlier_loses_its_weight() -> None:
     assert np.abs(wrong - clean).max() < 0.02 * np.abs(plain - clean).max()
 
 
-def test_a_direction_that_no_residual_shows_is_undetermined() -> None:
-    x = ca.SX.sym("x", 3)
-    residuals = ca.vertcat(x[0] - 1.0, x[1] + x[2], 2.0 * (x[1] + x[2]) - 1.0)
-    problem = _problem("A sum", x, residuals, [0.0, 0.0, 0.0])
-    assert undetermined(problem.jacobian(np.ones(3))).tolist() == [False, True, True]
-
-
 def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:
     x = ca.SX.sym("x", 1)
     problem = _problem("A root", x, ca.sqrt(x) - 1.0, [-1.0])
@@ -122,41 +98,6 @@ def test_an_interrupt_inside_ipopt_reaches_the_caller() -> None:
 
 
 # Equations
-
-
-def _noise_of(function: ca.Function, arguments: list[Array]) -> Array:
-    """Return the derivative by the errors, by differences."""
-    n, h = function.size1_in(1), 1e-6
-    steps = h * np.eye(n)
-    ahead, behind = (
-        np.array([function(arguments[0], s * e, *arguments[1:]).full().ravel() for e in steps])
-        for s in (1.0, -1.0)
-    )
-    return np.asarray((ahead - behind).T / (2.0 * h))
-
-
-def test_weights_follow_the_errors_of_each_equation() -> None:
-    """Of random numbers: covariances of residuals are J C J' of what was observed."""
-    rng = np.random.default_rng(0)
-    functions = (
-        joint_on_axis(),
-        leg_across_axis(),
-        end_of_leg(),
-        distance_of_ends(),
-        change_of_distance(),
-        mean_distance(),
-        point_on_ray(),
-        end_on_ray(),
-        end_on_axis(),
-        closure_of_leg(JointType.UNIVERSAL, JointType.UNIVERSAL),
-    )
-    for function in functions:
-        sizes = [function.size_in(k) for k in range(function.n_in())]
-        arguments = [rng.normal(size=size) for k, size in enumerate(sizes) if k != 1]
-        observed = [x[None] if x.shape[1] > 1 else x.T for x in arguments]
-        J = derivatives(function, 1, *observed)[0]
-        np.testing.assert_allclose(J, _noise_of(function, arguments), atol=1e-6)
-        assert evaluated(function, *observed).shape == (1, function.size1_out(0))
 
 
 @pytest.mark.parametrize("joints", ["UU", "U", "RU", "UR", "RR"])
@@ -191,31 +132,3 @@ def test_equations_of_a_leg_are_those_of_the_machine(joints: str) -> None:
         function = closure_of_leg(leg.base_joint, leg.platform_joint)
         sine = float(function(np.zeros(5), none, u, E, R, a, b, float(leg.twist or 0.0), 0.5))
         assert sine == pytest.approx(2.0 * values[EquationKind.TWIST], abs=1e-12)
-
-
-# Unknown motions and axes
-
-
-@given(turns=st.tuples(*[st.floats(-1.0, 1.0)] * 2), seed=st.integers(0, 10**6))
-@settings(max_examples=30, deadline=None)
-def test_turns_of_an_axis_are_its_angles_from_the_nominal_one(
-    turns: tuple[float, float], seed: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    nominal = rng.standard_normal(3)
-    nominal /= np.linalg.norm(nominal)
-    w = np.array(turns)
-    symbol, frame = ca.SX.sym("turns", 2), ca.SX(ca.DM(axis_frames(nominal[None])[0]))
-    in_casadi = ca.Function("axis", [symbol], [turned_frame(symbol, frame)[:, 0]])
-    axis = in_casadi(w).full().ravel()
-    np.testing.assert_allclose(turned_axis(nominal, angles_of(w)), axis, atol=1e-12)
-    np.testing.assert_allclose(gibbs_of(axis_angles(axis, nominal)), w, atol=1e-9)
-    np.testing.assert_allclose(axis_angles(-axis, nominal), angles_of(w), atol=1e-9)
-    exact = Rotation.from_rotvec(angles_of(w) @ normal_basis(nominal)).apply(nominal)
-    np.testing.assert_allclose(axis, exact, atol=1e-12)
-    h = 1e-6
-    slope = [(in_casadi(w + h * e) - in_casadi(w - h * e)).full() / (2.0 * h) for e in np.eye(2)]
-    np.testing.assert_allclose(axis_slope(nominal, w), np.hstack(slope), atol=1e-8)
-
-
-# Registration of points

@@ -1,6 +1,5 @@
 """What files of photographs say of how they were made, and what is said where it contradicts."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,9 @@ import yaml
 from camera_sessions import PINHOLE, drawings
 from dataset_folder import SIZE, Folder, folder
 from fuzzing.mutations import mutate
-from photograph_files import exif, jpeg, png, tiff, undecodable_png
+from photograph_files import exif, jpeg, png, tiff
 
 from legcal import calibrate, calibrate_camera, load_dataset
-from legcal.calibration.diagnosis.diagnosis import Diagnosis
 from legcal.data.photograph_notes import compression_notes
 from legcal.errors import DatasetError, NotVisible, Place
 from legcal.vision.camera import Camera
@@ -27,7 +25,6 @@ from legcal.vision.image_file import (
     image_size,
     inspect_image,
     read_facts,
-    read_image,
 )
 
 __all__ = ["folder"]
@@ -113,8 +110,6 @@ def _cut(content: bytes) -> bytes:
 
 SMALL = np.resize(PICTURE, (24, 32))
 REFUSED: tuple[tuple[bytes, list[str]], ...] = (
-    (b"", ["an empty file"]),
-    (b"GIF89a", ["none of these", "a complete PNG, JPEG or TIFF"]),
     (b"\xff\xd8\xff\xd9", ["a JPEG file of 4 bytes", "cut off", "copy it again"]),
     (_cut(jpeg(PICTURE)), ["JPEG", "cut off"]),
     (_cut(png(PICTURE)), ["PNG", "cut off"]),
@@ -149,13 +144,6 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(
     assert str(inspect_image(path, CAMERA, Place("table", 3))[1]) == sentence
     assert cv2.utils.logging.getLogLevel() == level
     assert capfd.readouterr().err == ""
-
-
-def test_a_picture_that_cannot_be_decoded_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    path.write_bytes(undecodable_png(PICTURE))
-    with pytest.raises(DatasetError, match="data that cannot be decoded"):
-        read_image(path, CAMERA)
 
 
 # What is said of a dataset
@@ -193,6 +181,13 @@ DIFFERENT: tuple[tuple[bytes, list[str]], ...] = (
     (phone(software="Adobe Lightroom 6.0"), ["'Adobe Lightroom 6.0'", "'17.1'", "processing"]),
     (phone(orientation=6), ["turned by 90 deg", "stands still"]),
     (phone(software="Screenshot"), ["'Screenshot'", "'17.1'"]),
+    # what moves no edge is not spoken of
+    (phone(exposure=0.5), []),
+    (phone(software="17.4"), []),
+    (phone(focal35=27), []),
+    (phone(focus=0.51), []),
+    (jpeg(PICTURE, 60, exif(**PHONE)), []),
+    (phone() + b"a video behind the picture", []),
 )
 
 
@@ -200,48 +195,18 @@ DIFFERENT: tuple[tuple[bytes, list[str]], ...] = (
 def test_an_image_unlike_the_others_is_named_with_the_difference(
     folder: Folder, content: bytes, words: list[str]
 ) -> None:
-    (note,) = notes(folder, {1: content})
-    assert [word for word in [*ONE, *words] if word not in note] == []
+    found = notes(folder, {1: content})
+    assert len(found) == bool(words)
+    assert all(word in note for note in found for word in (*ONE, *words))
 
 
-def test_a_refusal_names_what_may_be_its_cause(
-    folder: Folder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refusal_names_what_may_be_its_cause(folder: Folder) -> None:
     del folder.entry["views"]["c2"]["legs"]
     (note,) = notes(folder, {1: phone(zoom=2.0)})
     with pytest.raises(NotVisible) as refused:
         calibrate(folder.path)
     assert len(refused.value.problems) > 1
     assert refused.value.problems[-1] == note
-    # Where a mistake explains them, what follows from it is counted and accuses nobody.
-    n = len(refused.value.problems) - 1
-    mistake = Diagnosis(
-        "columns exchanged", "columns a and b look exchanged", (), "with them exchanged", 6, 1, 6,
-        0.9, "exchange their headers",
-    )  # fmt: skip
-    monkeypatch.setattr("legcal.calibration.pipeline.diagnose", lambda data: (mistake,))
-    with pytest.raises(NotVisible) as refused:
-        calibrate(folder.path)
-    first, follow, last = refused.value.problems
-    assert (first, last) == (mistake.sentence, note)
-    assert follow.startswith(f"{n} further problem")
-    assert len(refused.value.consequences) == n
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        phone(exposure=0.5),
-        phone(software="17.4"),
-        phone(focal35=27),
-        phone(focus=0.51),
-        jpeg(PICTURE, 60, exif(**PHONE)),
-        phone(make="ACME", model="Acme One"),
-        phone() + b"a video behind the picture",
-    ],
-)
-def test_differences_that_move_no_edge_are_not_spoken_of(folder: Folder, content: bytes) -> None:
-    assert notes(folder, {1: content}) == []
 
 
 RECORDED = {"device": ["Acme One"], "focal_length_mm": [4.25], "focal_length_35mm": [26.0],
@@ -285,29 +250,15 @@ def test_lossy_compression_is_noted_once_with_views_and_quality(folder: Folder) 
 # The camera
 
 
-@pytest.fixture(scope="module")
-def boards(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Photographs of a board by a phone, of which the last may be another."""
-    path = tmp_path_factory.mktemp("boards")
-    images = [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in drawings(path, PINHOLE, 3)]
-
-    def written(**others: Any) -> Path:
-        for p in path.glob("b*"):
-            p.unlink()
-        for k, image in enumerate(images):
-            assert image is not None
-            height, width = image.shape
-            said = PHONE | {"width": width, "height": height} | (others if k == 2 else {})
-            (path / f"b{k}.jpg").write_bytes(jpeg(image, 92, exif(**said)))
-        return path
-
-    return written
-
-
-def test_the_camera_file_records_its_photographs(
-    boards: Callable[..., Path], tmp_path: Path
-) -> None:
-    found = calibrate_camera(boards(), "chessboard:9x6:30mm", output=tmp_path / "camera.yaml")
+def test_the_camera_file_records_its_photographs(tmp_path: Path) -> None:
+    (tmp_path / "photographs").mkdir()
+    for k, path in enumerate(drawings(tmp_path, PINHOLE, 3)):
+        image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        said = PHONE | {"width": image.shape[1], "height": image.shape[0]}
+        (tmp_path / f"photographs/b{k}.jpg").write_bytes(jpeg(image, 92, exif(**said)))
+    found = calibrate_camera(
+        tmp_path / "photographs", "chessboard:9x6:30mm", output=tmp_path / "camera.yaml"
+    )
     assert not [w for w in found.warnings if "No one camera" in w]
     block = yaml.safe_load((tmp_path / "camera.yaml").read_text())["legcal_camera"]
     assert block["photographs"] == {

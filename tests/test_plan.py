@@ -16,35 +16,28 @@ import numpy as np
 import pytest
 from command_line import run
 from csv_rows import read_rows
-from fit_sessions import machine_session
 from scipy.spatial.transform import RigidTransform
 
 import legcal
 from legcal.calibration.joint_fit.predicted import (
-    DEFAULT_NOISE,
     WHITE,
-    Contributions,
-    Predictor,
-    predicted_outlines,
 )
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
-from legcal.geometry.types import Array
 from legcal.machine.configurations import Configurations
 from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
-from legcal.planning.exchange import Session, choose
+from legcal.planning.exchange import choose
 from legcal.planning.places import Place, Setting, default_setting, parse_bounds
-from legcal.planning.planner import Candidates, Scene, Task
 from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
 from legcal.planning.session import Plan, write_session
 from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings
 from legcal.vision.camera import sample_camera
 from legcal.vision.camera_file import camera_info
 
@@ -261,11 +254,6 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
     assert all(view.hand_held for view in shot.measurements.views)
     assert shot.corners is not None
     assert len(shot.corners.row) == 4 * held.board.board.n_corners
-    (tmp_path / "session" / "plan.json").write_text(
-        json.dumps(held.document() | {"T_base_board": None})
-    )
-    with pytest.raises(UsageError, match="no place of the board"):
-        simulate(load_mechanism("3-rpr"), tmp_path / "again", settings)
     wide = held.document()["tolerance"] | {"camera_rad": 3.0}
     (tmp_path / "session" / "plan.json").write_text(
         json.dumps(held.document() | {"tolerance": wide})
@@ -274,49 +262,6 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
         DatasetError, match=r"tolerance.camera_rad .* found 3.0, needed 0.8 or less"
     ):
         simulate(load_mechanism("3-rpr"), tmp_path / "again", settings)
-
-
-def test_what_is_seen_is_what_the_simulation_shows(planned: Plan, tmp_path: Path) -> None:
-    """By another code, which casts rays at solids and draws silhouettes by their tangents."""
-    exact = replace(planned, setting=replace(FEW, shift=0.0, turn=0.0))
-    write_session(exact, tmp_path / "session")
-    settings = SimulationSettings(
-        errors=ParameterErrors(), plan=tmp_path / "session", level=Level.OUTLINES, sigma_px=0.0
-    )
-    simulate(load_mechanism("3-rpr"), tmp_path / "shot", settings)
-    found = load_dataset(tmp_path / "shot").observations
-    assert found is not None
-    both = zip(found.row_keys(), found.h, found.ends, strict=True)
-    lines = {key: (h, ends) for key, h, ends in both}
-    row, agreeing, missing = 0, 0, 0
-    for view in planned.views:
-        of_view = predicted_outlines(view.seen, row + np.arange(len(view.poses.poses)), WHITE)
-        for key, h, ends in zip(of_view.row_keys(), of_view.h, of_view.ends, strict=True):
-            if key not in lines:
-                missing += 1
-                continue
-            agreeing += 1
-            np.testing.assert_allclose(lines[key][0], h, atol=2e-5)
-            shown = np.linalg.norm(ends[1] - ends[0])
-            assert np.linalg.norm(lines[key][1][1] - lines[key][1][0]) > 0.6 * shown
-        row += len(view.poses.poses)
-    assert missing <= 0.1 * agreeing
-
-
-def test_updates_of_the_covariance_are_those_of_the_information(planned: Plan) -> None:
-    task = Task(Predictor(planned.machine, planned.camera, DEFAULT_NOISE, 2e-6), 6, 1, FEW)
-    view = planned.views[0]
-    candidates = Candidates(Place(view.T_base_camera), view.poses)
-    found = Scene.nominal(task).of(candidates)
-    assert found is not None
-    session = Session([found])
-    one_more = session.with_one_more(0, np.array([0, 1]))
-    session.changed(0, 1, 1.0)
-    np.testing.assert_allclose(session.machine, one_more[1], rtol=1e-6, atol=1e-15)
-    updated = session.covariance.copy()
-    session.renewed()
-    sigma = np.sqrt(np.diagonal(session.covariance))
-    assert np.abs((updated - session.covariance) / np.outer(sigma, sigma)).max() < 1e-6
 
 
 FAR: dict[str, Any] = {"images": 4, "setting": FEW}
@@ -335,7 +280,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
     ({"given": "nowhere"}, DatasetError, "nowhere"),
     ({"noise": "nowhere"}, UsageError, "--noise"),
-    ({"noise": __file__}, UsageError, "found no JSON document"),
+    ({"noise": __file__}, UsageError, "found no JSON"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"encoder_sigma": "2"}, UsageError, "without a unit"),
     ({"setting": Setting(0.05, 2e-3, draws=0)}, UsageError, "0 draws"),
@@ -360,57 +305,6 @@ def test_what_cannot_be_planned_is_refused(
         legcal.plan("3-rpr", **({"cameras": 2} | asked))
     assert len(refusal.value.problems) == 1
     assert named in str(refusal.value)
-
-
-def test_photographs_of_one_site_share_errors_at_its_places() -> None:
-    """They tell as much as generalised least squares gets from all of them."""
-    hexapod, session = load_mechanism("hexapod"), machine_session("hexapod", n_views=1)
-    T_base_camera = hexapod.T_base_Rb * session.truth.T_camera_Rb[0].inv()
-    predictor = Predictor(hexapod, sample_camera(), DEFAULT_NOISE, 2e-6)
-
-    def contributions(*taken: int, is_fit: bool = False) -> Contributions:
-        shown = [np.flatnonzero(session.outlines.row == pose) for pose in taken]
-        image = np.repeat(np.arange(len(taken)), [len(own) for own in shown])
-        return predictor.contributions(
-            {"c1": T_base_camera},
-            np.zeros(len(taken), dtype=np.intp),
-            [session.truth.T_Rb_Re[pose] for pose in taken],
-            replace(session.outlines.choose(np.concatenate(shown)), row=image),
-            is_fit=is_fit,
-        )
-
-    def least_squares(fitted: Contributions) -> Array:
-        """Return the information of generalised least squares."""
-        J = fitted.rows.reshape(-1, len(fitted.names))
-        shared = fitted.shifts.reshape(len(J), -1)
-        return np.asarray(J.T @ np.linalg.solve(np.eye(len(J)) + shared @ shared.T, J))
-
-    found, information = contributions(0, 0, 0), least_squares(contributions(0, 0, 0, is_fit=True))
-    unit = np.sqrt(np.diagonal(information + found.prior))
-    J = found.all_gains() / unit
-    np.testing.assert_allclose(J.T @ J, information / unit / unit[:, None], atol=1e-9)
-
-    # A fit that knows nothing of them does worse than that, and than it would without them.
-    twice = contributions(*2 * [*range(6)], is_fit=True)
-    fit, best = Session([], [twice]), np.linalg.inv(least_squares(twice) + twice.prior)
-    sigma = np.sqrt(np.diagonal(fit.machine))
-    for least in (best[: fit.p, : fit.p], fit.machine):
-        worse = np.linalg.eigvalsh((fit.fitted() - least) / np.outer(sigma, sigma))
-        assert worse.min() > -1e-6
-        assert worse.max() > 0.1
-
-    several = contributions(0, 5, 0, 5, 0)
-    assert several.site.tolist() == [0, 1, 0, 1, 0]
-    of = np.array([1, 2, 3])
-    parts = {"rows": several.rows[of], "at_site": several.at_site[of], "site": several.site[of]}
-    searched, left = Session([several]), Session([], [replace(several, **parts)])
-    for image in (0, 1, 2, 3):
-        searched.changed(0, image, 1.0)
-    searched.changed(0, 0, -1.0)  # the other of its site moves up
-    unit = np.sqrt(np.diagonal(left.information))
-    off = (searched.information - left.information) / unit / unit[:, None]
-    np.testing.assert_allclose(off, 0.0, atol=1e-9)
-    np.testing.assert_allclose(searched.machine, left.machine, rtol=0.01, atol=1e-5)
 
 
 @pytest.mark.usefixtures("drawn_once")

@@ -69,13 +69,6 @@ def test_a_figure_shows_the_sigma_of_every_parameter(example_run: Run) -> None:
             assert f"{row.name}, 1 sigma: {1e3 * row.sigma:.3g} mm" in tips
 
 
-@pytest.mark.usefixtures("without_steps")
-def test_progress_can_be_switched_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    simulated(tmp_path / "set", "3-rpr", views=3, poses=6)
-    legcal.calibrate(tmp_path / "set", progress=True)
-    assert "Joint fit: 1/1" in capsys.readouterr().err
-
-
 def test_a_machine_is_drawn_with_numbered_joints_and_hostile_names(tmp_path: Path) -> None:
     machine = legcal.load_mechanism("3-rps")
     hostile = dataclasses.replace(machine, name="<script>")

@@ -1,7 +1,5 @@
 """Readings in degrees, radians and pulses of servos, stated and taken for each other."""
 
-import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,19 +11,18 @@ from command_line import run
 from csv_rows import read_rows
 from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
-from photograph_files import jpeg
+from test_init import own_folder
 
-import legcal
-from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.data.reading_units import sigmas_of
 from legcal.descriptions.new_model import create_model
 from legcal.errors import LegcalError, ModelError, UsageError
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model_writer import write_model
-from legcal.simulation.settings import Distribution, Level, SimulationSettings, Spread
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
 BOTH_WAYS = np.concatenate([ANGLES, -ANGLES])
+PHOTOGRAPHS = [f"IMG_{k}.jpg" for k in range(4)]
 PULSES = {"centre_us": 1500, "us_per_deg": 11.1}
 
 
@@ -98,50 +95,11 @@ def test_motors_that_turn_the_other_way_are_told_by_a_travel_that_is_uneven(tmp_
     assert "opposite sign" in said
 
 
-def test_sigmas_beyond_a_share_of_the_travel_or_of_a_turn_are_refused_wherever_they_are_given(
-    tmp_path: Path,
-) -> None:
-    machine, folder = load_mechanism("hexapod"), tmp_path / "dataset"
-    travel = machine.legs[0].travel[1] - machine.legs[0].travel[0]
-    shutil.copytree(ROOT / "examples/hexapod", folder)
-    entry = yaml.safe_load((folder / "dataset.yaml").read_text())
-
-    def load(stated: object) -> Dataset:
-        (folder / "dataset.yaml").write_text(yaml.safe_dump(entry | {"encoder_sigma": stated}))
-        return load_dataset(folder, check_images=False)
-
-    assert load(0.19 * travel).measurements.sigma_q == 0.19 * travel
-    sigma = 0.21 * travel
-    noisy = SimulationSettings(Level.OUTLINES, readings=Spread(sigma, Distribution.NORMAL))
-    ways: list[Callable[[], object]] = [
-        lambda: load(sigma),
-        lambda: load(dict.fromkeys(machine.motor_names, sigma)),
-        lambda: legcal.plan(machine, encoder_sigma=sigma),
-        lambda: legcal.simulate(machine, tmp_path / "out", noisy),
-    ]
-    for give in ways:
-        with pytest.raises(LegcalError) as refusal:
-            give()
-        assert f"{1e3 * sigma:.3g} mm, needed at most" in refusal.value.problems[0]
-        assert "20% of the travel of 'leg1_prismatic'" in refusal.value.problems[0]
+def test_sigmas_of_motors_that_turn_endlessly_are_at_most_a_share_of_a_turn() -> None:
     endless = replace(load_mechanism("delta").legs[0], travel=(-np.inf, np.inf))
     assert sigmas_of("70deg", [endless]) == {"arm1": pytest.approx(np.radians(70.0))}
     with pytest.raises(UsageError, match="found 80 deg, needed at most 20% of a turn, 72 deg"):
         sigmas_of("80deg", [endless])
-
-
-def photographs(folder: Path, n: int) -> None:
-    """Write photographs and the file of their camera."""
-    (folder / "photos").mkdir()
-    for k in range(n):
-        picture = np.full((48, 64), 40 + k, dtype=np.uint8)
-        (folder / f"photos/IMG_{k}.jpg").write_bytes(jpeg(picture))
-    (folder / "camera_info.yaml").write_text(
-        "image_width: 64\nimage_height: 48\ncamera_name: c\n"
-        "camera_matrix: {rows: 3, cols: 3, data: [80, 0, 32, 0, 80, 24, 0, 0, 1]}\n"
-        "distortion_model: plumb_bob\n"
-        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
-    )
 
 
 @pytest.mark.parametrize(
@@ -162,7 +120,7 @@ def test_init_takes_angles_and_pulses(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    photographs(tmp_path, 4)
+    own_folder(tmp_path, PHOTOGRAPHS)
     given = {"rad": ANGLES, "deg": np.degrees(ANGLES), "us": pulses(ANGLES)}[scale]
     model = "servo-hexapod"
     if scale == "us":
@@ -216,7 +174,7 @@ def test_what_init_cannot_make_of_angles(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    photographs(tmp_path, 4)
+    own_folder(tmp_path, PHOTOGRAPHS)
     assert init(tmp_path, given, headings, words, monkeypatch) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert said.count("legcal: ") == 1

@@ -27,7 +27,6 @@ from legcal.perception.camera_search import (
     place_by_edges,
     place_camera,
     place_near,
-    pose_hypotheses,
 )
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.pair_matching import (
@@ -36,12 +35,8 @@ from legcal.perception.pair_matching import (
     PairMatches,
     Picture,
     Pictures,
-    _moved,
     depth_reversed,
-    distances,
-    gauss_newton_step,
     match_pairs,
-    segment_equations,
 )
 from legcal.perception.placement import Group, Search, group_views
 from legcal.perception.view_fit import (
@@ -67,15 +62,6 @@ def _scene(
     return lp.pictures(made, T, platforms, rng, **difficulty), T  # type: ignore[arg-type]
 
 
-def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> CameraPoses:
-    return CameraPoses.one(T_base_camera, np.zeros((n_legs, 2, 3)))
-
-
-def _moved_machine(picture: Picture, G: RigidTransform) -> Picture:
-    ends = G.apply(picture.targets.ends.reshape(-1, 3)).reshape(-1, 2, 3)
-    return replace(picture, targets=replace(picture.targets, ends=ends))
-
-
 def _is_right(placed: PoseCandidates, T: RigidTransform) -> bool:
     away, angle = lp.apart(T, placed.pose())
     return angle < np.deg2rad(5.0) and away < 0.1
@@ -84,51 +70,14 @@ def _is_right(placed: PoseCandidates, T: RigidTransform) -> bool:
 MOTION = RigidTransform.from_components([0.3, -0.2, 0.5], Rotation.from_rotvec([0.4, 1.0, -0.3]))
 
 
-# Poses hypothesised from two pairs.
-
-
-def test_hypotheses_move_with_the_frame_of_the_machine_and_put_two_legs_on_pairs() -> None:
-    (picture,), _ = _scene(4, 5, 1)
-    moved = _moved_machine(picture, MOTION)
-    one, two = pose_hypotheses(picture, 5), pose_hypotheses(moved, 5)
-    scores = [_matched(p, s, 0.125).score for p, s in ((picture, one), (moved, two))]
-    assert np.mean((scores[0] > 0.1).sum(axis=1) >= 2) > 0.5
-    assert abs(len(one) - len(two)) <= 0.02 * len(one)
-    assert len(np.unique(one.R.round(9), axis=0)) > 0.7 * len(one)  # two turns of each
-    assert max(scores[0].sum(axis=1)) == pytest.approx(max(scores[1].sum(axis=1)), abs=0.05)
-    trace = np.einsum("kij,lij->kl", one.R[:200], two.R @ MOTION.rotation.as_matrix())
-    assert np.mean(trace.max(axis=1) > 3.0 - 1e-3) > 0.9
-    one_pair = replace(picture, pairs=picture.pairs.take(np.array([0])))
-    one_leg = replace(
-        picture, targets=lp.pieces(*(x[:1] for x in np.ones((2, 1, 3)) * [[[0]], [[1]]]))
-    )
-    assert len(pose_hypotheses(one_pair, 5)) == len(pose_hypotheses(one_leg, 5)) == 0
-
-
-# Scores of poses, and steps towards the pairs.
+def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> CameraPoses:
+    return CameraPoses.one(T_base_camera, np.zeros((n_legs, 2, 3)))
 
 
 def _matched(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Return the matches of one picture, without those of others."""
     score, pair, visible = match_pairs(Pictures.of([picture]), poses, tolerance)
     return PairMatches(score[0], pair[0], visible[0])
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_true_pose_matches_and_a_scaled_or_shifted_one_does_not(seed: int) -> None:
-    pictures, T = _scene(seed)
-    matches = [_matched(picture, _pose(T), 0.005) for picture in pictures]
-    score = np.concatenate([m.score[0][m.visible[0] > 0.9] for m in matches])
-    assert np.median(score) > 0.9
-    assert np.mean(score > 0.5) > 0.8  # pairs of edges of crossing legs may be taken as well
-    away = _pose(T)
-    away = replace(away, t=away.t + np.array([0.05, 0.0, 0.0]))
-    assert all(_matched(p, away, 0.005).score.mean() < 0.2 for p in pictures)
-    for picture, m in zip(pictures, matches, strict=True):  # a third farther and thinner
-        wide = replace(
-            picture, targets=replace(picture.targets, radius=1.33 * picture.targets.radius)
-        )
-        assert _matched(wide, _pose(T), 0.005).score.sum() < 0.4 * m.score.sum()
 
 
 def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
@@ -145,116 +94,6 @@ def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
     exclusive = (m.exclusive_score[0, :n] + m.exclusive_score[0, n:])[both]
     assert np.mean(np.abs(exclusive - better) < 1e-6) > 0.7
     assert np.all(exclusive <= better + 1e-6)
-
-
-def test_scores_depend_on_no_frame_and_not_on_other_poses() -> None:
-    (picture, *_), T = _scene(1)
-    poses = CameraPoses.joined([_pose(T)] * 300)
-    poses = replace(poses, t=poses.t + np.linspace(0.0, 0.1, 300)[:, None] * [1.0, 0.0, 0.0])
-    together = _matched(picture, poses, 0.025)
-    for i in (0, 127, 128, 299):
-        alone = _matched(picture, poses.take(np.array([i])), 0.025)
-        np.testing.assert_allclose(alone.score[0], together.score[i], atol=1e-6)
-    moved = _matched(_moved_machine(picture, MOTION), _pose(MOTION * T), 0.025)
-    np.testing.assert_allclose(moved.score[0], together.score[0], atol=1e-4)
-    C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, -0.5, 0.3]))
-    joined = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
-    other = _matched(joined, _pose(T * C), 0.025)
-    np.testing.assert_allclose(other.score[0], together.score[0], atol=1e-4)
-    for angle in (np.pi, 1.2):  # behind the camera, beside the picture
-        away = T * RigidTransform.from_rotation(Rotation.from_euler("y", angle))
-        assert not _matched(picture, _pose(away), 0.025).visible.any()
-    empty = replace(picture, pairs=picture.pairs.take(np.zeros(0, dtype=np.intp)))
-    nothing = _matched(empty, _pose(T), 0.025)
-    assert not nothing.score.any()
-    assert nothing.visible.any()
-    none = Pictures.of([empty])
-    still = gauss_newton_step(none, _pose(T), match_pairs(none, _pose(T), 0.025), 0.025, 0.015)
-    np.testing.assert_allclose(still.t, _pose(T).t)
-
-
-@pytest.mark.parametrize("joined", [False, True])
-def test_derivatives_of_residuals_are_those_by_differences(joined: bool) -> None:
-    (picture, *_), T = _scene(3)
-    C = RigidTransform.identity()
-    if joined:
-        C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, 0.5, 0.3]))
-        picture = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
-    poses = _pose(T * C)
-    rng = np.random.default_rng(0)
-    poses = replace(poses, shift=rng.uniform(-5e-3, 5e-3, poses.shift.shape))
-    own = Pictures.of([picture])
-    found = match_pairs(own, poses, 0.05)
-    matched = found.score[0, 0] > 0.3
-    assert matched.sum() > 5
-    J, J_leg, _, weight = (x[0] for x in segment_equations(own, poses, found, 0.025))
-    assert np.all(weight[0, matched] > 0.0)
-
-    def residual(at: CameraPoses) -> Array:
-        return np.asarray(segment_equations(own, at, found, 0.025)[2][0, 0])
-
-    # Fixed while a segment moves are its place along the pair, which matters by the product of two
-    # small residuals, and how obliquely its plane is seen, which matters a little for the width.
-    step, centre = 1e-6, np.full((1, 3), 1e3)
-    scale = np.abs(J[0, matched]).max()
-    for k in range(6):
-        xi = step * np.eye(6)[k][None]
-        ahead, back = (
-            residual(_moved(poses, s * xi, poses.shift, centre, 0.02)) for s in (1.0, -1.0)
-        )
-        error = np.abs(((ahead - back) / (2.0 * step))[matched] - J[0, matched, :, k])
-        assert error[:, :2].max() < 0.03 * scale
-        assert np.median(error[:, 2]) < 0.3
-        assert error[:, 3].max() < 1e-4 * scale
-    for k in range(6):
-        shift = poses.shift.copy()
-        shift.reshape(1, -1, 6)[..., k] += step
-        change = ((residual(replace(poses, shift=shift)) - residual(poses)) / step)[matched]
-        error = np.abs(change[:, :2] - J_leg[0, matched, :2, k])
-        assert error.max() < 0.05 * np.abs(J_leg[0, matched]).max()
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_steps_lead_back_to_the_true_pose(seed: int) -> None:
-    pictures, T = _scene(seed, noise=0.3)
-    rng = np.random.default_rng(seed)
-    off = RigidTransform.from_components(
-        rng.uniform(-0.01, 0.01, 3), Rotation.from_rotvec(rng.uniform(-0.02, 0.02, 3))
-    )
-    poses = _pose(T * off)
-    for tolerance in (0.075, 0.05, 0.025, 0.015, 0.01):
-        matches = match_pairs(Pictures.of(pictures), poses, tolerance)
-        poses = gauss_newton_step(Pictures.of(pictures), poses, matches, tolerance)
-    away, angle = lp.apart(T, poses.T_base_camera())
-    assert away < 0.025
-    assert angle < 0.01 < lp.apart(T, T * off)[1]
-    np.testing.assert_allclose(poses.R[0] @ poses.R[0].T, np.eye(3), atol=1e-12)
-
-
-def test_a_joint_that_is_elsewhere_is_found_in_the_picture() -> None:
-    rng = np.random.default_rng(5)
-    made, T, where = lp.machine(6, rng), lp.camera(rng), lp.platform(rng)
-    A, B = made.A.copy(), made.posed(where)
-    x = T.rotation.apply([1.0, 0.0, 0.0])
-    A[2] = A[2] + 8e-3 * x
-    picture = lp.picture((made.A, B), (A, B), T, rng)
-    poses = _pose(T)
-    for tolerance in (0.05, 0.025, 0.0125, 0.0075):
-        matches = match_pairs(Pictures.of([picture]), poses, tolerance)
-        poses = gauss_newton_step(Pictures.of([picture]), poses, matches, tolerance, 0.05)
-    sideways = np.cross(B[2] - A[2], T.rotation.apply([0.0, 0.0, 1.0]))
-    sideways /= np.linalg.norm(sideways)
-    assert abs(poses.shift[0, 2, 0] @ sideways) > 0.5 * abs(8e-3 * x @ sideways)
-    assert np.abs(np.delete(poses.shift[0], 2, axis=0)).max() < 3e-3
-    away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
-    (picture, *_), T = _scene(0)
-    own = Pictures.of([picture])
-    matches = match_pairs(own, _pose(T), 0.005)
-    good = matches.score[0, 0] > 0.9
-    away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
-    assert np.median(distances(own, _pose(T), matches)[0, 0, good]) < 2e-4
-    off = distances(own, _pose(away), matches)[0, 0, good]
-    assert 2e-3 < off.max() < 6e-3
 
 
 # The camera of a view.

@@ -121,15 +121,6 @@ def _folder(motion: Motion, folder: Path) -> Path:
     return place
 
 
-def _twice(motion: Motion, folder: Path) -> Path:
-    """Write a folder of images with two of one time, as whole seconds write them."""
-    place = _folder(motion, folder)
-    first = sorted(place.iterdir())[0]
-    first.rename(place / "1700000000.png")
-    (place / "left_1700000000.png").write_bytes((place / "1700000000.png").read_bytes())
-    return place
-
-
 def _bag(motion: Motion, folder: Path, **extra: str) -> Path:
     rosbags = pytest.importorskip("rosbags.rosbag2", reason="the package rosbags is not there")
     from rosbags.typesys import Stores, get_typestore
@@ -263,16 +254,12 @@ def test_times_in_names_keep_their_fraction(name: str, seconds: float | None) ->
 
 REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = {
     "no such file": (lambda m, t: (t / "none.mp4",), "found no such file"),
-    "damaged AVI header": (lambda m, t: (_written(t / "a.avi", b"RIFF0000AVI " + b"\xff" * 40),
-                                         "--readings", _ticks(m, t)), "found no frame in"),
     "another format": (lambda m, t: (_written(t / "a.txt", b"x"),), "found a file ending in"),
     "cut-off video": (lambda m, t: (_written(t / "a.mp4", b"\0" * 99), "--readings",
                                     _ticks(m, t)), "found no frame in it"),
     "damaged bag": (lambda m, t: (_written(t / "a.bag", b"\0" * 99),), "a complete bag"),
     "no readings": (lambda m, t: (_video(m, t),), "give it with --readings"),
     "no times": (lambda m, t: (_video(m, t), "--readings", _timeless(m, t)), "no column 'time'"),
-    "times of another name": (lambda m, t: (_video(m, t), "--readings", _renamed(m, t)),
-                              "Column 'Moment' of"),
     "nothing moves": (lambda m, t: (_video(m, t), "--readings", _resting(m, t)),
                       "readings that change at one rate all the time"),
     "other motion": (lambda m, t: (_video(m, t), "--readings", _other(m, t)),
@@ -283,16 +270,10 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
                    "needed times that overlap"),
     "no camera file": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t),
                                      "--camera", f"c1={t / 'nope.yaml'}"), "nope.yaml"),
-    "one time twice": (lambda m, t: (_twice(m, t), "--readings", _ticks(m, t)),
-                       "found the time of 1700000000.png again"),
     "no offset": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "nan"),
                   "correct --offset"),
     "a row without a time": (lambda m, t: (_video(m, t), "--readings", _holed(m, t)),
                              "found '',"),
-    "dates without signs": (lambda m, t: (_video(m, t), "--readings", _dated(m, t)),
-                            "found '20261123101500',"),
-    "two tables": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--readings",
-                                 _ticks(m, t)), "one for all or one for each"),
 }  # fmt: skip
 
 
@@ -322,20 +303,6 @@ def _holed(motion: Motion, folder: Path) -> Path:
     path = _ticks(motion, folder)
     first, second, *others = path.read_text().splitlines()
     path.write_text("\n".join([first, second[second.index(",") :], *others]))
-    return path
-
-
-def _dated(motion: Motion, folder: Path) -> Path:
-    path = _ticks(motion, folder)
-    first, *rows = path.read_text().splitlines()
-    dated = [f"{20261123101500 + k // 50}{row[row.index(',') :]}" for k, row in enumerate(rows)]
-    path.write_text("\n".join([first, *dated]))
-    return path
-
-
-def _renamed(motion: Motion, folder: Path) -> Path:
-    path = _ticks(motion, folder)
-    path.write_text(path.read_text().replace("time", "Moment", 1))
     return path
 
 

@@ -1,7 +1,6 @@
 """More motors than freedoms: ranks, poses of least squares, errors of parameters, refusals."""
 
 import dataclasses
-import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from legcal.data.image_choice import image_sequences
 from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.closing import generic_configurations, solve_poses
+from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import (
     Follower,
@@ -33,7 +32,7 @@ from legcal.machine.kinematics import (
     platform_in_base,
 )
 from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, readings_at, slider_columns
+from legcal.machine.model import Machine, readings_at
 from legcal.machine.parameters import geometries
 from legcal.simulation.dataset import simulate
 from legcal.simulation.session import given_poses
@@ -72,7 +71,6 @@ OTHERS: dict[str, Callable[[], MachineSpec]] = {
     "5-UPS": lambda: of_types(["US"] * 5),
     "three motors about a point": _concurrent,
 }
-MOBILITY = {"7-UPS": 6, "4-RPR": 3, "2-RPS + 2-SPS + rod": 3}
 
 
 @cache
@@ -80,39 +78,6 @@ def machine_of(name: str) -> Machine:
     """Return a machine that is written and loaded once."""
     spec = (REDUNDANT | SEVERAL | OTHERS)[name]()
     return load_mechanism(write_machine(Path(mkdtemp()), spec, Layout()))
-
-
-def _differences(f: Callable[[Array], Array], n: int) -> Array:
-    """Return the derivative of a function by central differences, (m, n)."""
-    steps = 1e-5 * np.eye(n)
-    return np.stack([(f(step) - f(-step)) / 2e-5 for step in steps], axis=1)
-
-
-@pytest.mark.parametrize("name", [*REDUNDANT, *OTHERS])
-def test_what_motors_hold_is_the_rank_of_closures_by_differences(name: str) -> None:
-    machine = machine_of(name)
-    chain, configuration = machine.chain, generic_configurations(machine, 2)[-1]
-
-    def moved(step: Array) -> Array:
-        """Return closures, then the pose of the platform."""
-        there = chain.integrate(configuration, step)
-        residual = chain.linearize(there)[0].copy()
-        R, t = chain.placement(there, machine.base, machine.platform)
-        return np.concatenate([residual, R.ravel(), t])
-
-    both = _differences(moved, chain.nv)
-    closures, twist = both[:-12], both[-12:]
-    motors = np.eye(chain.nv)[slider_columns(machine, machine.motors)[1]]
-    held = np.concatenate([closures, motors])
-    free, left = (
-        np.linalg.matrix_rank(np.concatenate([rows, twist]), tol=1e-6)
-        - np.linalg.matrix_rank(rows, tol=1e-6)
-        for rows in (closures, held)
-    )
-    assert (machine.mobility, machine.motor_rank) == (free, free - left)
-    assert machine.is_determined == (left == 0)
-    assert machine.is_redundant == (name in REDUNDANT)
-    assert machine.mobility == MOBILITY.get(name, machine.mobility)
 
 
 def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() -> None:
@@ -216,17 +181,9 @@ def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path:
     simulate(machine.yaml_path, folder, settings(poses=6, shared_poses=True))
     calibration = legcal.calibrate(folder, output=tmp_path / "result")
     judged = calibration.solution.quality.redundant_readings
-    written = json.loads((tmp_path / "result/result.json").read_text())["residuals"]
     assert judged is not None
-    assert written["redundant_readings"] == {
-        "rms": pytest.approx(judged.rms),
-        "rms_expected": pytest.approx(judged.rms_expected),
-        "rms_m": pytest.approx(judged.rms_m),
-        "wrong": [],
-    }
     assert 0.0 < judged.rms_expected < 1.0
     assert judged.rms == pytest.approx(judged.rms_expected, rel=0.5)
-    assert f"{judged.rms:.2f} of their standard deviations, rms (expected" in calibration.summary()
     truth = next((folder / "truth/models").glob("*.yaml"))
     before, after = (
         legcal.evaluate(path, truth, dataset=folder).displacement

@@ -1,7 +1,6 @@
 """Photographs: exact outlines, light as it falls, every mechanism, the same bits every time."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,17 +9,11 @@ import pytest
 from rendering import photograph
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import ndtr
-from simulated import settings
-from thinned import thinned
 
-from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.outlines import Outlines, read_observations
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.simulation.dataset import simulate
 from legcal.simulation.rendering.appearance import CAMERAS, Appearance, Light
 from legcal.simulation.rendering.scene import develop, prepare_view
-from legcal.simulation.settings import Level
 from legcal.simulation.solids import (
     Box,
     Material,
@@ -32,7 +25,6 @@ from legcal.simulation.solids import (
     Sphere,
 )
 from legcal.vision.camera import Camera
-from legcal.vision.camera_file import camera_info
 from legcal.vision.cylinder import outlines_of_axis
 
 IDENTITY = RigidTransform.identity()
@@ -136,13 +128,12 @@ def test_a_cylinder_seen_along_its_axis_shows_its_near_cap(turn: float) -> None:
     assert covered.sum() == pytest.approx(math.pi * near**2 * F * 1.01 * F, rel=0.01)
 
 
-def test_nearer_solids_hide_farther_ones_whatever_their_order() -> None:
-    near = solid(Sphere(0.1), RigidTransform.from_translation([0.0, 0.0, 0.8]), albedo=0.9)
-    far = solid(Box((0.6, 0.6, 0.1)), RigidTransform.from_translation([0.0, 0.0, 1.2]), albedo=0.3)
-    one, other = clean([near, far]), clean([far, near])
-    assert np.array_equal(one, other)
-    assert one[122, 157] == pytest.approx(0.9, abs=1e-4)
-    assert one[122, 157 + 80] == pytest.approx(0.3, abs=1e-4)
+def test_a_cylinder_seen_from_the_side_ends_at_both_ends() -> None:
+    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_euler("y", 0.5 * math.pi))
+    shown = clean([solid(SolidCylinder(0.01, 0.2), T, albedo=0.6)]).max(axis=0) > 0.3
+    np.testing.assert_allclose(
+        np.flatnonzero(shown)[[0, -1]], [157.3 - 40.0, 157.3 + 40.0], atol=1.5
+    )
 
 
 def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
@@ -160,26 +151,6 @@ def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
     lit = [clean([one], **looks) for one in solids]
     assert np.ptp(lit[0]) > 0.3
     assert np.mean(np.abs(lit[0] - lit[1]) > 2e-3) < 0.01  # at creases alone
-
-
-def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft() -> None:
-    wall = solid(Box((3.0, 3.0, 0.02)), RigidTransform.from_translation([0.0, 0.0, 1.51]))
-    ball = solid(Sphere(0.08), RigidTransform.from_translation([-0.1, 0.0, 1.0]))
-    scene = (wall, ball)
-    looks = Appearance.clean(
-        lights=(Light((-0.5, 0.0, -1.0), distance=3.0, radius=0.3),), ambient=0.0, shadows=True
-    )
-    rng = np.random.default_rng(0)
-    prepared = prepare_view(scene, LENSES["pinhole"], IDENTITY, looks, rng)
-    lamp = prepared.painter.light.lamps[0].position
-    image = prepared.render(scene, rng) / 65535.0
-    centre = ball.T_base_solid.translation
-    foot = lamp + (1.5 - lamp[2]) / (centre[2] - lamp[2]) * (centre - lamp)
-    u, v = np.rint(LENSES["pinhole"].project(foot)).astype(int)
-    assert image[v, u] < 0.02
-    across = image[v, u : u + 70] / image[v, u + 70]
-    half_shadow = np.count_nonzero((across > 0.05) & (across < 0.95))
-    assert half_shadow > 12
 
 
 def test_light_on_a_wall_falls_with_the_square_of_the_distance_of_its_lamp() -> None:
@@ -300,83 +271,3 @@ def test_cameras_leave_edges_where_they_are(kind: str, colour: bool) -> None:
 def test_looks_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=r"found .*, needed .*;"):
         Appearance(**wrong)
-
-
-# --- photographs of datasets against the truth beside them, by edge measurements of their own
-
-
-REACH, STEP = 4.0, 0.25  # of profiles across an outline [px]
-FREE = 0.12  # of an outline, left out at both ends
-
-
-def lens(folder: Path, width: int, height: int) -> Path:
-    """Write the file of a camera that distorts like a cheap lens."""
-    K = np.array([[1.25 * width, 0.0, 0.51 * width], [0.0, 1.26 * width, 0.48 * height], [0, 0, 1]])
-    path = folder / "lens.yaml"
-    path.write_text(camera_info(Camera(K, width, height, np.array([-0.2, 0.05, 0, 0, 0])), "lens"))
-    return path
-
-
-def photographs(name: str, folder: Path, size: tuple[int, int], looks: Appearance) -> Dataset:
-    few = settings(
-        level=Level.PHOTOGRAPHS, poses=1, views=1, camera=lens(folder, *size), appearance=looks
-    )
-    return load_dataset(simulate(name, folder / "set", few).folder)
-
-
-def picture(dataset: Dataset) -> Array:
-    path = dataset.image_path(0)
-    assert path is not None
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    return image.astype(np.float64)
-
-
-def true_outlines(dataset: Dataset) -> Outlines:
-    path = dataset.folder / "truth" / "outlines.csv"
-    return read_observations(path, dataset.machine.legs, dataset.measurements)
-
-
-def profiles(image: Array, camera: Camera, ends: Array, other: Array) -> Array:
-    """Return grey levels across an outline (n, m), from inside to outside.
-
-    Inside is where the other outline of the same part is. Bends of the lens are followed.
-    """
-    t = np.arange(FREE, 1.0 - FREE, 1.0 / np.linalg.norm(ends[1] - ends[0]))
-    start, end = camera.undistort(ends)
-    curve = camera.distort(start + t[:, None] * (end - start))
-    along = np.gradient(curve, axis=0)
-    out = np.stack([along[:, 1], -along[:, 0]], axis=-1)
-    out /= np.linalg.norm(out, axis=-1, keepdims=True)
-    out *= np.sign(out[len(out) // 2] @ (ends.mean(axis=0) - other.mean(axis=0)))
-    across = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
-    points = (curve[:, None] + across[:, None] * out[:, None]).astype(np.float32)
-    found = cv2.remap(image.astype(np.float32), points[..., 0], points[..., 1], cv2.INTER_LINEAR)
-    return np.asarray(found, dtype=np.float64)
-
-
-OF_EACH_CLASS = ("tricept", "3-rpr", "3-rps", "3-upu", "hexapod-rod", "hexaglide", "delta")
-
-
-@pytest.mark.parametrize("name", thinned(OF_EACH_CLASS, ["tricept"]))
-def test_photographs_of_every_class_show_the_legs_that_they_are_said_to(
-    name: str, tmp_path: Path
-) -> None:
-    looks = Appearance(clutter=4, samples=13)
-    dataset = photographs(name, tmp_path, (320, 240), looks)
-    truth, (view,) = true_outlines(dataset), dataset.measurements.views
-    image = picture(dataset)
-    assert image.shape == (240, 320)
-    names = dataset.machine.leg_names
-    said = {names.index(leg) for leg in view.legs or names}
-    assert said <= set(truth.leg.tolist())
-    for leg in said:
-        surest = 0.0
-        for i in np.flatnonzero(truth.leg == leg):
-            same = (truth.leg == leg) & (np.array(truth.part) == truth.part[i])
-            (pair,) = np.flatnonzero(same & (truth.edge != truth.edge[i]))
-            levels = profiles(image, view.camera, truth.ends[i], truth.ends[pair])
-            middle = levels.shape[1] // 2
-            step = levels[:, middle + round(1.5 / STEP)] - levels[:, middle - round(1.5 / STEP)]
-            surest = max(surest, abs(float(np.median(step))))
-        assert surest > 4.0  # grey levels: those of one pixel have a noise of two

@@ -16,6 +16,9 @@ from browser import PATIENCE, chromium
 from browser import errors as _errors
 from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.wait import WebDriverWait
 
 import legcal
 from legcal.calibration.detection import Detection, Examination
@@ -24,9 +27,6 @@ from legcal.geometry.motions import pose_distance
 from legcal.viewer.click_server import ClickServer
 
 pytestmark = pytest.mark.system
-
-
-HOSTILE = "\"'`</script><img src=x onerror=alert(1)><script>alert(1)</script>"
 
 
 @pytest.fixture(scope="module")
@@ -105,123 +105,6 @@ def test_sliders_move_the_machine(page: Any) -> None:
     assert _errors(page) == []
 
 
-def test_words_of_tables_are_whole_on_a_telephone(page: Any) -> None:
-    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
-    try:
-        inside, outside, first = page.execute_script(
-            "const table = document.querySelector('#platform table');"
-            "return [document.documentElement.scrollWidth, table.parentElement.clientWidth,"
-            " table.rows[1].cells[0].offsetWidth]"
-        )
-    finally:
-        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert inside <= 390
-    assert outside < 390
-    assert first > 80
-
-
-def test_a_scene_is_turned_and_zoomed(page: Any) -> None:
-    from selenium.webdriver.common.action_chains import ActionChains
-
-    canvas = page.find_element("id", "machine-scene")
-
-    def picture() -> str:
-        return str(page.execute_script("return arguments[0].toDataURL()", canvas))
-
-    show = "arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})"
-    page.execute_script(show, canvas)
-    before = picture()
-    ActionChains(page).drag_and_drop_by_offset(canvas, 60, 20).perform()
-    turned = picture()
-    page.execute_script(
-        "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -300, cancelable: true}))",
-        canvas,
-    )
-    assert len({before, turned, picture()}) == 3
-    assert _is_drawn(page, "machine-scene")
-    assert _errors(page) == []
-
-
-def test_a_point_of_a_chart_tells_its_outline_and_leads_to_it(page: Any) -> None:
-    from selenium.webdriver.common.action_chains import ActionChains
-
-    place = """const charts = document.querySelector(".charts");
-    const { links } = JSON.parse(charts.querySelector("script").textContent);
-    const svg = charts.querySelectorAll("svg")[2];
-    svg.scrollIntoView({block: "center", behavior: "instant"});
-    const matrix = svg.getScreenCTM();
-    for (const path of svg.querySelectorAll("[data-points]")) {
-      const places = [...path.getAttribute("d").matchAll(/M([-\\d.]+) ([-\\d.]+)/g)];
-      const k = path.dataset.points.split(" ").findIndex((number) => links[number]);
-      if (k < 0) continue;
-      const point = new DOMPoint(Number(places[k][1]), Number(places[k][2]));
-      const { x, y } = point.matrixTransform(matrix);
-      return [Math.round(x), Math.round(y), links[path.dataset.points.split(" ")[k]]];
-    }"""
-    x, y, _ = page.execute_script(place)
-    actions = ActionChains(page)
-    pointer: Any = actions.w3c_actions.pointer_action
-    pointer.move_to_location(x, y)
-    actions.perform()
-    assert " px" in page.find_element("id", "tip").text
-    pointer.click()
-    actions.perform()
-    assert "#outline-" in page.current_url
-
-
-def test_tables_sort_by_numbers_and_back(page: Any) -> None:
-    button = page.find_element("xpath", "//*[@id='parameters']//th/button[text()='change']")
-
-    def column() -> list[float]:
-        cells = page.find_elements(
-            "css selector", "#parameters > div:nth-of-type(1) td.n:nth-child(5)"
-        )
-        return [float(one.get_dom_attribute("data-value")) for one in cells]
-
-    before = column()
-    page.execute_script("arguments[0].click()", button)
-    assert column() == sorted(before) != before
-    page.execute_script("arguments[0].click()", button)
-    assert column() == sorted(before, reverse=True)
-    assert button.find_element("xpath", "..").get_dom_attribute("aria-sort") == "descending"
-
-
-def test_an_outline_is_enlarged_and_zoomed(page: Any) -> None:
-    button = page.find_element("css selector", ".crop .zoom")
-    page.execute_script("arguments[0].click()", button)
-    width = "return document.querySelector('#enlarged svg').viewBox.baseVal.width"
-    before = page.execute_script(width)
-    page.execute_script(
-        """const stage = document.querySelector("#enlarged div");
-        const box = stage.getBoundingClientRect();
-        stage.dispatchEvent(new WheelEvent("wheel", {deltaY: -500, clientX: box.x + 9,
-                                                     clientY: box.y + 9, cancelable: true}));"""
-    )
-    assert page.execute_script(width) < 0.5 * before
-    page.execute_script("document.getElementById('enlarged').close()")
-
-
-def test_hostile_names_do_nothing(example_run: Run, browser: Any, tmp_path: Path) -> None:
-    calibration = example_run.calibration
-    machine = calibration.dataset.machine
-    legs = tuple(replace(leg, name=f"{leg.name}{HOSTILE}") for leg in machine.legs)
-    measured = calibration.dataset.measurements
-    views = tuple(replace(view, name=f"{HOSTILE}{view.name}") for view in measured.views)
-    dataset = replace(
-        calibration.dataset,
-        machine=replace(machine, name=HOSTILE, legs=legs),
-        measurements=replace(measured, views=views),
-    )
-    changed = replace(calibration, dataset=dataset, notes=(HOSTILE,))
-    changed.__dict__["result"] = calibration.result
-    browser.get(legcal.write_report(changed, tmp_path).as_uri())
-    assert _is_drawn(browser, "machine-scene")
-    assert _errors(browser) == []
-    assert browser.execute_script("return document.querySelectorAll('img[src=x]').length") == 0
-    assert HOSTILE in browser.find_element("css selector", "h1").text
-
-
 # Correcting outlines on the page of ``legcal detect``.
 
 SIGMA = 0.37  # [px] of what is placed by hand in these tests
@@ -258,8 +141,6 @@ class Editor:
 
     def open(self, image: int) -> None:
         """Open the editor at an image."""
-        from selenium.webdriver.support.wait import WebDriverWait
-
         button = self.browser.find_element("css selector", f"figcaption [data-edit='{image}']")
         self.browser.execute_script("arguments[0].click()", button)
         shown = (
@@ -287,9 +168,6 @@ class Editor:
 
     def press(self, *keys: str) -> None:
         """Press keys; one of several words, as "Shift ArrowDown", holds the first."""
-        from selenium.webdriver.common.action_chains import ActionChains
-        from selenium.webdriver.common.keys import Keys
-
         named = {"Ctrl": Keys.CONTROL, "Shift": Keys.SHIFT, "Esc": Keys.ESCAPE,
                  "Left": Keys.ARROW_LEFT, "Down": Keys.ARROW_DOWN}  # fmt: skip
         actions = ActionChains(self.browser)
@@ -304,8 +182,6 @@ class Editor:
 
     def drag(self, end: int, dx: float, dy: float, *, to_the_end: bool = True) -> None:
         """Drag an end by pixels of the image, enlarged."""
-        from selenium.webdriver.common.action_chains import ActionChains
-
         self.press(str(end))
         handle = self.find(f".handle[data-end='{end - 1}'] circle")
         held = ActionChains(self.browser).click_and_hold(handle)
@@ -313,8 +189,6 @@ class Editor:
         (held.release() if to_the_end else held).perform()
 
     def release(self) -> None:
-        from selenium.webdriver.common.action_chains import ActionChains
-
         ActionChains(self.browser).release().perform()
 
     def state(self, name: str) -> str:
@@ -417,8 +291,6 @@ class Placer:
         self.browser = browser
 
     def open(self, image: int) -> None:
-        from selenium.webdriver.support.wait import WebDriverWait
-
         button = self.browser.find_element("css selector", "[data-place]")
         self.browser.execute_script("arguments[0].click()", button)
         while self.shown() != image:
@@ -442,16 +314,12 @@ class Placer:
         return round(x), round(y)
 
     def click(self, px: Any) -> None:
-        from selenium.webdriver.common.action_chains import ActionChains
-
         actions = ActionChains(self.browser)
         pointer: Any = actions.w3c_actions.pointer_action
         pointer.move_to_location(*self.on_screen(px)).click()
         actions.perform()
 
     def drag(self, start: Any, end: Any) -> None:
-        from selenium.webdriver.common.action_chains import ActionChains
-
         actions = ActionChains(self.browser)
         pointer: Any = actions.w3c_actions.pointer_action
         pointer.move_to_location(*self.on_screen(start)).pointer_down()
@@ -469,8 +337,6 @@ class Placer:
 
     def until(self, script: str) -> Any:
         """Wait for what a script returns."""
-        from selenium.webdriver.support.wait import WebDriverWait
-
         return WebDriverWait(self.browser, PATIENCE).until(
             lambda _: self.browser.execute_script(script)
         )

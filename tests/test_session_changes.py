@@ -18,7 +18,7 @@ from legcal import calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
 from legcal.calibration.result import Calibration
-from legcal.calibration.session_changes import Finding, Kind, session_tests
+from legcal.calibration.session_changes import Finding, session_tests
 from legcal.calibration.verdict import commanded
 from legcal.data.dataset import Dataset
 from legcal.data.image_choice import chosen_images, dataset_at, image_sequences, own_zeros
@@ -255,25 +255,6 @@ def test_a_split_stands_for_all_images_of_its_poses(shared: tuple[Dataset, Start
     assert zero.rows.tolist() == (dataset.measurements.pose < 5).tolist()
     with pytest.raises(UsageError, match="share a pose with them"):
         own_zeros(dataset, ["leg1@c2"])
-
-
-@pytest.mark.parametrize(
-    ("kind", "positive", "negative"),
-    [
-        (
-            "lag",
-            "ahead of the platform by 0.400 ± 0.010 %",
-            "behind the platform by 0.400 ± 0.010 %",
-        ),
-        ("gain", "leg4 are 0.400 ± 0.010 % too large", "leg4 are 0.400 ± 0.010 % too small"),
-        ("pitch", "leg4 are 0.400 ± 0.010 % larger than", "leg4 are 0.400 ± 0.010 % smaller than"),
-    ],
-)
-def test_words_tell_the_sign_of_readings_that_are_off(
-    kind: Kind, positive: str, negative: str
-) -> None:
-    for amount, words in ((LAG, positive), (-LAG, negative)):
-        assert words in Finding(kind, "leg4", "1", amount, 1e-4, None, 0.0, np.zeros((0, 1))).what
 
 
 def test_a_slip_that_cannot_be_seen_has_no_least_size(shared: tuple[Dataset, Start]) -> None:

@@ -7,6 +7,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +163,7 @@ def test_beyond_the_plan_the_next_pose_determines_more_than_others(labelled: Pat
     assert (best.view, best.pose, best.is_planned) == ("c2", "n01", False)
     values = []
     for q in (best.q, *load_dataset(HEXAPOD).measurements.q[16:20]):
-        guided.accept(best, None, q)
+        guided.accept(replace(best, q=q), None)
         assert guided.error is not None
         values.append(guided.error.mean_displacement)
         guided.undo()

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from machines import ROOT
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
+from legcal.errors import DatasetError, DidNotConverge, ModelError
 from legcal.geometry.types import Array
 from legcal.machine.closing import dimensionless, is_on_same_side, singularity
-from legcal.machine.configurations import JITTER, MIN_SINGULARITY, Configurations, Feasibility
+from legcal.machine.configurations import JITTER, MIN_SINGULARITY, Configurations
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
 from legcal.machine.loader import load_mechanism
@@ -126,12 +126,6 @@ def test_a_joint_outside_its_limits_at_home_is_named(tmp_path: Path) -> None:
         _drawn(wrong, 2)
 
 
-@pytest.mark.parametrize(("n", "sampling"), [(0, "extreme"), (-3, "extreme"), (3, "often")])
-def test_no_poses_and_unknown_samplings_are_refused(n: int, sampling: str) -> None:
-    with pytest.raises(UsageError, match="Poses could not be drawn: found"):
-        _drawn(load_mechanism("3-rpr"), n, sampling)
-
-
 def _along(machine: Machine, T: RigidTransform, j: int, n: int = 40) -> list[tuple[Array, float]]:
     """Return points of the axes of a leg's cylinders, and their radii."""
     vector = vectors_A_to_B(machine, T)[j]
@@ -161,19 +155,6 @@ def _with_radius(radius: float, folder: Path) -> Machine:
     return _copy(
         "hexapod", folder, lambda text: re.sub(r'radius="[^"]*"', f'radius="{radius}"', text)
     )
-
-
-def test_two_legs_that_cross_are_named(tmp_path: Path) -> None:
-    thick = _with_radius(0.037, tmp_path)
-    feasibility = Feasibility(thick)
-    assert feasibility.collision(thick.home) is None
-    turned = RigidTransform.from_components(
-        thick.home.translation, Rotation.from_euler("z", 150.0, degrees=True)
-    )
-    touching = feasibility.collision(turned)
-    assert touching is not None
-    i, j = (thick.leg_names.index(name) for name in touching)
-    assert _overlap(thick, turned, i, j) > 0.0
 
 
 def _csv(folder: Path, machine: Machine, rows: Array, names: list[str] | None = None) -> Path:
@@ -207,19 +188,6 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
         given_poses(thick, _csv(tmp_path, thick, poses.readings))
     rows = {int(re.findall(r"row (\d+)", problem)[0]) - 1 for problem in caught.value.problems}
     assert rows == {i for i, overlap in enumerate(overlaps) if overlap > 0.0}
-
-
-def test_malformed_files_of_poses_are_refused(tmp_path: Path) -> None:
-    """Others are among those of tests/refusal_table.py."""
-    path = tmp_path / "poses.csv"
-    path.write_text("leg1_prismatic,leg2_prismatic,leg3_prismatic\n0,0,0\n0,0\n")
-    machine = load_mechanism("3-rps")
-    with pytest.raises(DatasetError, match=rf"^{path}.*row 2 \(line 3\)"):
-        given_poses(machine, path)
-    passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
-    free = replace(machine, legs=(machine.legs[0], passive, machine.legs[2]))
-    with pytest.raises(UsageError, match="found a machine of 3 freedoms and 2 motors"):
-        given_poses(free, path)
 
 
 # --- poses that a controller with the nominal model could have commanded

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
-from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.meshes import ray_caster
-from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.model import Machine
 from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import (
     Box,
@@ -22,7 +21,6 @@ from legcal.simulation.solids import (
     Shape,
     SolidCylinder,
     Sphere,
-    dressed,
     link_poses,
     placed,
     solids_of,
@@ -51,12 +49,6 @@ def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Machine:
     text = text.replace('<link name="base"/>', f'{materials}<link name="base"/>')
     (folder / "urdf" / "hexapod.urdf").write_text(text)
     return load_mechanism(folder / "models" / "hexapod.yaml")
-
-
-def joints_at_home(machine: Machine) -> tuple[Array, Array]:
-    """Return the joint centres A and B in the base link at home, (n_legs, 3) each."""
-    B = machine.home.apply(machine.B_platform)
-    return B - vectors_A_to_B(machine, machine.home), B
 
 
 @pytest.mark.parametrize(
@@ -146,25 +138,6 @@ def test_a_mesh_is_scaled_and_placed_as_yourdfpy_shows_it(tmp_path: Path) -> Non
     corners = found[mesh.shape.faces[0]]
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     assert abs(normal @ turn.apply([0.0, 0.0, 1.0])) == pytest.approx(0.02)
-
-
-@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept", "hexaglide"])
-def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> None:
-    machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
-    solids = placed(dressed(machine), link_poses(machine, machine.home_configuration))
-    balls = [p.T_base_solid.translation for p in solids if isinstance(p.solid.shape, Sphere)]
-    A, B = joints_at_home(machine)
-    on_base = machine.base not in {s.link for s in solids_of(machine)}  # without rails or motors
-    ends = [A[: len(A) * on_base], B[[leg.platform_joint != "" for leg in machine.legs]]]
-    assert np.allclose(balls, np.concatenate(ends), atol=1e-6)
-    plates = [p for p in solids if p.solid.name.endswith("_plate")]
-    assert len(plates) == 1 + on_base
-    middles = 0.5 * (A + B)
-    for plate in plates:
-        assert isinstance(plate.solid.shape, SolidCylinder)
-        local = plate.T_base_solid.inv().apply(np.concatenate([A, B, middles]))
-        assert np.abs(local[:, 2]).min() > 0.5 * plate.solid.shape.length
-        assert len(set(np.sign(local[:, 2]))) == 1  # all joints on one side of it
 
 
 def test_meshes_hide_the_same_with_and_without_embree(monkeypatch: pytest.MonkeyPatch) -> None:

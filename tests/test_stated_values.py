@@ -83,15 +83,6 @@ def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSes
     assert_exact(session, found)
 
 
-def test_an_axis_fixed_at_an_angle_stays_there() -> None:
-    session, name = machine_session("3-spr"), "leg1.platform_axis.2"
-    value = true_values(session)[name]
-    found = fitted(session, fixed_at({name: value}))
-    assert found.estimates.values[name] == pytest.approx(value, abs=1e-12)
-    assert found.estimates.status[name] == "fixed"
-    assert_exact(session, found, 1e-7)
-
-
 def test_a_tight_prior_pins_and_a_loose_one_adds_information(noisy: MachineSession) -> None:
     plain = fitted(noisy)
     at = plain.estimates.names.index("leg1.offset")
@@ -151,25 +142,6 @@ def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSe
     ):
         with pytest.raises(NotIdentifiable, match=rf"{n_open} of \d+ combinations .*of camera c1"):
             fitted(session, Choices(free=frozenset(f"c1.{name}" for name in names)))
-
-
-def test_what_is_held_stays_at_nominal() -> None:
-    session = machine_session("3-upu")
-    found = fitted(session)
-    legs = session.legs
-    names = legs.parametrization.names
-    change = legs.vector(found.legs) - legs.vector(legs.nominal)
-    pairs = [
-        [names.index(f"leg{j}.{side}_axis.{angle}") for side in ("base", "platform")]
-        for j in (1, 2, 3)
-        for angle in (1, 2)
-    ]
-    # Base and platform axes part, as the truth wants, and their means stay.
-    assert np.abs(change[pairs].sum(axis=1)).max() < 1e-3
-    assert np.abs(change[pairs]).max() > 5e-3
-    assert sum("axis" in words for words in found.kinematic.held) == 6
-    weak = {name for name, status in found.estimates.status.items() if status == "weak"}
-    assert weak.isdisjoint(found.estimates.names)
 
 
 @pytest.mark.system

@@ -1,15 +1,18 @@
-"""The paper's evaluation: eq (20), its records, means, table and figure."""
+"""The paper's evaluation: eq (20), its sessions, means and table; the runner of studies."""
 
 import io
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from machines import from_vector
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
+from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.data.outlines import LegAxes
-from legcal.errors import DidNotConverge
+from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.configurations import JITTER
 from legcal.machine.kinematics import platforms_in_base
@@ -19,6 +22,7 @@ from legcal.machine.parameters import geometries, to_vector
 from legcal.report.session import study_table
 from legcal.simulation.observe import TableNoise, axes_in_images
 from legcal.simulation.paper import (
+    DOCUMENT_NAME,
     ESTIMATORS,
     PAPER_VIEWS,
     SCALARS,
@@ -133,3 +137,56 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
     assert found.document()["failures"] == {}
     text = _printed(found)
     assert "steps as printed, coplanar joints: 2 of 2 runs failed (DidNotConverge)" in text
+
+
+# The runner: the same results however it is run, written complete or not at all
+
+
+def test_runs_do_not_depend_on_their_number_and_are_counted(tmp_path: Path) -> None:
+    progress = list[tuple[str, int, int]]()
+    few = run_study(
+        Draws(), 10, output=tmp_path, progress=lambda *now: progress.append(now)
+    ).document()
+    assert progress == [("Study draws", done, 10) for done in range(11)]
+    assert json.loads((tmp_path / DOCUMENT_NAME).read_bytes()) == few
+    assert (tmp_path / "total.txt").read_text() == str(few["total"])
+    more = run_study(Draws(), 25, output=tmp_path).document()
+    assert json.loads((tmp_path / DOCUMENT_NAME).read_bytes()) == more
+    some = run_study(Draws(fails_above=0.0), 25).document()
+    assert some["n"] + some["failures"]["DidNotConverge"] == 25 == some["runs"]
+    assert some["total"] < 0.0
+    assert some["settings"] == {"scale": 1.0, "fails": {"above": 0.0}}
+
+
+def test_a_study_of_failures_only_says_why() -> None:
+    with pytest.raises(DidNotConverge, match=r"all of its 5 runs failed.*The draw is"):
+        run_study(Draws(fails_above=-np.inf), 5)
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.system)])
+def test_a_mistake_in_a_study_is_no_failed_run(workers: int) -> None:
+    with pytest.raises(ZeroDivisionError):
+        run_study(Mistaken(), 4, workers=workers)
+
+
+@pytest.mark.system
+def test_processes_give_the_same_and_one_that_is_ended_from_outside_is_told(
+    tmp_path: Path,
+) -> None:
+    study = Draws(fails_above=1.0)
+    assert run_study(study, 30, workers=2).document() == run_study(study, 30).document()
+    with pytest.raises(OutOfResources, match="one of the processes was ended from outside"):
+        run_study(Deadly(), 20, workers=2, output=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_that_make_no_sense_are_refused() -> None:
+    for n_runs, seed, workers, message in (
+        (0, 0, 1, "runs = 0, needed 1 or more"),
+        (10**9, 0, 1, "runs = 1000000000, needed 1000000 at most"),
+        (1, -1, 1, "seed = -1, needed 0 or more"),
+        (1, 0, 0, "workers = 0, needed 1 or more"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            run_study(Draws(), n_runs, seed=seed, workers=workers)
+    run_study(Draws(), 1, workers=10**11)  # more than are of use are not started

@@ -202,6 +202,3 @@ def test_sentences_of_earlier_versions_are_read_as_reasons(
     assert found == Rejection(code, detail)
     assert str(found) == (words or text)
     assert read_rejection(found.reason, str(found.detail)) == found
-
-
-# --- refused

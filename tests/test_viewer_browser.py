@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from browser import PATIENCE, chromium, errors
 from hexapod_example import Run
+from selenium.webdriver.common.keys import Keys
 
 from legcal.viewer.server import Address
 from legcal.viewer.source import Source, open_source
@@ -63,8 +64,6 @@ def _drawn(browser: Any) -> Any:
 
 
 def test_sliders_move_the_machine(browser: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
-
     with _shown(open_source("3-upu"), browser) as server:
         before, lines = server.motion.posture, _drawn(browser)
         _press(browser, "q1", Keys.END)
@@ -88,8 +87,6 @@ def test_sliders_move_the_machine(browser: Any) -> None:
 
 
 def test_a_result_is_shown_with_its_photographs(example_run: Run, browser: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
-
     with _shown(open_source(example_run.output, example_run.folder), browser) as server:
         first = server.motion.posture.T.as_matrix()
         _press(browser, "pose", Keys.ARROW_RIGHT)

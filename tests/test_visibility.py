@@ -1,27 +1,37 @@
-"""What simulated cameras see of legs: silhouettes, and where solids and borders hide them."""
+"""What cameras see of legs: silhouettes, and where solids of all kinds and borders hide them."""
 
+from collections.abc import Callable
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform
 
 import legcal
 from legcal.errors import NotVisible
 from legcal.geometry.motions import components, look_at
-from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations
+from legcal.machine.configurations import Configurations, random_configurations
+from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
+from legcal.machine.shapes import PlacedOccluders
 from legcal.simulation.cameras import cameras_around
-from legcal.simulation.observe import legs_in_image, shares, take_images
-from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
+from legcal.simulation.observe import legs_in_image, shares
+from legcal.simulation.solids import PosedMachine, Solid, dressed, pose_machine, solids_of
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import DistortionModel
-from legcal.vision.visibility import Bodies, Seen, in_picture, pixels_inside, visible_parts
+from legcal.vision.visibility import (
+    Bodies,
+    in_picture,
+    pixels_inside,
+    visible_parts,
+    visible_segments,
+)
 
 FAR = np.array([1.4, 0.3, 0.25])
 MIDDLE = np.array([0.0, 0.0, 0.2])
@@ -44,31 +54,6 @@ def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[Pos
     return pose_machine(machine, [*shown, *more], poses)
 
 
-def box(centre: Array, size: tuple[float, float, float]) -> Solid:
-    return Solid("box", None, Box(size), RigidTransform.from_translation(centre))
-
-
-def seen_at_home(*more: Solid) -> Seen:
-    T = look_at(FAR, MIDDLE)
-    return legs_in_image(
-        posed_machine("hexapod").legs, posed("hexapod", 1, *more)[0], sample_camera(), T
-    )
-
-
-def test_a_box_hides_what_the_lines_of_sight_say() -> None:
-    machine = posed_machine("hexapod")
-    nearest = int(np.argmin(np.linalg.norm(machine.A_base - FAR, axis=1)))
-    A, B = machine.A_base[nearest], machine.home.apply(machine.B_platform[nearest])
-    split = A + 0.3 * (B - A)
-    # The upper face of a wide box stands where the line of sight to that point passes.
-    height = (split + 0.5 * (FAR - split))[2]
-    middle = 0.5 * (FAR + split)
-    wall = box(np.array([middle[0], middle[1], height - 0.5]), (0.02, 2.0, 1.0))
-    seen = seen_at_home(wall)
-    [(start, _)] = seen.span[seen.leg == nearest]
-    assert start == pytest.approx(0.3, abs=0.03)  # the box is thick, the leg is round
-
-
 def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
     machine, here = posed_machine("hexapod"), posed("hexapod", 1)[0]
     least = list[float]()
@@ -80,50 +65,6 @@ def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
         np.testing.assert_array_equal(np.unique(seen.leg), np.flatnonzero(share >= 0.4))
         least += share[share > 0.0].tolist()
     assert min(abs(share - 0.4) for share in least) < 0.02
-
-
-def test_the_border_of_the_image_cuts_legs() -> None:
-    machine, camera = posed_machine("hexapod"), sample_camera()
-    here = posed("hexapod", 1)[0]
-    T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, 0.45]))  # the base is below the image
-    seen = legs_in_image(machine.legs, here, camera, T, least=0.0)
-    assert len(seen.leg)
-    assert np.all(seen.ends[..., 1] < camera.height)
-    assert seen.ends[..., 1].max() > camera.height - 20
-    assert shares(seen, machine.n_legs).max() < 0.95
-
-
-def test_a_thick_tube_covers_the_rod_in_it() -> None:
-    leg = posed_machine("3-rps").legs[0]
-    here = posed("3-rps", 1)[0]
-    T = look_at(np.array([1.0, -0.8, 0.3]), MIDDLE)
-    seen = legs_in_image(
-        (leg,),
-        PosedMachine(here.A[:1], here.B[:1], here.solids, here.vertices, here.faces),
-        sample_camera(),
-        T,
-    )
-    tube, rod = (next(c for c in leg.cylinders if c.link == part) for part in seen.part)
-    assert tube.radius > rod.radius
-    assert seen.span[0, 1] <= seen.span[1, 0]
-    length = float(np.linalg.norm(here.B[0] - here.A[0]))
-    assert rod.span(length)[0] < seen.span[0, 1] * length < rod.span(length)[1]
-
-
-def test_cameras_around_a_machine_see_its_legs_and_all_of_it() -> None:
-    name = "tricept"
-    machine, camera = posed_machine(name), sample_camera()
-    posed_machines = posed(name, 3, bare=False)
-    views, _ = cameras_around(machine, posed_machines, {"c1": camera}, np.random.default_rng(1))
-    for m in posed_machines:
-        for view in views:
-            T = view.T_base_camera
-            inside = camera.project(T.inv().apply(m.vertices))
-            assert np.all(inside > 0.0)
-            assert np.all(inside < [camera.width, camera.height])
-            assert not m.encloses(T.translation)
-    images = take_images(machine.legs, posed_machines, views, [range(len(posed_machines))], 1)
-    assert np.mean([len(images.seen(row)) for row in range(len(images))]) > 0.7 * machine.n_legs
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2)))
@@ -206,3 +147,107 @@ def test_what_sight_predicts_of_legs_is_what_rays_at_their_solids_meet(name: str
         assert not predicted
     assert missed <= 0.15 * len(beyond)
     assert np.median(beyond) < 0.02
+
+
+# Solids that are not measured
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def visual(shape: str, xyz: str, rpy: str = "0 0 0") -> str:
+    return f'<visual><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{shape}</geometry></visual>'
+
+
+HOUSING = visual('<box size="0.03 0.03 0.2"/>', "0.004 -0.003 -0.14")
+HOLLOW = visual('<mesh filename="hollow.stl"/>', "0 0 -0.14")
+MOTOR = visual('<cylinder radius="0.02" length="0.1"/>', "0.05 0 -0.2")
+ON_ENDS = (
+    visual('<box size="0.1 0.05 0.03"/>', "0.1 0 0.03", "0.3 0.2 0")
+    + visual('<sphere radius="0.03"/>', "0.1 0.1 0.05")
+    + visual('<mesh filename="package://any/angle.stl"/>', "-0.1 0 0.05")
+)
+
+
+@pytest.fixture(scope="module")
+def with_solids(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Machine]:
+    """Return shipped machines with solids on base, platform, and a stage of each leg.
+
+    Of their meshes one, on both ends, is not convex, the other surrounds the last leg.
+    """
+    root = tmp_path_factory.mktemp("solids")
+    (root / "models").mkdir()
+    (root / "urdf").mkdir()
+    parts = [trimesh.creation.box((0.1, 0.1, 0.01)), trimesh.creation.box((0.01, 0.1, 0.1))]
+    angle: Any = trimesh.util.concatenate(parts)
+    angle.export(root / "urdf/angle.stl")
+    trimesh.creation.annulus(0.013, 0.02, 0.2).export(root / "urdf/hollow.stl")
+
+    @cache
+    def machine(name: str) -> Machine:
+        text = (ROOT / f"urdf/{name}.urdf").read_text()
+        for link in ("base", "platform"):
+            text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{ON_ENDS}</link>')
+        for j in range(1, 7):
+            stage = f'<link name="leg{j}_tube">'
+            text = text.replace(stage, f"{stage}{HOLLOW if j == 6 else HOUSING}{MOTOR}")
+        (root / f"urdf/{name}.urdf").write_text(text)
+        (root / f"models/{name}.yaml").write_text((ROOT / f"models/{name}.yaml").read_text())
+        return legcal.load_mechanism(root / f"models/{name}.yaml")
+
+    return machine
+
+
+def with_hidden(machine: Machine, n: int) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
+    """Return a machine in poses: what of it is not measured as triangles, and as occluders."""
+    solids = [solid for solid in solids_of(machine) if solid.leg is None]
+    found = random_configurations(machine, n, 0)
+    poses = pose_machine(machine, solids, found)
+    A, B = (np.array([getattr(here, name) for here in poses]) for name in ("A", "B"))
+    return poses, PlacedOccluders.at(machine.occluders, A, B)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["hexapod", "3-prs", "delta"],
+)
+def test_hidden_is_what_rays_at_the_model_do_not_reach(
+    name: str, with_solids: Callable[[str], Machine]
+) -> None:
+    """Rays meet triangles of the visuals at the links' poses in Pinocchio, by another code."""
+    machine = with_solids(name)
+    size, rng = machine.size, np.random.default_rng(3)
+    share, n_hidden = list[float](), 0
+    for here, placed in zip(*with_hidden(machine, 2), strict=True):
+        middle = 0.5 * (here.A.mean(axis=0) + here.B.mean(axis=0))
+        direction = rng.normal(size=3)
+        centre = middle + 4.0 * size * direction / np.linalg.norm(direction)
+        points = middle + size * rng.uniform(-1.0, 1.0, (2500, 3))
+        none, zero = np.full(len(points), -1), np.zeros(len(points))
+        T = look_at(centre, middle)
+        seen = placed.before(T.as_matrix())
+        hidden = seen.hide(T.inv().apply(points), none, zero, zero) >= 0
+        by_rays = here.hidden(centre, points, zero)
+        share.append(float(np.mean(hidden != by_rays)))
+        n_hidden += int(np.count_nonzero(by_rays))
+    assert n_hidden > 50
+    assert max(share) < 0.003  # polygons stand for circles, one around and one within
+
+
+@pytest.mark.parametrize("name", ["leg1", "leg6"])  # a box, and a mesh that is hollow
+def test_a_rod_is_not_looked_for_inside_the_housing_of_its_leg(
+    name: str, with_solids: Callable[[str], Machine]
+) -> None:
+    machine = with_solids("hexapod")
+    leg = machine.legs[machine.leg_names.index(name)]
+    length = leg.length_at(0.5 * sum(leg.travel))
+    segments = visible_segments(leg.cylinders, length)
+    # from 0.14 - 0.1 to 0.14 + 0.1 from A inside it; the longer stretch begins at its end
+    assert segments
+    for segment in segments:
+        assert segment.start == pytest.approx(0.24 + 2.0 * segment.radius, abs=1e-3)
+    bare = [
+        Cylinder(c.link, c.radius, c.side, c.start, c.end)  # without what encloses it
+        for c in leg.cylinders
+    ]
+    assert visible_segments(bare, length)[0].start < 0.1

@@ -26,7 +26,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.board import needs_rough_cameras, rough_placement
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.documents import DiagnosisBlock, LeftOut, Overlay, left_out_blocks
+from legcal.calibration.documents import (
+    DiagnosisBlock,
+    LeftOut,
+    Overlay,
+    left_out_blocks,
+    overlay_blocks,
+)
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
@@ -34,7 +40,7 @@ from legcal.data.corners import Corners, write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, ImageReader
 from legcal.data.image_tables import inverse
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
-from legcal.data.measurements import few_views, image_notes, row_names
+from legcal.data.measurements import few_views, image_notes, places, row_names
 from legcal.data.outlines import (
     Outlines,
     are_of_arms,
@@ -482,13 +488,10 @@ class Examination:
         """Return the output of ``legcal doctor --json``."""
         detection, overlays, left_out = self.detection, list[Overlay](), list[LeftOut]()
         if detection is not None:
-            m = detection.dataset.measurements
-            names, left_out = row_names(m), left_out_blocks(m, detection.left_out)
-            files = detection.overlay_files if self.is_written else {}
-            overlays = [
-                Overlay(view=detection.view_of(row), image=names[row], file=file)
-                for row, file in files.items()
-            ]
+            of_rows = places(detection.dataset.measurements)
+            left_out = left_out_blocks(of_rows, detection.left_out)
+            if self.is_written:
+                overlays = overlay_blocks(of_rows, detection.overlay_files)
         return ExaminationDocument(
             legcal_doctor=1,
             dataset=self.dataset,

@@ -7,7 +7,8 @@ an earlier result is read (docs/formats.md).
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,8 +20,8 @@ from pydantic import (
     StrictStr,
     model_serializer,
 )
+from pydantic.json_schema import SkipJsonSchema
 
-from legcal.data.measurements import Measurements, row_names
 from legcal.data.reasons import Rejection
 from legcal.errors import DatasetError
 from legcal.files.motions import Pose
@@ -36,8 +37,7 @@ from legcal.files.schema import (
 )
 from legcal.machine.actuator import Actuator
 from legcal.machine.inspection import ActuatorBlock
-from legcal.machine.leg import ParameterId
-from legcal.vision.board import Link
+from legcal.machine.leg import Link, ParameterId
 
 AxesByLeg = dict[str, Triple]  # unit vectors
 Matrix = list[list[Number]]
@@ -253,14 +253,18 @@ class LeftOut(Document):
     images: list[NamedImage]
 
 
-def left_out_blocks(measurements: Measurements, why: Mapping[int, Rejection]) -> list[LeftOut]:
-    """Return images that were left out, by row, a block a reason with its detail."""
-    names = row_names(measurements)
+def left_out_blocks(
+    places: Sequence[tuple[str, str]], why: Mapping[int, Rejection]
+) -> list[LeftOut]:
+    """Return images that were left out, a block a reason with its detail.
+
+    *places* are the view and the image of each row.
+    """
     images: dict[tuple[str, str], list[NamedImage]] = {}
     for row, rejection in sorted(why.items()):
-        view = measurements.views[int(measurements.view[row])].name
+        view, image = places[row]
         alike = images.setdefault((str(rejection.reason), str(rejection)), [])
-        alike.append(NamedImage(view=view, image=names[row]))
+        alike.append(NamedImage(view=view, image=image))
     return [LeftOut(reason=code, why=text, images=named) for (code, text), named in images.items()]
 
 
@@ -374,14 +378,35 @@ class DiagnosisBlock(Document):
     remedy: str
 
 
-class DoubtBlock(Document):
-    """What speaks against a result; effects are null where they cannot be computed."""
+@dataclass(frozen=True)
+class Doubt:
+    """Something that speaks against a result; effects are null where they cannot be computed.
+
+    Attributes
+    ----------
+    code : str
+        What was tested; codes do not change.
+    what : str
+        What was found, as a clause.
+    remedy : str
+        What to do, as a clause.
+    sigma_dX_m, sigma_dE_rad : float or None
+        How far the platform would be displaced and turned if it were true [m, rad].
+    is_grave : bool
+        The result is not to be loaded; no part of the document.
+    """
 
     code: str
     what: str
-    sigma_dX_m: float | None
-    sigma_dE_rad: float | None
     remedy: str
+    sigma_dX_m: float | None = None
+    sigma_dE_rad: float | None = None
+    is_grave: Annotated[bool, Field(exclude=True), SkipJsonSchema()] = False
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do."""
+        return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
 
 
 class Heading(Document):
@@ -391,7 +416,7 @@ class Heading(Document):
     status: Literal["converged"]
     verdict: str
     trustworthy: bool
-    doubts: list[DoubtBlock]
+    doubts: list[Doubt]
     legs: list[str]  # the order of what follows
 
 
@@ -401,6 +426,13 @@ class Overlay(Document):
     view: str
     image: str
     file: str
+
+
+def overlay_blocks(places: Sequence[tuple[str, str]], files: Mapping[int, str]) -> list[Overlay]:
+    """Return the overlays of rows; *places* are the view and the image of each row."""
+    return [
+        Overlay(view=places[row][0], image=places[row][1], file=file) for row, file in files.items()
+    ]
 
 
 class MotorZero(Document):

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.documents import Holdout
+from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import CrossValidation, cross_validate
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
@@ -66,38 +66,6 @@ _SURE = 5.0  # standard deviations of these squares
 MIN_GAIN = 0.5  # of what a change claims to predict better, by its information on left-out images
 _LAST_DIGIT = 0.5e-6  # [m] half of the last digit of printed lengths
 MOST_MOVED = 4.0  # standard deviations of a change by tolerance and fit; one machine in 500 has one
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """Something that speaks against a result.
-
-    Attributes
-    ----------
-    code : str
-        What was tested; codes do not change.
-    what : str
-        What was found, as a clause.
-    remedy : str
-        What to do, as a clause.
-    sigma_dX_m, sigma_dE_rad : float or None
-        How far the platform would be displaced and turned if it were true; None where that cannot
-        be computed.
-    is_grave : bool
-        The result is not to be loaded.
-    """
-
-    code: str
-    what: str
-    remedy: str
-    sigma_dX_m: float | None = None
-    sigma_dE_rad: float | None = None
-    is_grave: bool = False
-
-    @property
-    def sentence(self) -> str:
-        """What was found, and what to do."""
-        return f"{self.what[0].upper()}{self.what[1:]}; {self.remedy}."
 
 
 def model_error(doubts: Sequence[Doubt]) -> tuple[float, float]:

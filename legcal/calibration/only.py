@@ -17,8 +17,8 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.documents import MotorZero
-from legcal.calibration.doubts import MOST_MOVED, TOLERANCE, Doubt
+from legcal.calibration.documents import Doubt, MotorZero
+from legcal.calibration.doubts import MOST_MOVED, TOLERANCE
 from legcal.calibration.joint_fit.parameter_choices import Group
 from legcal.calibration.joint_fit.part_errors import (
     Kind,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,7 @@ from legcal.calibration.documents import (
     BoardPose,
     CoordinateStatus,
     Distance,
-    DoubtBlock,
+    Doubt,
     FrameMark,
     Gamma,
     Holdout,
@@ -27,7 +27,6 @@ from legcal.calibration.documents import (
     LinkBlock,
     NoSteps,
     Observations,
-    Overlay,
     ParameterRow,
     PlatformBlock,
     PlatformBoardPose,
@@ -42,8 +41,8 @@ from legcal.calibration.documents import (
     WeakInLinks,
     WorkspaceAccuracy,
     left_out_blocks,
+    overlay_blocks,
 )
-from legcal.calibration.doubts import Doubt
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
@@ -55,19 +54,18 @@ from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import canonical_order
-from legcal.data.measurements import row_names
+from legcal.data.measurements import places
 from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
 from legcal.geometry.lines import normal_basis, turned_axis
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences
-from legcal.machine.leg import Leg, LegColumns, LegKind
+from legcal.machine.leg import LINKS, Leg, LegColumns, LegKind, Link
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     SHOWN,
     describe_direction,
-    free_coordinates,
     geometries,
     nominal_axes,
     parametrization_of,
@@ -75,7 +73,6 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
-from legcal.vision.board import LINKS, Link
 from legcal.vision.camera import camera_numbers, shared_cameras
 
 REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
@@ -220,7 +217,7 @@ def _result_of(calibration: Calibration) -> Result:
         status="converged",
         verdict=calibration.verdict.sentence,
         trustworthy=calibration.verdict.trustworthy,
-        doubts=[DoubtBlock.model_validate(doubt) for doubt in calibration.doubts],
+        doubts=list(calibration.doubts),
         legs=list(names),
         **_legs(names, solution.legs),
         nominal_axes=turned_from,
@@ -228,7 +225,7 @@ def _result_of(calibration: Calibration) -> Result:
         parameters=parameters,
         covariance=solution.estimates.covariance.tolist(),
         kinematic=kinematic,
-        links=joints_in_links(machine, parameters, kinematic, turned_from),
+        links=joints_in_links(machine, parameters, kinematic),
         weakest=[
             WeakCombination(
                 direction=describe_direction([name for name, _ in weak.parts], names),
@@ -261,7 +258,7 @@ def _result_of(calibration: Calibration) -> Result:
         diagnosis=[one.document() for one in calibration.diagnosis] or None,
         only=None if calibration.group is None else calibration.group.group,
         zeros=None if calibration.group is None else calibration.group.zeros,
-        overlays=_overlays(calibration),
+        overlays=overlay_blocks(places(measurements), calibration.overlays) or None,
     )
 
 
@@ -334,7 +331,7 @@ def _staged(calibration: Calibration) -> Staged | NoSteps:
 
 def _observations(calibration: Calibration) -> Observations:
     """Return what the fit was made from."""
-    outlines = calibration.solution.outlines
+    outlines, measurements = calibration.solution.outlines, calibration.dataset.measurements
     reasons = Counter(
         str(why.reason)
         for why, used in zip(outlines.reason, outlines.used, strict=True)
@@ -343,20 +340,10 @@ def _observations(calibration: Calibration) -> Observations:
     return Observations(
         used=int(outlines.used.sum()),
         total=len(outlines),
-        images=calibration.dataset.measurements.n_rows,
+        images=measurements.n_rows,
         rejected=dict(reasons.most_common()),
-        left_out=left_out_blocks(calibration.dataset.measurements, images_left_out(outlines)),
+        left_out=left_out_blocks(places(measurements), images_left_out(outlines)),
     )
-
-
-def _overlays(calibration: Calibration) -> list[Overlay] | None:
-    """Return where each image is drawn with its outlines; None without overlays."""
-    measurements = calibration.dataset.measurements
-    views, names = [view.name for view in measurements.views], row_names(measurements)
-    return [
-        Overlay(view=views[measurements.view[row]], image=names[row], file=file)
-        for row, file in calibration.overlays.items()
-    ] or None
 
 
 def _board(calibration: Calibration, link: Link) -> dict[str, Any] | None:
@@ -437,9 +424,10 @@ def _predicted(error: PlatformError) -> dict[str, Any]:
 # Joints in the links of the model
 #
 # Results are computed in R_b and R_e; users know the links. The calibrated R_b is aligned with the
-# nominal one in the base link and R_e likewise in the platform link, as in ``calibrated.urdf``:
-# p_link = T_link_frame p_frame, with the covariance R C R^T. Coordinates that define a frame have
-# no uncertainty there: their variance is zero, and they are marked.
+# nominal one in the base link and R_e likewise in the platform link, as in ``calibrated.urdf``. A
+# joint centre in its link and the turn of an axis are linear in the parameters, with the covariance
+# J C J^T. Coordinates that define a frame have no uncertainty there: their variance is zero, and
+# they are marked.
 
 
 _MARKS: tuple[FrameMark, ...] = ("origin", "x axis", "xy plane")
@@ -448,100 +436,49 @@ _ROUNDING = 1e-9  # rounding of the components of unit vectors
 
 
 @dataclass(frozen=True, eq=False)
-class _LinkFrame:
-    """R_b in the base link, or R_e in the platform link, with the joints of that side."""
+class _LinkVector:
+    """A joint centre in a link, or the turn of an axis from its nominal direction there."""
 
-    side: Link
-    link: str
-    T_link_frame: RigidTransform
-    points: Array  # (n_legs, 3): joint centres in the frame [m]
-    place: IntArray  # (n_legs, 3): indices of the coordinates among kinematic parameters, or -1
-    names: tuple[str, ...]  # names of the kinematic parameters
-    legs: tuple[str, ...]
-    frame_legs: tuple[int, ...]
-    zero: BoolArray  # (n_legs, 3): whether the definition of the frame makes a coordinate zero
-    axes: tuple[Array | None, ...]  # joint axes of the legs in the frame; None without one
-    turns: IntArray  # (n_legs, 2): indices of the axis rotations among kinematic parameters, or -1
+    leg: int
+    nominal: Array  # (3,) the centre [m], or the direction of the axis, in R_b or R_e
+    is_axis: bool
+    names: tuple[str, ...]  # n parameters in R_b or R_e; "" for a number that is none
+    by: Array  # (3, n) derivative of x, y, z in the link by these
 
-    @classmethod
-    def of(cls, machine: Machine, side: Link) -> _LinkFrame:
-        """Return the frame of one side of a machine."""
-        parametrization, legs = parametrization_of(machine, twists=True), geometries(machine)
-        is_base = side == "base"
-        n_d = len(machine.frame_legs)
-        zero = ~free_coordinates(machine.n_legs, machine.frame_legs)
-        zero[:, n_d:] = False  # heights of planar machines are fixed, and define nothing
-        return cls(
-            side,
-            machine.base if is_base else machine.platform,
-            machine.T_link_frame(side),
-            np.array([leg.A if is_base else leg.B for leg in legs]),
-            parametrization.place[:, LegColumns.A if is_base else LegColumns.B],
-            parametrization.names,
-            machine.leg_names,
-            machine.frame_legs,
-            zero,
-            tuple(leg.base_axis if is_base else leg.platform_axis for leg in legs),
-            parametrization.place[:, LegColumns.BASE_AXIS if is_base else LegColumns.PLATFORM_AXIS],
-        )
 
-    @property
-    def R(self) -> Array:
-        """Rotation (3, 3) from the frame to the link."""
-        return np.asarray(self.T_link_frame.rotation.as_matrix())
+def _in_link(machine: Machine, side: Link) -> Iterator[_LinkVector]:
+    """Yield the joint centre of each leg and, if it has one, its axis."""
+    parametrization, R = parametrization_of(machine, twists=True), _rotation(machine, side)
+    centre, axis = LegColumns.A, LegColumns.BASE_AXIS
+    if side == "platform":
+        centre, axis = LegColumns.B, LegColumns.PLATFORM_AXIS
+    named = (*parametrization.names, "")  # the last one is number -1
+    for j, (leg, place) in enumerate(zip(geometries(machine), parametrization.place, strict=True)):
+        point, direction = (leg.A, leg.base_axis) if side == "base" else (leg.B, leg.platform_axis)
+        yield _LinkVector(j, point, False, tuple(named[k] for k in place[centre]), R)
+        if direction is not None:
+            by_turns = R @ normal_basis(direction).T
+            yield _LinkVector(j, direction, True, tuple(named[k] for k in place[axis]), by_turns)
 
-    def points_with(self, values: Mapping[str, float]) -> Array:
-        """Return the joint centres (n_legs, 3) in the link at given parameter values [m]."""
-        points = self.points.copy()
-        for index in np.argwhere(self.place >= 0).tolist():
-            name = self.names[self.place[tuple(index)]]
-            points[tuple(index)] = values.get(name, points[tuple(index)])
-        return np.asarray(self.T_link_frame.apply(points))
 
-    def defines(self, leg: int) -> FrameMark | None:
-        """Return the part of the frame that a joint defines."""
-        return _MARKS[self.frame_legs.index(leg)] if leg in self.frame_legs else None
-
-    def named(self, indices: IntArray) -> list[str]:
-        """Return the names of parameters by index; "" for -1."""
-        return [self.names[k] if k >= 0 else "" for k in indices.tolist()]
-
-    def turned(self, leg: int, w: Array) -> Array:
-        """Return two turns of an axis (2,) as a rotation vector in the link [rad]."""
-        axis = self.axes[leg]
-        return np.zeros(3) if axis is None else np.asarray(self.R @ (w @ normal_basis(axis)))
-
-    def statuses(self, leg: int, status: Mapping[str, str]) -> list[CoordinateStatus]:
-        """Return the status of each coordinate of a joint in the link, by its parameters."""
-        statuses: list[CoordinateStatus] = []
-        for row in self.R:
-            parts = {
-                "frame" if is_zero else "fixed" if k < 0 else status.get(self.names[k], "fixed")
-                for k, is_zero, part in zip(self.place[leg], self.zero[leg], row, strict=True)
-                if abs(part) > _ROUNDING
-            }
-            statuses.append(next(possible for possible in _STATUSES if possible in parts))
-        return statuses
+def _rotation(machine: Machine, side: Link) -> Array:
+    """Return the rotation (3, 3) from R_b or R_e to the link."""
+    return np.asarray(machine.T_link_frame(side).rotation.as_matrix())
 
 
 def joints_in_links(
-    machine: Machine,
-    parameters: Sequence[ParameterRow],
-    kinematic: Kinematic,
-    axes: Mapping[str, Mapping[str, Sequence[float]]] | None = None,
+    machine: Machine, parameters: Sequence[ParameterRow], kinematic: Kinematic
 ) -> dict[Link, LinkBlock]:
     """Return the joints of a calibration in the links of base and platform.
 
     Parameters
     ----------
     machine : Machine
-        The nominal or the calibrated model; R_b and R_e in the links are the same.
+        The nominal model.
     parameters : sequence of ParameterRow
         Parameters of ``result.json``, in R_b and R_e [m].
     kinematic : Kinematic
         The covariance of all kinematic parameters by name, zero for fixed or held ones.
-    axes : mapping, optional
-        The nominal axes by side and leg, in R_b and R_e; axes are returned only if given.
 
     Returns
     -------
@@ -549,78 +486,82 @@ def joints_in_links(
         A :class:`LinkBlock` for ``base`` and ``platform`` [m]; joints in the order of the legs.
     """
     rows = {row.name: row for row in parameters}
-    status = {name: row.status for name, row in rows.items()}
     number = {name: k for k, name in enumerate(kinematic.names)}
     everything = np.array(kinematic.covariance)
     blocks: dict[Link, LinkBlock] = {}
     for side in LINKS:
-        frame = _LinkFrame.of(machine, side)
-        nominal = frame.points_with({name: row.nominal for name, row in rows.items()})
-        calibrated = frame.points_with({name: row.value for name, row in rows.items()})
-        joints = []
-        for j, leg in enumerate(frame.legs):
-            names = frame.named(frame.place[j])
-            numbered = [i for i, name in enumerate(names) if name in number]
-            indices = [number[names[i]] for i in numbered]
-            C = np.zeros((3, 3))
-            C[np.ix_(numbered, numbered)] = everything[np.ix_(indices, indices)]
-            C = frame.R @ C @ frame.R.T
-            statuses = frame.statuses(j, status)
-            sigma = np.sqrt(np.maximum(np.diagonal(C), 0.0)).tolist()
-            joints.append(
-                JointInLink(
-                    leg=leg,
-                    xyz=calibrated[j].tolist(),
-                    nominal=nominal[j].tolist(),
-                    sigma=[
-                        s if coordinate_status == "estimated" else None
-                        for s, coordinate_status in zip(sigma, statuses, strict=True)
-                    ],
-                    covariance=(0.5 * (C + C.T)).tolist(),
-                    status=statuses,
-                    defines=frame.defines(j),
-                )
-            )
-        blocks[side] = LinkBlock(
-            link=frame.link,
-            T_link_frame=Pose.of(frame.T_link_frame),
-            joints=joints,
-            axes=_axes_in_link(frame, (axes or {}).get(side, {}), rows, number, everything),
-        )
+        T, joints, axes = machine.T_link_frame(side), list[JointInLink](), list[AxisInLink]()
+        for vector in _in_link(machine, side):
+            known = [i for i, name in enumerate(vector.names) if name in number]
+            indices = [number[vector.names[i]] for i in known]
+            C = everything[np.ix_(indices, indices)]
+            C = vector.by[:, known] @ C @ vector.by[:, known].T
+            if not vector.is_axis:
+                joints.append(_joint(machine, T, vector, rows, C))
+            elif all(vector.names):
+                axes.append(_axis(machine, T, vector, rows, C))
+        link = machine.base if side == "base" else machine.platform
+        blocks[side] = LinkBlock(link=link, T_link_frame=Pose.of(T), joints=joints, axes=axes)
     return blocks
 
 
-def _axes_in_link(
-    frame: _LinkFrame,
-    nominal: Mapping[str, Sequence[float]],
+def _joint(
+    machine: Machine,
+    T_link_frame: RigidTransform,
+    centre: _LinkVector,
     rows: Mapping[str, ParameterRow],
-    number: Mapping[str, int],
     C: Array,
-) -> list[AxisInLink]:
-    """Return the axes of joints, with C the covariance of the numbered parameters."""
-    axes = []
-    for j, leg in enumerate(frame.legs):
-        names = frame.named(frame.turns[j])
-        if leg not in nominal or not all(names):
-            continue
-        axis = np.array(nominal[leg])
-        turns = normal_basis(axis) @ frame.R.T  # (2, 3) unit turns in the link
-        w = np.array([rows[name].value if name in rows else 0.0 for name in names])
-        sigma = None
-        if all(name in rows and rows[name].status == "estimated" for name in names):
-            indices = [number[name] for name in names]
-            variance = np.einsum("ki,kl,li->i", turns, C[np.ix_(indices, indices)], turns)
-            sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
-        axes.append(
-            AxisInLink(
-                leg=leg,
-                direction=(frame.R @ turned_axis(axis, w)).tolist(),
-                nominal=(frame.R @ axis).tolist(),
-                turn=(w @ turns).tolist(),
-                sigma=sigma,
-            )
-        )
-    return axes
+) -> JointInLink:
+    """Return a joint centre with its covariance C (3, 3)."""
+    nominal, calibrated = centre.nominal.copy(), centre.nominal.copy()
+    n_d, rank = len(machine.frame_legs), 3
+    if centre.leg in machine.frame_legs:  # zero from its rank on; heights in a plane define nothing
+        rank = machine.frame_legs.index(centre.leg)
+    of_numbers = list[str]()
+    for k, row in enumerate(rows.get(name) for name in centre.names):
+        if row is not None:
+            nominal[k], calibrated[k] = row.nominal, row.value
+        of_numbers.append("frame" if rank <= k < n_d else "fixed" if row is None else row.status)
+    statuses: list[CoordinateStatus] = []
+    for by in centre.by:
+        parts = {of for of, part in zip(of_numbers, by, strict=True) if abs(part) > _ROUNDING}
+        statuses.append(next(possible for possible in _STATUSES if possible in parts))
+    sigma = zip(_sigma(C), statuses, strict=True)
+    return JointInLink(
+        leg=machine.leg_names[centre.leg],
+        xyz=T_link_frame.apply(calibrated).tolist(),
+        nominal=T_link_frame.apply(nominal).tolist(),
+        sigma=[s if status == "estimated" else None for s, status in sigma],
+        covariance=(0.5 * (C + C.T)).tolist(),
+        status=statuses,
+        defines=_MARKS[rank] if rank < n_d else None,
+    )
+
+
+def _axis(
+    machine: Machine,
+    T_link_frame: RigidTransform,
+    axis: _LinkVector,
+    rows: Mapping[str, ParameterRow],
+    C: Array,
+) -> AxisInLink:
+    """Return an axis with the covariance C (3, 3) of its turn."""
+    turns = [rows.get(name) for name in axis.names]
+    w = np.array([0.0 if row is None else row.value for row in turns])
+    is_estimated = all(row is not None and row.status == "estimated" for row in turns)
+    return AxisInLink(
+        leg=machine.leg_names[axis.leg],
+        direction=T_link_frame.rotation.apply(turned_axis(axis.nominal, w)).tolist(),
+        nominal=T_link_frame.rotation.apply(axis.nominal).tolist(),
+        turn=(axis.by @ w).tolist(),
+        sigma=_sigma(C) if is_estimated else None,
+    )
+
+
+def _sigma(C: Array) -> list[float]:
+    """Return the standard deviations of x, y, z."""
+    sigma: list[float] = np.sqrt(np.maximum(np.diagonal(C), 0.0)).tolist()
+    return sigma
 
 
 def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakInLinks:
@@ -630,17 +571,10 @@ def weak_in_links(machine: Machine, parts: Sequence[tuple[str, float]]) -> WeakI
     """
     component, named_parts = dict(parts), dict[str, float]()
     for side in LINKS:
-        frame = _LinkFrame.of(machine, side)
-        for j, leg in enumerate(frame.legs):
-            for kind, names in (
-                (side, frame.named(frame.place[j])),
-                (f"{side}_axis", frame.named(frame.turns[j])),
-            ):
-                in_frame = np.array([component.pop(name, 0.0) for name in names])
-                v = frame.R @ in_frame if kind == side else frame.turned(j, in_frame)
-                named_parts |= {
-                    f"{leg}.{kind}.{axis}": float(x) for axis, x in zip("xyz", v, strict=True)
-                }
+        for vector in _in_link(machine, side):
+            name = f"{machine.leg_names[vector.leg]}.{side}{'_axis' * vector.is_axis}"
+            v = vector.by @ [component.pop(parameter, 0.0) for parameter in vector.names]
+            named_parts |= {f"{name}.{xyz}": x for xyz, x in zip("xyz", v.tolist(), strict=True)}
     named_parts |= component
     largest = max(map(abs, named_parts.values()), default=0.0)
     significant = {name: x for name, x in named_parts.items() if abs(x) > SHOWN * largest}

@@ -28,7 +28,6 @@ from legcal.calibration.documents import (
     Result,
     unreadable,
 )
-from legcal.calibration.doubts import Doubt
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
 from legcal.calibration.joint_fit.parameter_choices import KnownIntrinsics
 from legcal.calibration.joint_fit.solution import Solution
@@ -200,8 +199,8 @@ class EarlierResult(Summarised):
         sentence = self.document.verdict
         is_refused = sentence.startswith(REFUSED)
         doubts = [
-            Doubt(**block.model_dump(), is_grave=is_refused and k == 0)  # the worst is the first
-            for k, block in enumerate(self.document.doubts)
+            replace(doubt, is_grave=is_refused and k == 0)  # the worst is the first
+            for k, doubt in enumerate(self.document.doubts)
         ]
         return Verdict(tuple(doubts), sentence)
 

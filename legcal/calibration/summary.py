@@ -6,30 +6,28 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 
+from legcal.calibration.documents import (
+    BoardBlock,
+    FrameMark,
+    Holdout,
+    NoSteps,
+    Observations,
+    PlatformBlock,
+    ReadingResiduals,
+    Result,
+    WorkspaceAccuracy,
+)
 from legcal.data.reasons import reason_in_words
 from legcal.files.quantity import SHOWN_IN
-from legcal.machine.leg import ParameterId
+from legcal.machine.leg import Link, ParameterId
 from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import AT_ZERO
 from legcal.pages.document import Number, Table
 from legcal.pages.svg import Bars, Canvas, Figure, Points, log_bars, scatter, stacked
-
-if TYPE_CHECKING:
-    from legcal.calibration.documents import (
-        BoardBlock,
-        FrameMark,
-        Holdout,
-        Observations,
-        PlatformBlock,
-        ReadingResiduals,
-        Result,
-        WorkspaceAccuracy,
-    )
-    from legcal.vision.board import Link
 
 FRAMES: dict[str, str] = {"base": "R_b", "platform": "R_e"}
 DIGITS = {"mm": 4, "deg": 4, "px": 3, "": 6}  # decimals by unit
@@ -433,8 +431,6 @@ def _of_board(link: Link, board: BoardBlock | None) -> list[str]:
 
 def _steps_lines(result: Result) -> list[str]:
     steps = result.stages.staged
-    from legcal.calibration.documents import NoSteps  # it loads OpenCV, which exports do without
-
     if isinstance(steps, NoSteps):
         if result.observations.total == 0:
             return ["The four steps need legs in sight: there is no staged.yaml."]

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 
 from legcal.calibration.diagnosis.diagnosis import Diagnosis
-from legcal.calibration.documents import Holdout
+from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.doubts import (
     CAMERA,
     TOLERANCE,
-    Doubt,
     click_notes,
     doubts_of,
     model_error,

@@ -11,8 +11,9 @@ covariance of both. Directions that the new images determine worse than the prio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from legcal.calibration.documents import (
 from legcal.calibration.evaluation import machine_difference
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.part_errors import with_zeros
+from legcal.calibration.joint_fit.platform import expected_error, moved_by
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import State
@@ -44,7 +47,7 @@ from legcal.estimation.solver import Minimum, information, minimise
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.covariances import whitener
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.actuator import Actuator, ActuatorColumns, Line
+from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.leg import ARMS, Leg, LegColumns, LegKind, ParameterId
 from legcal.machine.model import Machine, vectors_A_to_B
@@ -209,9 +212,8 @@ def _explain(
     )
 
 
-_Moved = Callable[[float], Sequence[Leg]]  # the legs after a step of a component
-# part, and the name, unit, link of the axes and motion of its components
-_Possible = tuple[str, list[tuple[str, str, str, _Moved]]]
+# Name, unit, link of the axes and motion of a component of what may have changed
+_Component = tuple[str, str, str, Callable[[float], Sequence[Leg]]]
 
 
 def possible_changes(
@@ -222,110 +224,84 @@ def possible_changes(
     Joints move along the axes of the links of base and platform. Changes of a motor that moves
     joints at A affect all its rods.
     """
-    legs = geometries(machine)
-    single, of_joints, of_legs = list[Change](), list[Change](), list[Change]()
+    legs, changes = geometries(machine), dict[str, list[Change]]()
     metre = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
-    rods = list(zip(actuator_index(legs), range(len(legs)), strict=True))
-    parts = [(leg.name, _of_leg(machine, legs, j)) for j, leg in enumerate(machine.legs)]
-    parts += [
-        (actuator.joint, _of_actuator(legs, actuator, [j for other, j in rods if other == a]))
-        for a, actuator in enumerate(actuators_of(legs))
-    ]
-    for name, changes in parts:
-        of_part = list[Change]()
-        for part, components in changes:
-            shown = list[tuple[str, str, str, Array]]()
-            for component, unit, link, moved in components:
-                size = _STEP * (machine.size if unit == "m" else 1.0)
-                before, after = (
-                    vector_of(
-                        parametrization, in_joint_frames(moved(step), machine.frame_legs), legs
-                    )
-                    for step in (-size, size)
-                )
-                column = (after - before) / (2.0 * size)
-                if np.any(np.abs(column) * size > _STEP * _STEP * metre):
-                    shown.append((component, unit, link, column))
-            if shown:
-                names, units, links, columns = zip(*shown, strict=True)
-                of_part.append(Change(part, name, names, units, links, np.column_stack(columns)))
-        single += [change for change in of_part if len(change.components) == 1]
-        of_joints += [change for change in of_part if len(change.components) > 1]
-        if len(of_part) > 1:
-            of_legs.append(_together(name, of_part))
-    return tuple(single), tuple(of_joints), tuple(of_legs)
+
+    def parameters(moved: Sequence[Leg]) -> Array:
+        return vector_of(parametrization, in_joint_frames(moved, machine.frame_legs), legs)
+
+    for owner, part, components in _possible(machine, legs):
+        shown = list[tuple[str, str, str, Array]]()
+        for component, unit, link, moved in components:
+            size = _STEP * (machine.size if unit == "m" else 1.0)
+            column = (parameters(moved(size)) - parameters(moved(-size))) / (2.0 * size)
+            if np.any(np.abs(column) * size > _STEP * _STEP * metre):
+                shown.append((component, unit, link, column))
+        if shown:
+            names, units, links, columns = zip(*shown, strict=True)
+            change = Change(part, owner, names, units, links, np.column_stack(columns))
+            changes.setdefault(owner, []).append(change)
+    every = [change for of_owner in changes.values() for change in of_owner]
+    return (
+        tuple(change for change in every if len(change.components) == 1),
+        tuple(change for change in every if len(change.components) > 1),
+        tuple(_together(owner, own) for owner, own in changes.items() if len(own) > 1),
+    )
 
 
-def _along(legs: Sequence[Leg], which: Sequence[int], columns: slice, direction: Array) -> _Moved:
-    """Return the motion of some of the numbers of legs (:class:`LegColumns`) along a direction."""
+def _possible(
+    machine: Machine, legs: Sequence[Leg]
+) -> Iterator[tuple[str, str, Iterable[_Component]]]:
+    """Yield the parts of legs and motors that may change, each with its owner and components."""
     place = np.arange(len(legs) * LegColumns.COUNT).reshape(len(legs), LegColumns.COUNT)
 
-    def moved(step: float) -> Sequence[Leg]:
-        change = np.zeros(place.shape)
-        change[list(which), columns] = step * direction
-        return moved_legs(legs, place, change.ravel())
+    def along(
+        which: Sequence[int], columns: slice, parts: Iterable[tuple[str, str, str, Array]]
+    ) -> Iterator[_Component]:
+        """Yield motions of some of the numbers of legs (:class:`LegColumns`) along directions."""
 
-    return moved
+        def moved(direction: Array, step: float) -> Sequence[Leg]:
+            change = np.zeros(place.shape)
+            change[list(which), columns] = step * direction
+            return moved_legs(legs, place, change.ravel())
 
+        for name, unit, link, direction in parts:
+            yield name, unit, link, partial(moved, direction)
 
-def _of_actuator(legs: Sequence[Leg], actuator: Actuator, rods: Sequence[int]) -> list[_Possible]:
-    """Return the possible changes of a motor that moves joints at A: zero, axis and arm."""
-
-    def zero_moved(step: float) -> Sequence[Leg]:
-        reading = np.array([step])
-        turn, arm = actuator.rotations(reading)[0], actuator.arm
-        if arm is not None:
-            line = Line(actuator.at(arm.line.point, reading)[0], turn @ arm.line.axis)
-            arm = replace(arm, line=line)
-        return [
-            leg
-            if j not in rods
-            else replace(
-                leg,
-                A=actuator.at(leg.A, reading)[0],
-                base_axis=None if leg.base_axis is None else turn @ leg.base_axis,
-                actuator=replace(actuator, arm=arm),
-            )
-            for j, leg in enumerate(legs)
-        ]
-
-    def of_line(part: str, columns: slice) -> _Possible:
-        units = ("rad", "rad", "m", "m")[: columns.stop - columns.start]
-        names = ("1", "2", "place 1", "place 2")
-        directions = zip(names, units, np.eye(len(units)), strict=False)
-        return part, [(n, u, "", _along(legs, rods, columns, x)) for n, u, x in directions]
-
-    zero: _Possible = ("zero", [(f"{actuator.joint}.zero", actuator.unit, "", zero_moved)])
-    if not actuator.turns:
-        return [zero, of_line("direction", ActuatorColumns.AXIS)]
-    arm_line = [] if actuator.arm is None else [of_line("arm line", ActuatorColumns.ARM)]
-    return [zero, of_line("axis", ActuatorColumns.LINE), *arm_line]
-
-
-def _of_leg(machine: Machine, legs: Sequence[Leg], j: int) -> list[_Possible]:
-    """Return the possible changes of a leg."""
-    leg, name, changes = legs[j], machine.leg_names[j], list[_Possible]()
-    if leg.kind is not LegKind.PASSIVE:
-        length = "length" if leg.kind is LegKind.CONSTANT else "offset"
-        columns = slice(LegColumns.LENGTH, LegColumns.LENGTH + 1)
-        moved = _along(legs, [j], columns, np.ones(1))
-        changes.append((length, [(f"{name}.{length}", "m", "", moved)]))
-    for part, link, T, columns in (  # rows of T are the axes of the links in R_b and R_e
-        ("base joint", machine.base, machine.T_base_Rb, LegColumns.A),
-        ("platform joint", machine.platform, machine.T_platform_Re, LegColumns.B),
-    ):
-        axes = zip("xyz", T.rotation.as_matrix(), strict=True)
-        changes.append((part, [(x, "m", link, _along(legs, [j], columns, v)) for x, v in axes]))
-    for part, axis, columns in (
-        ("base axis", leg.base_axis, LegColumns.BASE_AXIS),
-        ("platform axis", leg.platform_axis, LegColumns.PLATFORM_AXIS),
-    ):
-        turns = zip("12", np.eye(2), strict=True)
-        if axis is not None:
-            changes.append(
-                (part, [(x, "rad", "", _along(legs, [j], columns, v)) for x, v in turns])
-            )
-    return changes
+    for j, leg in enumerate(legs):
+        if leg.kind is not LegKind.PASSIVE:
+            length = "length" if leg.kind is LegKind.CONSTANT else "offset"
+            number = slice(LegColumns.LENGTH, LegColumns.LENGTH + 1)
+            one = [(f"{leg.name}.{length}", "m", "", np.ones(1))]
+            yield leg.name, length, along([j], number, one)
+        for part, link, T, columns in (  # rows of T are the axes of the links in R_b and R_e
+            ("base joint", machine.base, machine.T_base_Rb, LegColumns.A),
+            ("platform joint", machine.platform, machine.T_platform_Re, LegColumns.B),
+        ):
+            axes = zip("xyz", "mmm", [link] * 3, T.rotation.as_matrix(), strict=True)
+            yield leg.name, part, along([j], columns, axes)
+        for part, axis, columns in (
+            ("base axis", leg.base_axis, LegColumns.BASE_AXIS),
+            ("platform axis", leg.platform_axis, LegColumns.PLATFORM_AXIS),
+        ):
+            if axis is not None:
+                turns = zip("12", ["rad"] * 2, [""] * 2, np.eye(2), strict=True)
+                yield leg.name, part, along([j], columns, turns)
+    index = actuator_index(legs)
+    for a, actuator in enumerate(actuators_of(legs)):
+        motor, rods = actuator.joint, [j for j, other in enumerate(index) if other == a]
+        zero = partial(lambda motor, step: with_zeros(legs, {motor: step}), motor)
+        yield motor, "zero", [(f"{motor}.zero", actuator.unit, "", zero)]
+        lines = [("axis", ActuatorColumns.LINE)]
+        if not actuator.turns:
+            lines = [("direction", ActuatorColumns.AXIS)]
+        elif actuator.arm is not None:
+            lines.append(("arm line", ActuatorColumns.ARM))
+        for part, columns in lines:
+            names, units = ("1", "2", "place 1", "place 2"), ("rad", "rad", "m", "m")
+            n = columns.stop - columns.start
+            numbers = zip(names[:n], units[:n], [""] * n, np.eye(n), strict=True)
+            yield motor, part, along(rods, columns, numbers)
 
 
 def _together(name: str, changes: Sequence[Change]) -> Change:
@@ -644,14 +620,9 @@ def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> MovedPlatf
     # Priors shrink the estimate towards the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.sigma**2
     spread = G @ covariance + G @ prior.covariance @ G.T
-    shift = J @ (values - prior.old)
-    variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
-    return MovedPlatform(
-        dX_m=_rms(shift[:, 3:] ** 2),
-        dE_rad=_rms(shift[:, :3] ** 2),
-        sigma_dX_m=_rms(variance[:, 3:]),
-        sigma_dE_rad=_rms(variance[:, :3]),
-    )
+    dX_m, dE_rad = moved_by(J, (values - prior.old)[:, None]).rms
+    sigma_dX_m, sigma_dE_rad = expected_error(J, spread).rms
+    return MovedPlatform(dX_m=dX_m, dE_rad=dE_rad, sigma_dX_m=sigma_dX_m, sigma_dE_rad=sigma_dE_rad)
 
 
 def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
@@ -676,8 +647,3 @@ def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametri
         tuple(parametrization.units[i] for i in columns),
         place,
     )
-
-
-def _rms(squares: Array) -> float:
-    """Return the root mean square over poses of vectors with squared components (k, 3)."""
-    return float(np.sqrt(np.mean(squares.sum(axis=1))))

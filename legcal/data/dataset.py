@@ -52,9 +52,10 @@ from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
 from legcal.files.schema import closest, describe
 from legcal.machine.files import shipped_folder, shipped_names
+from legcal.machine.leg import Link
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.vision.board import FixedBoard, Link, parse_boards
+from legcal.vision.board import FixedBoard, parse_boards
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import Grey, ImageFacts, decode_image, inspect_image

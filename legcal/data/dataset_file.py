@@ -29,10 +29,10 @@ from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, r
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
 from legcal.files.table import format_table
 from legcal.machine.files import DATASET_YAML
+from legcal.machine.leg import Link
 from legcal.machine.model import Machine
 from legcal.machine.parameters import list_in_words
 from legcal.machine.tolerance import BuiltEntry
-from legcal.vision.board import Link
 
 MEASUREMENTS = "measurements.csv"
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m] plausible standard deviations of an encoder

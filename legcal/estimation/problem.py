@@ -659,13 +659,8 @@ class Linearization:
                 g[block] += slope.T @ r
 
 
-def linearize(
-    problem: EstimationProblem[S], state: S, computed_rows: Mapping[str, Residuals] | None = None
-) -> Linearization:
-    """Linearise a problem at a state.
-
-    *computed_rows* are rows of factors that were computed at this state before.
-    """
+def linearize(problem: EstimationProblem[S], state: S) -> Linearization:
+    """Linearise a problem at a state."""
     priors, first = [], 0
     for block in problem.variables:
         prior, size = block.prior, block.n_unknowns
@@ -679,6 +674,5 @@ def linearize(
                 slope = prior.whitened(np.eye(size)[prior.unknown])
             priors.append(PriorRows(r, slope, first + prior.unknown, first))
         first += size
-    computed_rows = {} if computed_rows is None else computed_rows
-    rows = {f.name: computed_rows.get(f.name) or f.linearize(state) for f in problem.factors}
+    rows = {factor.name: factor.linearize(state) for factor in problem.factors}
     return Linearization(rows, tuple(priors), problem.n_kept)

@@ -8,7 +8,7 @@ tangent space of the constraints (:class:`Tangent`), and every step ends with a 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic
@@ -73,7 +73,6 @@ def minimise(
     tolerance: float = COST_TOLERANCE,
     relative_tolerance: float = 0.0,
     must_converge: bool = True,
-    computed_rows: Mapping[str, Residuals] | None = None,
     rate: float = 1.0,
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
@@ -98,8 +97,6 @@ def minimise(
         linear, and its last decreases slow.
     must_converge : bool
         Raise if the steps do not converge; otherwise return the best state.
-    computed_rows : mapping, optional
-        Rows of factors at the start.
     rate : float
         ``Minimum.rate`` of a minimum nearby: it predicts the decrease after the first step, which
         may then be the only one.
@@ -110,8 +107,8 @@ def minimise(
         If no step decreases the cost before convergence, or if the cost still falls by more than
         1e-6 a step after *max_iterations* steps.
     """
-    start, state = state, problem.projected(state)
-    linear = linearize(problem, state, computed_rows if state is start else None)
+    state = problem.projected(state)
+    linear = linearize(problem, state)
     current_loss = _loss_for(problem, linear, loss, np.inf)
     damping, failed, fall_before = _MIN_DAMPING if is_near else _FIRST_DAMPING, 0.0, np.inf
     cost, normal = robust_cost(problem, linear, current_loss), None
@@ -288,9 +285,11 @@ class NormalEquations:
     @cached_property
     def _kept_covariance(self) -> Array:
         if len(self.held_directions) == 0:
-            return inverse_on_range(self._reduced)
-        N = null_space(self.held_directions)
-        return np.asarray(N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T)
+            covariance = inverse_on_range(self._reduced)
+        else:
+            N = null_space(self.held_directions)
+            covariance = N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T
+        return np.asarray(0.5 * (covariance + covariance.T))  # rounding grows with the condition
 
     def moved_by(self, columns: Array) -> Array:
         """Multiply columns (n_kept, c) by the covariance of the kept unknowns."""

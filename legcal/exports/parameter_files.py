@@ -11,10 +11,11 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from legcal.calibration.documents import JointInLink
 from legcal.calibration.summary import FRAMES, Quantity, parameters_of
 from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
 from legcal.files.quantity import SHOWN_IN
@@ -24,9 +25,6 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.machine.rods import actuators_of
 from legcal.version import __version__
-
-if TYPE_CHECKING:
-    from legcal.calibration.documents import JointInLink
 
 COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "status")
 _DIGITS = 6  # decimals in the table

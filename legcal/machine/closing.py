@@ -488,18 +488,13 @@ def singularities(machine: Machine, poses: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, 5])
 
 
-def dimensionless(
-    machine: Machine,
-    poses: Array,
-    motors: Sequence[int] | None = None,
-) -> Array:
+def dimensionless(machine: Machine, poses: Array) -> Array:
     """Return the Jacobians of :func:`singularity`, (k, n_rows, 6): rotation, displacement.
 
-    Poses are matrices T_base_platform (k, 3 or 4, 4). *motors* limits the motors, all by default.
+    Poses are matrices T_base_platform (k, 3 or 4, 4).
     """
-    motors = list(machine.motors if motors is None else motors)
     equations = machine_equations(machine, poses[:, :3, :3], poses[:, :3, 3])
-    counts = ~equations.measured | np.isin(equations.leg, motors)
+    counts = ~equations.measured | np.isin(equations.leg, machine.motors)
     gradient, moment = equations.by_pose[:, counts, 3:], equations.by_pose[:, counts, :3]
     scale = np.linalg.norm(vectors_at(machine, poses), axis=2).mean(axis=1)[:, None, None]
     centre = (B_at(machine, poses) - poses[:, None, :3, 3]).mean(axis=1, keepdims=True)

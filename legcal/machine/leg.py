@@ -23,6 +23,8 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator, ActuatorColumns, Arm
 from legcal.machine.chain import Connection
 
+Link = Literal["base", "platform"]
+LINKS: tuple[Link, ...] = ("base", "platform")
 TRAVEL_MARGIN = 0.05  # tolerance of the travel, relative to it
 # Default standard deviations of readings and of measured lengths, in mean leg lengths.
 SIGMA_READING, SIGMA_LENGTH = 5e-6, 1.25e-4

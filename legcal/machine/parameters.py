@@ -60,13 +60,6 @@ class Parametrization:
     def __len__(self) -> int:
         return len(self.names)
 
-    def scatter(self, by_local: Array, leg: int) -> Array:
-        """Return derivatives (..., 21) by the numbers of a leg as derivatives by all parameters."""
-        place = self.place[leg]
-        wide = np.zeros((*by_local.shape[:-1], len(self)))
-        wide[..., place[place >= 0]] = by_local[..., place >= 0]
-        return wide
-
 
 def parametrize(
     names: Sequence[str], legs: Sequence[Leg], frame_legs: Sequence[int], *, twists: bool = False

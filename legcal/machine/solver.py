@@ -6,6 +6,7 @@ connected to the start, steps are not damped but must contract.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -164,32 +165,15 @@ def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Arra
 
 
 def _least(jacobian: Array, values: Array, rank: float) -> Array:
-    """Return the minimum-norm least-squares solutions (k, n) of linear equations."""
-    if len(values) == 1:
-        return _shortest(jacobian[0], values[0], rank)[None]
+    """Return the minimum-norm least-squares solutions (k, n) of linear equations.
+
+    Square ones without a near dependence are solved directly.
+    """
+    steps = np.full((len(values), jacobian.shape[2]), np.inf)
     if jacobian.shape[1] == jacobian.shape[2]:
-        try:
+        with suppress(np.linalg.LinAlgError):
             steps = np.linalg.solve(jacobian, values[..., None])[..., 0]
-        except np.linalg.LinAlgError:
-            steps = np.full_like(values, np.inf)
-        far = ~(np.abs(steps).max(axis=1, initial=0.0) < 1.0)
-        if far.any():
-            steps[far] = _shortest_many(jacobian[far], values[far], rank)
-        return np.asarray(steps)
-    return _shortest_many(jacobian, values, rank)
-
-
-def _shortest_many(jacobian: Array, values: Array, rank: float) -> Array:
-    return np.asarray((np.linalg.pinv(jacobian, rcond=rank) @ values[..., None])[..., 0])
-
-
-def _shortest(jacobian: Array, values: Array, rank: float) -> Array:
-    """Return the minimum-norm least-squares solution (n,) of one set of linear equations."""
-    if jacobian.shape[0] == jacobian.shape[1]:
-        try:
-            change = np.linalg.solve(jacobian, values)
-            if np.abs(change).max(initial=0.0) < 1.0:
-                return np.asarray(change)
-        except np.linalg.LinAlgError:
-            pass
-    return np.asarray(np.linalg.lstsq(jacobian, values, rcond=rank)[0])
+    far = ~(np.abs(steps).max(axis=1, initial=0.0) < 1.0)
+    if far.any():
+        steps[far] = (np.linalg.pinv(jacobian[far], rcond=rank) @ values[far, :, None])[..., 0]
+    return np.asarray(steps)

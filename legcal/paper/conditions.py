@@ -38,11 +38,6 @@ class Condition:
     needed: bool = True  # (12) is not, where a calibration board ties the cameras to each other
     by_analogy: bool = False  # ours and not the paper's: joints at A move
 
-    @property
-    def fails(self) -> bool:
-        """Whether it is needed and does not hold."""
-        return self.needed and not self.ok
-
 
 def count_conditions(
     views: Sequence[Collection[int]],

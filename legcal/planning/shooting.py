@@ -333,13 +333,11 @@ class GuidedSession:
         self,
         asked: Asked,
         photograph: Path | None,
-        q: Array | None = None,
         checked: Checked | None = None,
     ) -> None:
         """Put a photograph into the dataset, complete or not at all.
 
-        *q* (n_legs,) are the readings [m or rad] where they differ from the commanded ones. Without
-        a photograph, its outlines are given otherwise.
+        Without a photograph, its outlines are given otherwise.
         """
         if photograph is None and "pose" not in self._header:
             raise UsageError(
@@ -347,8 +345,8 @@ class GuidedSession:
                 "needed one to tell rows apart; add the column."
             )
         image, cells = "", {**asked.cells, "view": asked.view}
-        if q is not None or not asked.is_planned:
-            cells |= self._readings(asked.q if q is None else q)
+        if not asked.is_planned:
+            cells |= self._readings(asked.q)
         if photograph is not None:
             image = asked.image + photograph.suffix.lower()
             (self.folder / image).parent.mkdir(parents=True, exist_ok=True)

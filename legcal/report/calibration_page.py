@@ -15,6 +15,7 @@ from markupsafe import Markup
 from scipy.special import ndtri
 
 from legcal.calibration.evaluation import Evaluation, evaluate
+from legcal.calibration.joint_fit.platform import PlatformMap, platform_map
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
 from legcal.calibration.summary import (
@@ -26,7 +27,6 @@ from legcal.calibration.summary import (
     platform_chart,
     tables,
 )
-from legcal.calibration.workspace_errors import PlatformMap, platform_map
 from legcal.data.measurements import row_names
 from legcal.errors import LegcalError, printable
 from legcal.files.quantity import SHOWN_IN
@@ -184,7 +184,7 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
     )
     charts = [Drawing(chart.markup()) for chart in platform_chart(calibration.result)]
     blocks: list[Any] = [replace(platform_table(platform), note=note), *charts]
-    workspace = platform_map(calibration)
+    workspace = platform_map(calibration.dataset.machine, calibration.solution)
     if workspace is not None:
         blocks += _maps(workspace)
     return blocks

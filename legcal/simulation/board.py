@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.types import Array, BoolArray
+from legcal.machine.leg import Link
 from legcal.simulation.observe import BORDER_PX, NEAREST
 from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid, triangles
 from legcal.vision.board import (
@@ -22,7 +23,6 @@ from legcal.vision.board import (
     Board,
     BoardKind,
     FixedBoard,
-    Link,
     board_document,
     charuco_board,
     dictionary,

@@ -21,6 +21,7 @@ from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.lines import direction_above, normal_basis
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
+from legcal.machine.leg import Link
 from legcal.machine.model import Machine
 from legcal.planning.places import feet
 from legcal.progress import Report, no_progress
@@ -31,7 +32,7 @@ from legcal.simulation.observe import (
 )
 from legcal.simulation.rendering.rays import in_view, surrounding_points
 from legcal.simulation.solids import PosedMachine
-from legcal.vision.board import Board, Link, facing_board
+from legcal.vision.board import Board, facing_board
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
 

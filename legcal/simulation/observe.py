@@ -413,7 +413,8 @@ def table_of_lines(u: Array, A: Array) -> Array:
 
     The direction u is at 90 deg - psi to the optical axis, and its picture u_y - i u_x as a complex
     number is at theta to the image's y axis. M_LS is in the plane y = 0 and has the moment of
-    the line, M x u = A x u. The method computes the same in another way, so that a mistake shows.
+    the line, M x u = A x u. The method goes back to the line by another way, so that a mistake
+    shows.
     """
     u_x, u_y, u_z = u.T
     if np.any(np.abs(u_y) < _MIN_UPRIGHT):

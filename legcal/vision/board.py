@@ -25,6 +25,7 @@ from legcal.files.schema import FileSchema, Number, closest, describe, read_yaml
 from legcal.files.table import is_number
 from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import LINKS, Link
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid", "circles", "asymmetric_circles"]
 
@@ -119,10 +120,6 @@ def facing_board(board: Board, place: Array, normal: Array, side: Array) -> Rigi
     y = y / np.linalg.norm(y)
     turn = Rotation.from_matrix(np.column_stack([cross(y, z), y, z]))
     return RigidTransform.from_components(place - turn.apply(board.extent.mean(axis=0)), turn)
-
-
-Link = Literal["base", "platform"]
-LINKS: tuple[Link, ...] = ("base", "platform")
 
 
 @dataclass(frozen=True, eq=False)

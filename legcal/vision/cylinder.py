@@ -86,15 +86,6 @@ def direction_of_angles(
     )
 
 
-def angles_of_direction(
-    u: Array,  # (..., 3) unit directions in the camera frame, from base to platform
-) -> tuple[Array, Array]:
-    """Return psi = asin(u_z) and theta = atan2(-u_x, u_y)."""
-    x, y, z = np.moveaxis(u, -1, 0)
-    # Equal to asin(u_z), without its loss of digits near the optical axis.
-    return np.arctan2(z, np.hypot(x, y)), np.arctan2(-x, y)
-
-
 def direction_derivative(psi: Array, theta: Array) -> Array:
     """Return d u / d (psi, theta), (..., 3, 2); arguments as in :func:`direction_of_angles`.
 

@@ -35,6 +35,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     resolve,
 )
 from legcal.calibration.joint_fit.part_errors import PartSigma, predicted_sigmas, sigmas_in_words
+from legcal.calibration.joint_fit.platform import moved_by
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     WHITE,
@@ -51,7 +52,7 @@ from legcal.geometry.types import Array
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.files import DATASET_YAML
 from legcal.machine.inspection import singularity_note
-from legcal.machine.leg import ARMS, JointType, LegColumns, ParameterId
+from legcal.machine.leg import ARMS, JointType, LegColumns, Link, ParameterId
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
@@ -73,7 +74,6 @@ from legcal.paper.conditions import (
     two_directions,
 )
 from legcal.perception.body_edges import bodies_of
-from legcal.vision.board import Link
 
 _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
@@ -195,9 +195,7 @@ class PlatformMotion:
         """Motion of the platform by a direction (p,) in metres."""
         if self.by_metres is None:
             return None
-        moved = self.by_metres @ direction
-        turn, shift = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in np.split(moved, 2, 1))
-        return RmsMotion(shift, turn)
+        return RmsMotion(*moved_by(self.by_metres, direction[:, None]).rms)
 
     def sigma(self, information: Array) -> RmsMotion | None:
         """Return the standard deviation of the platform for the information of parameters."""
@@ -205,11 +203,7 @@ class PlatformMotion:
             return None
         _, singular, basis = np.linalg.svd(information)
         seen = singular > _limit(self.session)
-        spread = self.by_metres @ (basis[seen].T / singular[seen])
-        turn, shift = (
-            float(np.sqrt(np.mean(np.sum(x**2, (1, 2))))) for x in np.split(spread, 2, 1)
-        )
-        return RmsMotion(shift, turn)
+        return RmsMotion(*moved_by(self.by_metres, basis[seen].T / singular[seen]).rms)
 
     def split(self, basis: Array) -> tuple[Array, Array]:
         """Split a space (w, p) into directions that move the platform and harmless ones."""

@@ -40,7 +40,7 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, radius_name
+from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, Link, radius_name
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -53,13 +53,11 @@ from legcal.machine.rods import (
     actuator_index,
     actuators_of,
     ends_at_poses,
-    joints_at,
-    readings_of_rods,
 )
 from legcal.machine.shapes import Occluder
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
 from legcal.perception.body_edges import bodies_of, predicted_edges
-from legcal.vision.board import Board, FixedBoard, Link, facing_board
+from legcal.vision.board import Board, FixedBoard, facing_board
 from legcal.vision.camera import sample_camera
 from legcal.vision.visibility import Bodies, visible_parts
 
@@ -154,8 +152,8 @@ class Session:
     def edges(self) -> Outlines:
         """Edges of bodies of the legs that views show."""
         views = [(view.camera, T) for view, T in zip(self.cameras, self.places, strict=True)]
-        ends = self.A_at[self.pose], (self.arm + self.t[:, None])[self.pose]
-        return predicted_edges(self.occluders, views, self.view, ends, self.seen, EDGE_SIGMA_PX)
+        A, B = (end[self.pose] for end in self.ends)
+        return predicted_edges(self.occluders, views, self.view, (A, B), self.seen, EDGE_SIGMA_PX)
 
     @cached_property
     def measurements(self) -> Measurements:
@@ -255,14 +253,9 @@ class Session:
         return np.array(actuator_index(self.legs), dtype=np.intp)
 
     @cached_property
-    def q(self) -> Array:
-        """Readings of the actuators at every pose, (k, n_actuators) [m or rad]."""
-        return readings_of_rods(self.legs, self.R, self.t)
-
-    @cached_property
-    def A_at(self) -> Array:
-        """Base joint centres in R_b at every pose, (k, n_legs, 3) [m]."""
-        return joints_at(self.legs, self.q)
+    def ends(self) -> tuple[Array, Array]:
+        """A and B in R_b at every pose, (k, n_legs, 3) [m]."""
+        return ends_at_poses(self.legs, self.R, self.t)
 
     @property
     def on_actuators(self) -> tuple[tuple[tuple[int, ...], bool], ...]:
@@ -273,19 +266,14 @@ class Session:
         )
 
     @cached_property
-    def arm(self) -> Array:
-        """From the origin of R_e to B in the directions of R_b, (k, n_legs, 3) [m]."""
-        return np.asarray(np.einsum("kij,nj->kni", self.R, np.array([leg.B for leg in self.legs])))
-
-    @cached_property
     def length(self) -> Array:
         """Leg lengths at every pose, (k, n_legs) [m]."""
-        return np.asarray(np.linalg.norm(self.arm + self.t[:, None] - self.A_at, axis=2))
+        return np.asarray(np.linalg.norm(self.ends[1] - self.ends[0], axis=2))
 
     @cached_property
     def u(self) -> Array:
         """Leg directions in R_b at every pose, (k, n_legs, 3)."""
-        return (self.arm + self.t[:, None] - self.A_at) / self.length[..., None]
+        return (self.ends[1] - self.ends[0]) / self.length[..., None]
 
     @cached_property
     def mean_length(self) -> float:
@@ -502,9 +490,8 @@ def default_cameras(
 
 def cameras_for(session: Session, views: Sequence[Sequence[int]]) -> tuple[View, ...]:
     """Return the default positions of further cameras."""
-    B = (session.arm + session.t[:, None]).mean(axis=0)
-    rng = np.random.default_rng(_SEED + 1)
-    return default_cameras(session.A_at.mean(axis=0), B, views, session.spatial, rng)
+    A, B = (end.mean(axis=0) for end in session.ends)
+    return default_cameras(A, B, views, session.spatial, np.random.default_rng(_SEED + 1))
 
 
 def _axis(A: Array, B: Array) -> Array:
@@ -548,8 +535,8 @@ def _showing(dataset: Dataset, link: Link) -> BoolArray:
 
 def legs_around(session: Session) -> list[int]:
     """Return the legs in their order around the base."""
-    A = session.A_at.mean(axis=0)
-    points = A + (session.arm + session.t[:, None]).mean(axis=0)
+    A, B = (end.mean(axis=0) for end in session.ends)
+    points = A + B
     centred = points - points.mean(axis=0)
     _, _, basis = np.linalg.svd(A - A.mean(axis=0))
     angle = np.arctan2(centred @ basis[1], centred @ basis[0])

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from scipy.special import chdtrc
 
-from legcal.calibration.joint_fit.determinacy import (
-    HeldDirections,
-    held_at_nominal,
-    undetermined_directions,
-)
+from legcal.calibration.joint_fit.determinacy import HeldDirections, undetermined_directions
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -29,10 +26,9 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.solver import NormalEquations, information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.leg import Leg, ParameterId, radius_name
+from legcal.machine.leg import LINKS, Leg, ParameterId, radius_name
 from legcal.machine.parameters import list_in_words
 from legcal.machine.rods import actuators_of
-from legcal.vision.board import LINKS
 from legcal.vision.camera import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
@@ -67,15 +63,31 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     if not problem.settings.judges_stated_values:
         return
     names = problem.choices.priors.keys()
+    unit_of = dict(zip(problem.named, problem.units, strict=True))
     problems = [
-        f"The prior of {name} contradicts the measurements: prior {prior.mean:.6g} +- "
-        f"{prior.sigma:.2g} {problem.units[problem.named.index(name)]}, measurements about "
-        f"{estimate.mean:.4g} {problem.units[problem.named.index(name)]}, {apart:.0f} standard "
-        f"deviations apart (limit {_SIGNIFICANT:g}); correct or remove the prior."
+        _contradiction(name, unit_of[name], (prior.mean, prior.sigma), estimate.mean, apart)
         for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
     ]
     if problems:
         raise DidNotConverge(problems)
+
+
+def _contradiction(
+    name: str,
+    unit: str,
+    stated: tuple[float, float],  # value and standard deviation, zero where it is fixed
+    measured: float,
+    apart: float,  # standard deviations
+) -> str:
+    """Describe a stated value that the measurements contradict."""
+    mean, sigma = stated
+    what, remedy = ("prior", "") if sigma else ("fixed value", "give it a prior, ")
+    in_words = f"{mean:.6g} +- {sigma:.2g} {unit}" if sigma else f"{mean:.6g} {unit}"
+    return (
+        f"The {what} of {name} contradicts the measurements: stated {in_words}, measured about "
+        f"{measured:.4g} {unit}, {apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); "
+        f"correct it, {remedy}or free it (--set {name}=free)."
+    )
 
 
 def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
@@ -137,23 +149,9 @@ class _Comparison:
 
     name: str
     unit: str
-    mean: float
-    sigma: float  # zero where it is fixed
     estimate: float
     sigmas_joint: float  # difference in standard deviations, other stated values free
     sigmas_alone: float  # the same, other stated values right
-
-    def __str__(self) -> str:
-        apart = self.sigmas_joint if self.sigmas_joint > _SIGNIFICANT else self.sigmas_alone
-        stated = f"{self.mean:.6g} {self.unit}"
-        if self.sigma:
-            stated = f"{self.mean:.6g} +- {self.sigma:.2g} {self.unit}"
-        return (
-            f"The {'prior' if self.sigma else 'fixed value'} of {self.name} contradicts the "
-            f"measurements: stated {stated}, measured about {self.estimate:.4g} {self.unit}, "
-            f"{apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); correct it, "
-            f"{'' if self.sigma else 'give it a prior, '}or free it (--set {self.name}=free)."
-        )
 
 
 def refuse_contradicted_values(
@@ -211,14 +209,14 @@ def refuse_contradicted_values(
             continue
         comparisons = _compare(fit, held, stated, wide)
         break
-    contradicted = [
-        comparison for comparison in comparisons if comparison.sigmas_joint > _SIGNIFICANT
-    ]
-    contradicted = contradicted or [
-        comparison for comparison in comparisons if comparison.sigmas_alone > _SIGNIFICANT
-    ]
-    if contradicted:
-        raise DidNotConverge([str(comparison) for comparison in contradicted])
+    for apart in (attrgetter("sigmas_joint"), attrgetter("sigmas_alone")):
+        problems = [
+            _contradiction(one.name, one.unit, stated[one.name], one.estimate, apart(one))
+            for one in comparisons
+            if apart(one) > _SIGNIFICANT
+        ]
+        if problems:
+            raise DidNotConverge(problems)
 
 
 def _fixed_by_choice(problem: FitProblem) -> tuple[str, ...]:
@@ -261,11 +259,7 @@ def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
     first = first_minimum(problem, state)
     normal = information(problem, first.state, first.linear, problem.loss)
     held = undetermined_directions(problem, first.state, normal)
-    if len(held.basis):
-        problem, state = held_at_nominal(problem, first.state, held)
-        continued = first_minimum(problem, state)
-        first = replace(continued, iterations=first.iterations + continued.iterations)
-    return fit_in_rounds(problem, first), held
+    return fit_in_rounds(problem, first, held), held
 
 
 def _compare(
@@ -305,8 +299,6 @@ def _compare(
             _Comparison(
                 name,
                 problem.units[unknowns[i]],
-                float(mean[i]),
-                float(sigma[i]),
                 float(fitted[i]),
                 float(joint_sigmas) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0,
                 float(abs(slope[i] / measured) / np.sqrt(1.0 / measured + sigma[i] ** 2)),

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +29,9 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
-from legcal.machine.leg import LegColumns, LegKind
+from legcal.machine.leg import LINKS, LegColumns, LegKind, Link
 from legcal.machine.rods import actuator_index, first_rods
-from legcal.vision.board import LINKS, FixedBoard, Link
+from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
 from legcal.vision.cylinder import EPSILON
 
@@ -132,9 +132,8 @@ class ObservedOutlines:
     # (n, 2, 2) points of the measured outline at both ends of its segment, on the sensor plane
     feet: Array
     pixels: Array  # (n, 2, 2) the same points in the image [px]
-    # (n, 9) data of the residual: the inverse transposed derivative of pixels at these points
-    # [1/px], column by column, and epsilon of eq (5)
-    constants: Array
+    lens: Array  # (n, 2, 2, 2) J^-1 at these points, J the derivative of pixels there [1/px]
+    epsilon: Array  # (n,) +1 or -1 of eq (5)
     covariance: Array  # (n, 2, 2) claimed covariance of the offsets at both ends [px^2]
     # (n,) derivative of the outline's position by the logarithm of the camera's gamma, positive
     # inwards [px]; zero where the gamma is given or the derivative unknown
@@ -174,30 +173,13 @@ class ObservedOutlines:
         """Mask of the outlines of arms, (n,)."""
         return np.array([part in self.arms for part in self.parts], dtype=np.bool_)[self.radius]
 
-    @property
-    def epsilon(self) -> Array:
-        """+1 or -1 of eq (5), (n,)."""
-        return np.asarray(self.constants[:, 8])
-
     def __len__(self) -> int:
         return len(self.index)
 
     def at(self, which: IntArray) -> ObservedOutlines:
         """Select outlines by index, without biases."""
-        bare = self.without_biases()
-        shared = (
-            "parts",
-            "views",
-            "series",
-            "cameras",
-            "on_actuators",
-            "arms",
-            "polished",
-            "memory",
-        )
-        chosen = {
-            f.name: getattr(bare, f.name)[which] for f in fields(self) if f.name not in shared
-        }
+        bare = vars(self.without_biases())
+        chosen = {name: bare[name][which] for name in _BY_OUTLINE}
         return replace(self, **chosen, memory=Memory())
 
     def without_biases(self) -> ObservedOutlines:
@@ -212,13 +194,12 @@ class ObservedOutlines:
 
     def through(self, cameras: Sequence[Camera]) -> ObservedOutlines:
         """Project the same pixels onto the sensor planes of other cameras."""
-        feet, constants = self.feet.copy(), self.constants.copy()
+        feet, lens = self.feet.copy(), self.lens.copy()
         for v in np.unique(self.view):
             of_view = self.view == v
             feet[of_view] = cameras[v].undistort(self.pixels[of_view])
-            lens = _inverses(cameras[v].pixels_per_unit(feet[of_view]))
-            constants[of_view, :8] = lens.reshape(-1, 8)
-        return replace(self, feet=feet, constants=constants)
+            lens[of_view] = _inverses(cameras[v].pixels_per_unit(feet[of_view]))
+        return replace(self, feet=feet, lens=lens)
 
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
         """Return the distance of both ends from the predicted outline, (n, 2) [px]."""
@@ -265,7 +246,7 @@ class ObservedOutlines:
                 slope = np.concatenate([slope, np.einsum("kcqn,cqn->kqn", by_key, by_xy)])
             return r, slope, ends, by_xy
 
-        inputs = self.radius, self.feet, self.constants
+        inputs = self.radius, self.feet, self.lens, self.epsilon
         poses = state.camera_pose, state.platform_pose
         prediction: tuple[Array, Array, _EndsInCamera, Array] = self.memory.of(
             predicted, keys, *inputs, state.legs, state.radii, state.cameras, *poses
@@ -275,19 +256,18 @@ class ObservedOutlines:
     @cached_property
     def _lens(self) -> Array:
         """Inverse transposed derivatives of pixels by row, column and end, (2, 2, 2, n)."""
-        by_end = self.constants[:, :8].reshape(-1, 2, 2, 2)  # column by column
-        return np.ascontiguousarray(by_end.transpose(3, 2, 1, 0))
+        return np.ascontiguousarray(self.lens.transpose(3, 2, 1, 0))
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor, whitened by the claimed covariances."""
         own = ("radii", self.radius, _ONE), ("biases", self.bias_index, _ONE)
         touches = _touches_of_legs(self, *own)
-        whitening = whitener(self.covariance)
-
-        def rows(state: State) -> Residuals:
-            return self.rows(keys, state)
-
+        rows, whitening = partial(self.rows, keys), whitener(self.covariance)
         return Factor("outlines", rows, touches, len(self), 2, self.pose, whitening, robust=True)
+
+
+_NAMES = [one.name for one in fields(ObservedOutlines)]
+_BY_OUTLINE = _NAMES[: _NAMES.index("parts")]  # fields with a row for each outline
 
 
 def observed_outlines(
@@ -325,8 +305,7 @@ def observed_outlines(
     covariance, by_gamma = covariance[order], by_gamma[order]
     n, numbers = len(index), {part: i for i, part in enumerate(parts)}
     radius = np.array([numbers[key] for key in keys], dtype=np.intp)[order]
-    feet, pixels, constants = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.empty((n, 9))
-    constants[:, 8] = EPSILON[outlines.edge[index] - 1]
+    feet, pixels, lens = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2, 2))
     for v in np.unique(view):
         camera, of_view = measurements.views[v].camera, view == v
         rows_of_view = index[of_view]
@@ -336,7 +315,7 @@ def observed_outlines(
         )
         value = np.sum(normal * xy, axis=-1, keepdims=True) + outlines.h[rows_of_view, None, 2:]
         feet[of_view] = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
-        constants[of_view, :8] = _inverses(camera.pixels_per_unit(feet[of_view])).reshape(-1, 8)
+        lens[of_view] = _inverses(camera.pixels_per_unit(feet[of_view]))
         pixels[of_view] = camera.distort(feet[of_view])
     return ObservedOutlines(
         index,
@@ -346,7 +325,8 @@ def observed_outlines(
         radius,
         feet,
         pixels,
-        constants,
+        lens,
+        EPSILON[outlines.edge[index] - 1],
         covariance,
         by_gamma,
         np.zeros((n, 0), dtype=np.intp),
@@ -501,11 +481,7 @@ class ObservedEdges:
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor."""
         touches = _touches_of_legs(self, ("leans", self.body, _ALL))
-        whitening = 1.0 / self.sigma[:, None, None]
-
-        def rows(state: State) -> Residuals:
-            return self.rows(keys, state)
-
+        rows, whitening = partial(self.rows, keys), 1.0 / self.sigma[:, None, None]
         return Factor("edges", rows, touches, len(self), 1, self.pose, whitening, robust=True)
 
 
@@ -727,8 +703,7 @@ class ObservedCorners:
     point: Array  # (n, 3) the corners in the frame of the board [m]
     feet: Array  # (n, 2) measured corners on the sensor plane
     pixels: Array  # (n, 2) measured corners in the image [px]
-    # (n, 4) data of the residual: the derivative of pixels at these points [px], column by column
-    constants: Array
+    lens: Array  # (n, 2, 2) derivative of pixels at these points [px]
     sigma: Array  # (n,) standard deviation of both coordinates [px]
 
     def __len__(self) -> int:
@@ -766,7 +741,7 @@ class ObservedCorners:
         in_camera = turned + state.camera_pose.t[self.view]
         depth = in_camera[:, 2:]
         projected = in_camera[:, :2] / depth
-        lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
+        lens = self.lens
         by_projected = lens / depth[:, None]
         by_depth = -by_projected @ projected[..., None]
         r = (lens @ (projected - xy)[..., None])[..., 0]
@@ -795,9 +770,8 @@ class ObservedCorners:
 
     def by_intrinsics(self, wanted: tuple[str, ...], state: State) -> Array:
         """Return derivatives (n, 2, n_wanted) of the residuals by intrinsics of their views."""
-        lens = np.swapaxes(self.constants.reshape(-1, 2, 2), 1, 2)
         slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
-        return np.asarray(-lens @ slopes)
+        return np.asarray(-self.lens @ slopes)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor; a board on the platform depends on its poses."""
@@ -809,11 +783,7 @@ class ObservedCorners:
             ("board_scale", board, _ALL),
             ("cameras", self.view, _ALL),
         )
-        whitening = 1.0 / self.sigma[:, None, None]
-
-        def rows(state: State) -> Residuals:
-            return self.rows(keys, state)
-
+        rows, whitening = partial(self.rows, keys), 1.0 / self.sigma[:, None, None]
         return Factor(self.name, rows, touches, len(self), 2, element, whitening, robust=True)
 
 
@@ -840,7 +810,7 @@ def _corners_on(
         none, index = np.zeros(0), np.zeros(0, dtype=np.intp)
         pair = none.reshape(0, 2)
         return ObservedCorners(
-            link, index, index, index, none.reshape(0, 3), pair, pair, none.reshape(0, 4), none
+            link, index, index, index, none.reshape(0, 3), pair, pair, none.reshape(0, 2, 2), none
         )
     corners = seen.corners
     used = np.flatnonzero(corners.used & fixed.has(corners.corner))
@@ -855,14 +825,13 @@ def _corners_on(
         [np.bincount(which, weights=weight * corners.px[used, i]) / total for i in range(2)], axis=1
     )
     view, pose, corner = unique_keys.T.astype(np.intp)
-    feet, constants = np.zeros((len(view), 2)), np.zeros((len(view), 4))
+    feet, lens = np.zeros((len(view), 2)), np.zeros((len(view), 2, 2))
     for v in np.unique(view).tolist():
         of_view = view == v
         feet[of_view] = cameras[v].undistort(pixels[of_view])
-        lens = cameras[v].pixels_per_unit(feet[of_view])
-        constants[of_view] = np.swapaxes(lens, -1, -2).reshape(-1, 4)
+        lens[of_view] = cameras[v].pixels_per_unit(feet[of_view])
     point, sigma = fixed.board.points[corner - fixed.first], 1.0 / np.sqrt(total)
-    return ObservedCorners(link, view, pose, corner, point, feet, pixels, constants, sigma)
+    return ObservedCorners(link, view, pose, corner, point, feet, pixels, lens, sigma)
 
 
 # ------------------------------------------------------------------------------------ residuals

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from legcal.calibration.joint_fit.free_poses import (
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, robust_noise
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
@@ -53,8 +53,8 @@ from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines, are_of_arms
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation.problem import Residuals, linearize
-from legcal.estimation.solver import Minimum, information, minimise
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import Minimum, NormalEquations, information, minimise
 from legcal.machine.leg import Leg
 
 _MAX_RADIUS_CHANGE = 0.5
@@ -281,8 +281,7 @@ def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None
     try:
         if are_free(problem, begin):
             return _first_minimum_with_free_poses(problem, begin)
-        first = first_minimum(*_hold_undetermined_at_start(problem, begin))
-        return _in_best_assembly_modes(problem, first)
+        return _in_best_assembly_modes(problem, _first_minimum_from(problem, begin))
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, with_priors=True)
         _refuse_undetermined(problem, begin)
@@ -298,51 +297,42 @@ def _in_best_assembly_modes(problem: FitProblem, first: Minimum[State]) -> Minim
     state = in_other_assembly_modes(problem, first.state, _PART_OF_MODEL)
     if state is first.state:
         return first
-    other = first_minimum(*_hold_undetermined_at_start(problem, state), must_converge=False)
+    other = _first_minimum_from(problem, state, must_converge=False)
     return other if other.cost < first.cost else first
 
 
 def _first_minimum_with_free_poses(problem: FitProblem, start_state: State) -> Minimum[State]:
     """First minimum, with a search for better poses of images with large residuals."""
-
-    def minimum(state: State, must_converge: bool = True) -> Minimum[State]:
-        return first_minimum(
-            *_hold_undetermined_at_start(problem, state), must_converge=must_converge
-        )
-
     try:
-        best = minimum(start_state)
+        best = _first_minimum_from(problem, start_state)
         if not have_outliers(problem, best.state):
             return best
     except DidNotConverge:
         best = None
     # Poses of wrong images drift without end: only the last minimisation has to converge.
-    candidate = minimum(
-        with_free_poses(problem, problem.projected(start_state)), must_converge=False
-    )
+    state = with_free_poses(problem, problem.projected(start_state))
+    candidate = _first_minimum_from(problem, state, must_converge=False)
     best = candidate if best is None or candidate.cost < best.cost else best
     for k in range(_POSE_ROUNDS):
         if not have_outliers(problem, best.state):
             break
         state = with_better_poses(problem, best.state, _PART_OF_MODEL, seed=k)
-        candidate = minimum(state, must_converge=False)
+        candidate = _first_minimum_from(problem, state, must_converge=False)
         best = candidate if candidate.cost < best.cost else best
     return best
 
 
-def _hold_undetermined_at_start(
-    problem: FitProblem, begin: State
-) -> tuple[FitProblem, State, Mapping[str, Residuals] | None]:
-    """Hold the directions that are open at the start; also return the rows computed there."""
+def _first_minimum_from(
+    problem: FitProblem, begin: State, *, must_converge: bool = True
+) -> Minimum[State]:
+    """First minimum from a state, with the directions held that are open there."""
     begin = problem.projected(begin)
-    linear = linearize(problem, begin)
-    try:
-        held = undetermined_directions(problem, begin, information(problem, begin, linear))
-    except NotIdentifiable:  # at the start only, or reported at the minimum
-        return problem, begin, linear.rows
-    if len(held.basis):
-        return *held_at_nominal(problem, begin, held), None
-    return problem, begin, linear.rows
+    with contextlib.suppress(NotIdentifiable):  # at the start only, or reported at the minimum
+        normal = information(problem, begin, linearize(problem, begin))
+        held = undetermined_directions(problem, begin, normal)
+        if len(held.basis):
+            problem, begin = held_at_nominal(problem, begin, held)
+    return first_minimum(problem, begin, must_converge=must_converge)
 
 
 def _refine_minimum(
@@ -356,36 +346,36 @@ def _refine_minimum(
     normal = information(problem, first.state, first.linear, problem.loss)
     held = undetermined_directions(problem, first.state, normal)
     refuse_contradicted_board(problem, first.state, normal)
-    without_held, state = problem, first.state
     while True:
         try:
-            if len(held.basis):
-                problem, state = held_at_nominal(without_held, state, held)
-                continued = first_minimum(problem, state)
-                state = continued.state
-                first = dataclasses.replace(
-                    continued, iterations=first.iterations + continued.iterations
-                )
-            fit = fit_in_rounds(problem, first)
-            normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-            refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
-            _refuse_other_radii(problem, fit.state)
+            fit, normal = _fit_holding(problem, held, first)
             break
         except (DidNotConverge, NotIdentifiable) as failure:
-            more = _open_farther_on(without_held, problem, state, len(held.basis))
-            if more is not None:
-                held = more
-                continue
-            refuse_contradicted_values(without_held, start, state, with_priors=True)
-            _refuse_contradicted(without_held, state)
-            _refuse_undetermined(without_held, state)
-            if isinstance(failure, DidNotConverge):
-                raise blaming_stated_values(without_held, failure) from None
-            raise
+            within, at = held_at_nominal(problem, first.state, held)
+            more = _open_farther_on(problem, within, at, len(held.basis))
+            if more is None:
+                refuse_contradicted_values(problem, start, at, with_priors=True)
+                _refuse_contradicted(problem, at)
+                _refuse_undetermined(problem, at)
+                if isinstance(failure, DidNotConverge):
+                    raise blaming_stated_values(problem, failure) from None
+                raise
+            held = more
     if rejected_notes(fit.problem, fit.accepted):
-        refuse_contradicted_values(without_held, start, state, with_priors=True)
+        refuse_contradicted_values(problem, start, first.state, with_priors=True)
     refuse_contradicted_priors(fit.problem, fit.state, normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
+
+
+def _fit_holding(
+    problem: FitProblem, held: HeldDirections, first: Minimum[State]
+) -> tuple[Fit, NormalEquations]:
+    """Fit with held directions; also return the information, which must determine all others."""
+    fit = fit_in_rounds(problem, first, held)
+    normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
+    refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
+    _refuse_other_radii(problem, fit.state)
+    return fit, normal
 
 
 def _open_farther_on(

@@ -151,8 +151,8 @@ def compare_held_out(
         poses=measurements.n_poses,
         outlines=len(problem.outlines),
         wrong=int(np.sum(~inliers)),
-        rms_px=_rms(offsets[inliers]),
-        expected_px=_rms(np.sqrt(pixels[inliers])),
+        rms_px=rms(offsets[inliers]),
+        expected_px=rms(np.sqrt(pixels[inliers])),
         views={
             measurements.views[v].name: float(np.sqrt(np.mean(offsets[inliers][view == v] ** 2)))
             for v in np.unique(view).tolist()
@@ -171,9 +171,9 @@ def _refuse_undetermined(readings: NormalEquations) -> None:
         )
 
 
-def _rms(offsets: Array) -> float | None:
-    """Root mean square of offsets; None without any."""
-    return float(np.sqrt(np.mean(offsets**2))) if len(offsets) else None
+def rms(values: Array) -> float | None:
+    """Root mean square of values; None without any."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
 _N_BLOCKS = 5

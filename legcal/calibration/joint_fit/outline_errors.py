@@ -29,7 +29,7 @@ both.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,6 +50,7 @@ _MIN_NOISE_GAIN = (
 )
 _MAX_ITERATIONS = 100
 _VARIANCE_TOLERANCE = 1e-9
+_HALVINGS = 40  # of an interval around the size of an error
 _RANK = 1e-10  # relative singular value of kinds of noise that offsets cannot separate
 
 KINDS = (
@@ -289,25 +290,11 @@ def _root(excess: Callable[[float], float], offsets: Array) -> float:
     if excess(0.0) <= 0.0:
         return 0.0
     low, high = 0.0, 2.0 * float(np.abs(offsets).max())
-    above, below = excess(low), excess(high)
-    while below > 0.0:
-        low, above, high = high, below, 2.0 * high
-        below = excess(high)
-    # Regula falsi (Illinois): the value at an end that stays twice counts half. Steps are at least
-    # as long as the tolerance, and both ends close around the root. SciPy's takes 0.1 s to load.
-    tolerance = 1e-12 + 1e-14 * high
-    was_above = None
-    while high - low > 2.0 * tolerance:
-        between = low + (high - low) * above / (above - below)
-        between = min(max(between, low + tolerance), high - tolerance)
-        value = excess(between)
-        is_above = value > 0.0
-        stays = 0.5 if is_above is was_above else 1.0
-        if is_above:
-            low, above, below = between, value, stays * below
-        else:
-            high, below, above = between, value, stays * above
-        was_above = is_above
+    while excess(high) > 0.0:
+        low, high = high, 2.0 * high
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
     return 0.5 * (low + high)
 
 
@@ -328,7 +315,6 @@ class EdgeBiases:
     shift: Array  # (n, c, 2) shift of both ends along the line's normal by one unit [px]
     shown: Array | None = None  # (n_kinds,) variances estimated from residuals
     likeliest_sigma: Array | None = None  # (N_KINDS,) if ``sigma`` is a posterior mean
-    parts: dict[bytes, EdgeBiases] = field(default_factory=dict, repr=False)  # cached subsets
 
     @property
     def sigmas(self) -> Array:
@@ -362,18 +348,15 @@ class EdgeBiases:
     def of_sizes(self, sigma: Array) -> EdgeBiases:
         """Set the standard deviations; drop biases where they are zero."""
         kept = sigma[self.kind] > 0.0
-        selected = self.parts.get(kept.tobytes())
-        if selected is None:
-            renumbered = np.cumsum(kept) - 1
-            columns = kept[self.index].all(axis=0)  # all biases of a column are of one kind
-            selected = self.parts[kept.tobytes()] = EdgeBiases(
-                tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
-                self.kind[kept],
-                sigma,
-                renumbered[self.index[:, columns]],
-                self.shift[:, columns],
-            )
-        return replace(selected, sigma=sigma)
+        renumbered = np.cumsum(kept) - 1
+        columns = kept[self.index].all(axis=0)  # all biases of a column are of one kind
+        return EdgeBiases(
+            tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
+            self.kind[kept],
+            sigma,
+            renumbered[self.index[:, columns]],
+            self.shift[:, columns],
+        )
 
 
 def possible_biases(

@@ -15,7 +15,7 @@ from legcal.data.measurements import View
 from legcal.errors import DatasetError, UsageError
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegKind, ParameterId, radius_name
+from legcal.machine.leg import LINKS, LegKind, Link, ParameterId, radius_name
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     geometries,
@@ -24,7 +24,7 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.machine.tolerance import Tolerance
-from legcal.vision.board import LINKS, FixedBoard, Link, board_name
+from legcal.vision.board import FixedBoard, board_name
 from legcal.vision.camera import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
 
 Group = Literal["zeros", "lengths", "all"]  # what --only reports, and writes into the model

@@ -211,10 +211,12 @@ def _with_zero(leg: Leg, zero: float) -> Leg:
     if actuator is None:
         return replace(leg, q0=leg.q0 + leg.sign * zero) if leg.kind is LegKind.ACTUATED else leg
     q = np.array([zero])
-    moved = replace(leg, A=actuator.at(leg.A, q)[0])
-    if actuator.arm is None:
-        return moved
-    line = actuator.arm.line
-    axis = actuator.rotations(q)[0] @ line.axis if actuator.turns else line.axis
-    turned = replace(actuator.arm, line=Line(actuator.at(line.point, q)[0], axis))
-    return replace(moved, actuator=replace(actuator, arm=turned))
+    turn, arm = actuator.rotations(q)[0], actuator.arm
+    if arm is not None:
+        arm = replace(arm, line=Line(actuator.at(arm.line.point, q)[0], turn @ arm.line.axis))
+    return replace(
+        leg,
+        A=actuator.at(leg.A, q)[0],
+        base_axis=None if leg.base_axis is None else turn @ leg.base_axis,
+        actuator=replace(actuator, arm=arm),
+    )

@@ -1,7 +1,7 @@
 """Accuracy of a fit at the platform: change of its poses, and their predicted errors.
 
 Errors over the workspace are at a hundred poses all over the travel, the poses at which ``legcal
-evaluate`` compares two models.
+evaluate`` compares two models; on pages, at a grid of places in the orientation of home.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import platform_poses
-from legcal.errors import DidNotConverge
+from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Frames
+from legcal.geometry.motions import motions_of
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import workspace
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.machine.leg import Leg
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, readings_at_poses
 from legcal.machine.parameters import Parametrization, geometries
 from legcal.machine.rods import length_errors
 
@@ -49,6 +51,12 @@ class PlatformError:
     def mean_rotation(self) -> float:
         """Mean over the poses [rad]."""
         return float(self.rotation.mean())
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Root mean squares over the poses: displacement [m], rotation [rad]."""
+        displacement, rotation = (x @ x / len(x) for x in (self.displacement, self.rotation))
+        return float(np.sqrt(displacement)), float(np.sqrt(rotation))
 
     @property
     def max_displacement(self) -> float:
@@ -96,6 +104,10 @@ def _root_of_sum(squares: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(squares.sum(axis=1), 0.0)))
 
 
+N_ACROSS, N_LEVELS = 7, 3  # points of the grid in x and y, and in z
+MIN_PLACES = 6  # smallest number of reachable points of a grid
+_FLAT = 1e-3  # extent of a planar workspace, relative to the largest extent
+_CLOSED = 2.5e-6  # largest difference of a point and the pose by its readings [leg lengths, rad]
 # Leg lengths: residual of a pose that reaches its readings
 _REACHED = 2.5e-8
 _REACHED_BY_ALL = 0.03  # with redundant motors, whose readings may disagree
@@ -191,3 +203,91 @@ def poses_at_readings(
     read = np.array([leg.is_motor for leg in legs], dtype=np.bool_)
     lengthening = np.where(read, machine.sign * q, np.nan)
     return platform_poses(legs, lengthening, nearby, machine.frame_legs)
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformMap:
+    """Displacements of the platform at places of the workspace."""
+
+    # x, y, z: (n_x,), (n_y,), (n_z,): the grid of origins of the platform link in the base link [m]
+    x: Array
+    y: Array
+    z: Array
+    # change, sigma: (n_z, n_y, n_x): change from the nominal to the calibrated model at the same
+    # readings, and predicted error of the calibrated model, one standard deviation [m]; NaN out of
+    # reach
+    change: Array
+    sigma: Array
+
+
+def platform_map(machine: Machine, solution: Solution) -> PlatformMap | None:
+    """Return the platform errors over the workspace; None if readings do not determine the pose.
+
+    None also if no random poses can be drawn within the travels of the model, or if it reaches few
+    places in the orientation of home.
+    """
+    if not machine.is_determined:
+        return None
+    try:
+        _, drawn = workspace(machine)
+    except DidNotConverge:
+        return None
+    x, y, z = _grid(np.array([T.translation for T in drawn]))
+    grids = np.meshgrid(z, y, x, indexing="ij")
+    places = np.stack([grid.ravel() for grid in grids[::-1]], axis=1)
+    R = np.broadcast_to(machine.home.rotation.as_matrix(), (len(places), 3, 3))
+    readings = readings_at_poses(machine, np.concatenate([R, places[..., None]], axis=2))
+    inside = np.flatnonzero(_inside(machine, readings))
+    poses = motions_of(R[inside], places[inside])
+    errors = _errors(machine, solution, readings[inside], poses) if len(inside) else None
+    if errors is None:
+        return None
+    reached, change, sigma = errors
+    if len(change.displacement) < MIN_PLACES:
+        return None
+    maps = np.full((2, len(places)), np.nan)
+    maps[:, inside[reached]] = change.displacement, sigma.displacement
+    return PlatformMap(x, y, z, *maps.reshape(2, *grids[0].shape))
+
+
+def _grid(position: Array) -> list[Array]:
+    """Return points along x and y over the whole workspace, and levels of z inside it."""
+    low, high = position.min(axis=0), position.max(axis=0)
+    flat = high - low < _FLAT * float(np.max(high - low))
+    x, y = (np.linspace(a, b, N_ACROSS) for a, b in zip(low[:2], high[:2], strict=True))
+    z = np.quantile(position[:, 2], np.arange(1, N_LEVELS + 1) / (N_LEVELS + 1.0))
+    return [axis[:1] if is_flat else axis for axis, is_flat in zip((x, y, z), flat, strict=True)]
+
+
+def _inside(machine: Machine, q: Array) -> BoolArray:
+    """Return a mask of the rows of readings (n, n_legs) within the travels."""
+    inside = np.ones(len(q), dtype=np.bool_)
+    for j, leg in enumerate(machine.legs):
+        if leg.is_motor:
+            inside &= (q[:, j] >= leg.travel[0]) & (q[:, j] <= leg.travel[1])
+    return inside
+
+
+def _errors(
+    machine: Machine, solution: Solution, q: Array, T_base_platform: Sequence[RigidTransform]
+) -> tuple[BoolArray, PlatformError, PlatformError] | None:
+    """Return a mask of the poses that both models reach, and change and predicted error there."""
+    wanted = platforms_in_base(machine, T_base_platform)
+    nominal = poses_at_readings(machine, geometries(machine), q, wanted)
+    calibrated = poses_at_readings(machine, solution.legs, q, nominal)
+    distance, angle = pose_differences(nominal, wanted)
+    reached = (distance < _CLOSED * machine.size) & (angle < _CLOSED)
+    reached &= reach_readings(machine, solution.legs, q, calibrated)
+    indices = np.flatnonzero(reached)
+    if not len(indices):
+        return None
+    reached_poses = [calibrated[k] for k in indices]
+    try:
+        moves = platform_by_parameters(
+            solution.legs, solution.kinematic.parametrization, machine.frame_legs, reached_poses
+        )
+    except NotIdentifiable:  # a point of the grid is singular
+        return None
+    sigma = expected_error(moves, solution.kinematic.total_covariance)
+    change = PlatformError(*pose_differences(reached_poses, [nominal[k] for k in indices]))
+    return reached, change, sigma

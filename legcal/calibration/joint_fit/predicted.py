@@ -16,17 +16,16 @@ n / (1 + n s^2) of what one would without such errors.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import ResidualsBlock, Result
 from legcal.calibration.joint_fit.factors import BoardCorners, ObservedOutlines
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
@@ -48,7 +47,6 @@ from legcal.data.reasons import USED
 from legcal.errors import DatasetError, UsageError
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.uncertainty import marginal_rows
-from legcal.files.reading import read_json
 from legcal.files.table import read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg, LegKind, ParameterId
@@ -513,37 +511,21 @@ WHITE = PredictedNoise(0.1, -0.5, (0.0,) * 6, (0.0, 0.0), 0.0, "independent erro
 
 
 def read_noise(path: Path) -> PredictedNoise:
-    """Return the estimated noise of an earlier result, by its folder or ``result.json``."""
+    """Return the estimated noise of an earlier result, by its folder or ``result.json``.
+
+    Its outlines have their claimed standard deviations times the estimated scale.
+    """
     file = path / "result.json" if path.is_dir() else path
     try:
-        document = read_json(file)
-        if "legcal_result" in document:
-            return _noise_of_result(document, file)
-    except FileNotFoundError as error:
-        problem = "no such file" if file == path else f"a folder without {file.name}"
-        raise _unusable(path, problem) from error
-    except OSError as error:
-        raise _unusable(path, f"'{error.strerror or error}'") from error
-    except KeyError as error:
-        raise _unusable(path, f"a document without {error}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise _unusable(path, "no JSON document") from error
-    except (ValueError, TypeError, AttributeError, DatasetError) as error:
-        raise _unusable(path, f"'{error}'") from error
-    raise _unusable(path, "another document")
+        return _noise_of_result(Result.read(file).residuals, file)
+    except (OSError, DatasetError) as error:
+        raise UsageError(
+            f"The noise in {path} could not be used: {error} Correct --noise, or leave it out."
+        ) from error
 
 
-def _unusable(path: Path, problem: str) -> UsageError:
-    return UsageError(
-        f"{path}: the noise could not be used: found {problem}, needed the folder of an earlier "
-        "result or its result.json; correct --noise, or leave it out."
-    )
-
-
-def _noise_of_result(document: dict[str, Any], file: Path) -> PredictedNoise:
-    """Noise of a result: claimed standard deviations times the estimated scale."""
-    noise, common = document["residuals"]["noise"], document["residuals"]["shared_px"]
-    scale = float(noise["scale"])
+def _noise_of_result(residuals: ResidualsBlock, file: Path) -> PredictedNoise:
+    noise, common = residuals.noise, residuals.shared_px
     sigma, correlation = DEFAULT_NOISE.sigma_px, DEFAULT_NOISE.correlation
     table = file.parent / OBSERVATIONS_NAME
     if table.is_file():
@@ -554,12 +536,12 @@ def _noise_of_result(document: dict[str, Any], file: Path) -> PredictedNoise:
         length = np.linalg.norm(ends[:, 2:] - ends[:, :2], axis=1)
         if len(length):
             variance = 0.5 * (s00 + s11)
-            sigma = scale * float(np.median(np.sqrt(variance * length / 4.0)))
+            sigma = noise.scale * float(np.median(np.sqrt(variance * length / 4.0)))
             correlation = float(np.median(s01 / variance))
-    shared = tuple(float(common.get(kind, 0.0)) for kind in KINDS)
+    shared = tuple(common.get(kind, 0.0) for kind in KINDS)
     # With few images, errors at places appear as bias and tilt of single outlines.
-    single_edges = float(noise["bias_px"]), float(noise["tilt_px"])
-    at_places = (float(common.get(kind, 0.0)) for kind in PLACES)
+    single_edges = noise.bias_px, noise.tilt_px
+    at_places = (common.get(kind, 0.0) for kind in PLACES)
     places = tuple(max(both) for both in zip(single_edges, at_places, strict=True))
     gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
     return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, places, gamma, str(file))

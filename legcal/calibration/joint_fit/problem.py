@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -69,11 +68,10 @@ from legcal.estimation.problem import (
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms
-from legcal.machine.leg import Leg, ParameterId, radius_name
+from legcal.machine.leg import LINKS, Leg, ParameterId, radius_name
 from legcal.machine.parameters import Parametrization, is_held_by_default
 from legcal.machine.rods import reading_legs, readings_of_rods
 from legcal.machine.ties import wholly_tied
-from legcal.vision.board import LINKS
 from legcal.vision.camera import (
     Camera,
     intrinsic_names,
@@ -265,13 +263,11 @@ class FitProblem(EstimationProblem[State]):
 
     def with_choices(self, choices: Choices) -> FitProblem:
         """Rebuild the problem for the same measurements with other choices of parameters."""
-        owners = shared_cameras(self.outlines.views, self.first_cameras)
         observed = self.observed._replace(outlines=self.outlines.without_biases())
         cameras, n_poses = self.first_cameras, self.n_elements
-        given = _FitInputs(
-            self.legs, observed, cameras, owners, n_poses, self.images, self.settings
+        return _build_problem(
+            self.legs, observed, cameras, n_poses, self.images, self.settings, choices
         )
-        return _build_problem(given, choices)
 
 
 def build_fit(
@@ -301,9 +297,7 @@ def build_fit(
     )
     observed = observed_arrays(measurements, legs, outlines, board, cameras, edges)
     n_poses, images = measurements.n_poses, _images(measurements)
-    return _build_problem(
-        _FitInputs(legs, observed, cameras, owners, n_poses, images, settings), choices
-    )
+    return _build_problem(legs, observed, cameras, n_poses, images, settings, choices)
 
 
 def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
@@ -322,28 +316,21 @@ def _images(measurements: Measurements) -> dict[tuple[int, int], str]:
     return dict(zip(places, row_names(measurements), strict=True))
 
 
-class _FitInputs(NamedTuple):
-    """Inputs of a fit besides the choices of its parameters."""
-
-    legs: FittedLegs
-    observed: Observed
-    cameras: tuple[Camera, ...]  # of the views
-    owners: tuple[str, ...]  # representative view of each view's camera
-    n_poses: int
-    images: Mapping[tuple[int, int], str]
-    settings: RefinementSettings
-
-
-def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
+def _build_problem(
+    legs: FittedLegs,
+    observed: Observed,
+    cameras: tuple[Camera, ...],  # of the views
+    n_poses: int,
+    images: Mapping[tuple[int, int], str],
+    settings: RefinementSettings,
+    choices: Choices,
+) -> FitProblem:
     """Build the problem of measurements with the unknowns and priors of choices."""
-    legs, observed, cameras, settings = given.legs, given.observed, given.cameras, given.settings
     outlines, boards = observed.outlines, observed.boards
-    parameters, kinematic = _kinematic(given, choices)
-    views_with_outlines_or_corners = np.concatenate(
-        [outlines.view, observed.edges.view, *(corners.view for corners in boards)]
-    )
-    observed_owners = {given.owners[v] for v in np.unique(views_with_outlines_or_corners).tolist()}
-    intrinsics, keys = _intrinsics(outlines.views, cameras, given.owners, observed_owners, choices)
+    parameters, kinematic = _kinematic(legs, outlines, settings, choices)
+    owners = shared_cameras(outlines.views, cameras)
+    shown = {owners[v] for v in observed.views.tolist()}
+    intrinsics, keys = _intrinsics(outlines.views, cameras, owners, shown, choices)
     camera_pose = fixed_at_start(len(cameras), 6)
     camera_pose[observed.views] = all_free(len(observed.views), 6)
     board_pose = fixed_at_start(len(boards), 6)
@@ -367,7 +354,7 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
-        eliminated=_poses(given.n_poses, legs.n_actuators),
+        eliminated=_poses(n_poses, legs.n_actuators),
         factors=(*observed.factors(keys), measured_lengths(legs.names, choices).factor()),
         constraint=LegConstraints(parameters),
         name="joint fit",
@@ -383,15 +370,22 @@ def _build_problem(given: _FitInputs, choices: Choices) -> FitProblem:
         first_cameras=cameras,
         first_board_scale=np.array([choices.values.get(board_scale(k), 1.0) for k in LINKS]),
         keys=keys,
-        images=given.images,
+        images=images,
         settings=settings,
     )
 
 
-def _kinematic(given: _FitInputs, choices: Choices) -> tuple[LegParameters, Variables]:
-    """Estimated kinematic parameters, and their block."""
-    legs, names = given.legs, given.legs.parametrization.names
-    arms = _arm_priors(legs, given.observed.outlines, choices, given.settings)
+def _kinematic(
+    legs: FittedLegs, outlines: ObservedOutlines, settings: RefinementSettings, choices: Choices
+) -> tuple[LegParameters, Variables]:
+    """Estimated kinematic parameters, and their block.
+
+    The lines of visible arms have default priors; parameters with a choice have none.
+    """
+    names, chosen = legs.parametrization.names, {*choices.fixed, *choices.free, *choices.priors}
+    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
+    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
+    arms = {name: sigma for name, sigma in sigmas.items() if name not in chosen}
     free = np.array(
         [not choices.holds(n, by_default=is_held_by_default(n) and n not in arms) for n in names],
         dtype=np.bool_,
@@ -420,19 +414,6 @@ def _kinematic(given: _FitInputs, choices: Choices) -> tuple[LegParameters, Vari
         prior=prior,
     )
     return parameters, block
-
-
-def _arm_priors(
-    legs: FittedLegs, outlines: ObservedOutlines, choices: Choices, settings: RefinementSettings
-) -> dict[str, float]:
-    """Default priors of the lines of visible arms, by parameter [rad, m].
-
-    Parameters with a choice have no default prior.
-    """
-    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
-    chosen = {*choices.fixed, *choices.free, *choices.priors}
-    sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
-    return {name: sigma for name, sigma in sigmas.items() if name not in chosen}
 
 
 def arm_sigmas(

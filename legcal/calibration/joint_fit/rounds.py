@@ -10,13 +10,13 @@ too small on average.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from legcal.calibration.joint_fit.determinacy import HeldDirections, held_at_nominal
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
 from legcal.calibration.joint_fit.outlier_readings import (
     reject_outlier_readings,
@@ -48,7 +48,7 @@ from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
 from legcal.data.measurements import few
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
-from legcal.estimation.problem import GaussianPrior, Residuals, linearize
+from legcal.estimation.problem import GaussianPrior, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
 from legcal.estimation.uncertainty import leverage, response, score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -118,19 +118,14 @@ class Fit:
 
 
 def first_minimum(
-    problem: FitProblem,
-    begin: State,
-    computed_rows: Mapping[str, Residuals] | None = None,
-    *,
-    must_converge: bool = True,
+    problem: FitProblem, begin: State, *, must_converge: bool = True
 ) -> Minimum[State]:
     """Solve with all observations and claimed covariances, regularised towards the nominal model.
 
     Steps along open directions are free and would not stop: axes of a translational 3-UPU end half
     a radian off, where other directions look determined. Nominal models are not wrong by a large
-    part of a leg. The returned cost and derivatives are without this prior. *computed_rows* are
-    rows of factors at *begin*, with claimed covariances. Without *must_converge*, the best state
-    is returned if the steps do not converge.
+    part of a leg. The returned cost and derivatives are without this prior. Without
+    *must_converge*, the best state is returned if the steps do not converge.
     """
     original, all_outlines = problem, np.ones(len(problem.outlines), dtype=np.bool_)
     is_rough = problem.legs.is_redundant
@@ -153,13 +148,11 @@ def first_minimum(
         max_iterations=problem.settings.max_iterations,
         tolerance=_INTERMEDIATE_TOLERANCE,
         relative_tolerance=_REJECTION_TOLERANCE,
-        computed_rows=computed_rows if chosen.all() and not is_rough else None,
         must_converge=must_converge,
     )
     determined = of_determined_poses(claimed, minimum.state, all_outlines)
     problem = original.weighted(NoiseModel(), determined)
-    same = bool(np.array_equal(determined, chosen)) and not is_rough
-    linear = linearize(problem, minimum.state, minimum.linear.rows if same else None)
+    linear = linearize(problem, minimum.state)
     cost = robust_cost(problem, linear, loss)
     if is_rough:  # one wrong reading would outweigh all else
         rough = with_inflated_reading_noise(problem)
@@ -167,10 +160,11 @@ def first_minimum(
     return Minimum(minimum.state, linear, cost, minimum.iterations)
 
 
-def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
+def fit_in_rounds(problem: FitProblem, first: Minimum[State], held: HeldDirections) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
-    *first* is the result of :func:`first_minimum`. Readings of redundant motors that contradict
+    *first* is the result of :func:`first_minimum`, where the directions to be held are open: with
+    them at nominal, there is another one. Readings of redundant motors that contradict
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
 
@@ -179,6 +173,10 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     DidNotConverge
         If a minimisation fails, most outlines are outliers, or the rounds do not converge.
     """
+    if len(held.basis):
+        problem, state = held_at_nominal(problem, first.state, held)
+        continued = first_minimum(problem, state)
+        first = replace(continued, iterations=first.iterations + continued.iterations)
     try:
         return _fit_in_rounds(problem, first)
     except DidNotConverge:
@@ -197,14 +195,10 @@ def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     all_weights = np.ones(len(problem.outlines))
     begin = Fit(problem, first, NoiseModel(), none, all_weights).with_edge_biases(none)
     fit, changes = _with_estimated_errors(_without_outliers(begin), possible, least)
-    computed_rows: Mapping[str, Residuals] | None = fit.minimum.linear.rows
     if fit.edge_biases.are_shown:
         scores = _scores_of_biases(fit, possible)
         fit = fit.with_edge_biases(expected_biases(possible, *scores, fit.edge_biases, least))
-        computed_rows = None
-    fit = replace(
-        fit, minimum=_minimise_near(fit.problem, fit.minimum, computed_rows=computed_rows)
-    )
+    fit = replace(fit, minimum=_minimise_near(fit.problem, fit.minimum))
     _refuse_disagreement(fit)
     return replace(
         fit,
@@ -389,10 +383,8 @@ def _with_edge_noise(fit: Fit) -> Fit:
     linear = fit.minimum.linear
     normal = information(fit.problem, fit.state, linear, fit.problem.loss)
     share = leverage(fit.problem, linear, normal, "edges")[:, 0, 0]
-    redundancy = max(1.0 - float(np.mean(share)), _MIN_REDUNDANCY)
     offsets = edges.rows(fit.problem.keys, fit.state).r[:, 0] / edges.sigma
-    variance = float(np.median(offsets**2)) / MEDIAN_OF_1 / redundancy
-    scale = max(float(np.sqrt(variance)), _MIN_SCALE)
+    scale = _scale_by_median(offsets**2, MEDIAN_OF_1, share)
     agrees = np.abs(offsets) <= settings.rejection * scale
     whitening = (agrees / (scale * edges.sigma))[:, None, None]
     factor = replace(fit.problem.factor("edges"), whitening=whitening)
@@ -439,20 +431,15 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
         if not len(board):
             continue
         rows, share = linear[board.name], leverage(problem, linear, normal, board.name)
-        redundancies = 1.0 - 0.5 * np.einsum("nqq->n", share)
         norms = rows.squared_norms
-        redundancy = max(float(np.mean(redundancies)), _MIN_REDUNDANCY)
-        variance = float(np.median(norms)) / MEDIAN_OF_2 / redundancy
-        scale = max(float(np.sqrt(variance)), _MIN_SCALE)
+        scale = _scale_by_median(norms, MEDIAN_OF_2, 0.5 * np.einsum("nqq->n", share))
         agrees = norms <= (scale * settings.rejection) ** 2
         judged = judged.with_corners(board.chosen(agrees, scale), board.keys(~agrees))
         rms = float(np.sqrt(np.mean((rows.r * board.sigma[:, None]) ** 2)))
         is_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
         on_base = board.link == "base"
-        rejected_of_board = [
-            pose for _, pose, _ in judged.rejected_corners if (pose < 0) == on_base
-        ]
-        if len(rejected_of_board) > int(agrees.sum()) or is_far:
+        n_rejected = sum((pose < 0) == on_base for _, pose, _ in judged.rejected_corners)
+        if n_rejected > int(agrees.sum()) or is_far:
             board_name = "" if board.link == "base" else f" on the {board.link}"
             raise DidNotConverge(
                 f"The joint fit ended with an error of {rms:.1f} px (rms) of the corners of the "
@@ -461,6 +448,15 @@ def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
                 "its dimensions, and the camera files."
             )
     return judged
+
+
+def _scale_by_median(squares: Array, of_unit: float, explained: Array) -> float:
+    """Return the factor on standard deviations by the median of squares, *of_unit* for right ones.
+
+    *explained* (n,) are the shares of the errors that the fit absorbs.
+    """
+    redundancy = max(1.0 - float(np.mean(explained)), _MIN_REDUNDANCY)
+    return max(float(np.sqrt(np.median(squares) / of_unit / redundancy)), _MIN_SCALE)
 
 
 def corner_notes(problem: FitProblem) -> tuple[str, ...]:
@@ -574,11 +570,9 @@ def rejection_reasons(
     # Every rejected outline, assigned to every edge.
     outline, edge = np.repeat(rejected, len(edges)), np.tile(np.arange(len(edges)), len(rejected))
     as_others = o.at(outline)
-    constants = as_others.constants.copy()
-    constants[:, 8] = np.tile(EPSILON, len(o.parts))[edge]
     legs = np.array([leg for leg, _ in o.parts], dtype=np.intp)
-    radius = part[edge]
-    as_others = replace(as_others, leg=legs[radius], radius=radius, constants=constants)
+    radius, epsilon = part[edge], np.tile(EPSILON, len(o.parts))[edge]
+    as_others = replace(as_others, leg=legs[radius], radius=radius, epsilon=epsilon)
     distances_to_edges = np.abs(as_others.offsets(problem.keys, state)).max(axis=1, initial=0.0)
     for i, distances in enumerate(distances_to_edges.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))

@@ -29,8 +29,7 @@ from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegColumns, ParameterId
-from legcal.vision.board import LINKS
+from legcal.machine.leg import LINKS, LegColumns, ParameterId
 
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
 ALL_READINGS = "an error that all readings share, by one standard deviation of pitches"

@@ -18,7 +18,7 @@ from legcal.calibration.joint_fit.diagnostics import (
     reversed_motors,
 )
 from legcal.calibration.joint_fit.free_poses import of_determined_poses
-from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.held_out import Posterior, rms
 from legcal.calibration.joint_fit.outlier_readings import (
     JudgedReadings,
     judged_readings,
@@ -52,12 +52,12 @@ from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import (
     KinematicParameters,
     Leg,
+    Link,
     parameters_of_legs,
     radius_name,
     with_platform_points,
 )
 from legcal.machine.parameters import Parametrization, geometries, parametrize, vector_of
-from legcal.vision.board import Link
 from legcal.vision.camera import Camera
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
@@ -311,11 +311,11 @@ def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> Goodness
         cost=robust_cost(claimed, linearize(claimed, state), claimed.loss),
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
         dof=n_residuals - problem.n_unknowns + n_held,
-        rms_px=_rms(used),
+        rms_px=rms(used),
         rms_corners_px={
-            corners.link: rms
+            corners.link: rms_px
             for corners in problem.boards
-            if (rms := _rms(linear[corners.name].r * corners.sigma[:, None])) is not None
+            if (rms_px := rms(linear[corners.name].r * corners.sigma[:, None])) is not None
         },
         noise=fit.noise,
         shared_px=fit.shared_px,
@@ -409,11 +409,6 @@ def _kinematic(
         held_basis,
         held.directions,
     )
-
-
-def _rms(values: Array) -> float | None:
-    """Root mean square of values; None without any."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
 def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:

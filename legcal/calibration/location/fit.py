@@ -11,10 +11,10 @@ wrong row never decides about another.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, fdtrc
 
@@ -81,7 +81,9 @@ class FrameFit:
     @property
     def frame_design(self) -> Array:
         """The columns of the frames, errors of the model eliminated, (m, 12)."""
-        return frame_design(self.design)
+        F, E = self.design[:, :N_STEP], self.design[:, N_STEP:]
+        Q, _ = np.linalg.qr(E)
+        return np.asarray(F - Q @ (Q.T @ F))
 
     @property
     def information(self) -> Array:
@@ -118,9 +120,7 @@ def fit_at(
     pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None = None
 ) -> FrameFit:
     """Return the fit at frames and noise that have converged."""
-    y, A = _whitened(
-        *_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented)
-    )  # residuals at errors of the model of zero
+    y, A = _whitened(pairs, frames, noise, motions)  # at errors of the model of zero
     remaining = y - A @ np.linalg.lstsq(A, y, rcond=RANK_TOLERANCE)[0]
     _, dof = _variances(pairs, frames, replace(noise, stated=(True, True)), motions)
     s = np.linalg.svd(A, compute_uv=False)
@@ -144,34 +144,42 @@ class _State:
     tool: Frames
     errors: Array
 
+    @property
+    def frames(self) -> Array:
+        """The frames (2, 3, 4)."""
+        return frames_from(self.base.R[0], self.base.t[0], self.tool.R[0], self.tool.t[0])
+
 
 def _most_likely(
     pairs: PosePairs,
     frames: Array,
     noise: PoseNoise,
     motions: Array | None,
-    fixed: Array | None = None,  # (12, k): held directions in units of ``pairs.scale``
+    held: Array | None = None,  # (12, k): directions without a step, in units of ``pairs.scale``
 ) -> Array:
     """Return the least-squares frames at given variances; undetermined directions stay."""
-    n = len(pairs)
-    k = 0 if motions is None else motions.shape[-1]
-
-    def frames_in(state: _State) -> Array:
-        return frames_from(state.base.R[0], state.base.t[0], state.tool.R[0], state.tool.t[0])
 
     def rows_of(state: _State) -> Residuals:
-        current = frames_in(state)
-        J = jacobian(current, pairs)
-        by_model = np.zeros((n, 6, 0)) if motions is None else tool_motions(motions, current, pairs)
-        blocks = J[..., :6][..., _TURN_FIRST], J[..., 6:][..., _TURN_FIRST], by_model
-        r = by_model @ state.errors - residuals(current, pairs)
+        by_step, by_model = _derivatives(pairs, state.frames, motions)
+        blocks = by_step[..., :6][..., _TURN_FIRST], by_step[..., 6:][..., _TURN_FIRST], by_model
+        r = by_model @ state.errors - residuals(state.frames, pairs)
         return Residuals.of(r, np.concatenate(blocks, axis=-1))
 
-    first, all_elements = np.zeros(n, dtype=np.intp), slice(None)
-    errors = np.arange(k, dtype=np.intp)
-    held = np.zeros((0, N_STEP))
-    if fixed is not None:
-        held = (fixed / pairs.scale[:, None]).T.reshape(-1, 2, 6)[..., _TURN_FIRST]
+    n, k = len(pairs), 0 if motions is None else motions.shape[-1]
+    first, errors, everything = np.zeros(n, dtype=np.intp), np.arange(k), slice(None)
+    none = np.zeros((N_STEP, 0)) if held is None else held / pairs.scale[:, None]
+    poses = Factor(
+        "poses",
+        rows_of,
+        (
+            ("base", first, everything),
+            ("tool", first, everything),
+            ("errors", np.tile(errors, (n, 1)), everything),
+        ),
+        n,
+        6,
+        whitening=noise.weights(pairs.oriented)[..., None] * np.eye(6),
+    )
     problem = EstimationProblem[_State](
         variables=(
             Variables("base", all_free(1, 6), Frames.moved, max_step=_MAX_STEP),
@@ -181,26 +189,13 @@ def _most_likely(
             ),
         ),
         eliminated=None,
-        factors=(
-            Factor(
-                "poses",
-                rows_of,
-                (
-                    ("base", first, all_elements),
-                    ("tool", first, all_elements),
-                    ("errors", np.tile(errors, (n, 1)), all_elements),
-                ),
-                n,
-                6,
-                whitening=noise.whitening(pairs.oriented),
-            ),
-        ),
-        held_directions=held.reshape(-1, N_STEP),
+        factors=(poses,),
+        held_directions=none.T.reshape(-1, 2, 6)[..., _TURN_FIRST].reshape(-1, N_STEP),
         name="fit of the frames",
         remedy="check that readings and poses belong together",
     )
     base, tool = (Frames(F[None, :, :3], F[None, :, 3]) for F in frames)
-    return frames_in(minimise(problem, _State(base, tool, np.zeros(k))).state)
+    return minimise(problem, _State(base, tool, np.zeros(k))).state.frames
 
 
 def _variances(
@@ -212,83 +207,48 @@ def _variances(
     satisfies y^T P D P y = tr(P D): v is multiplied by the ratio of both sides until it is one.
     Stated sigmas stay.
     """
-    sigma, dof, n = noise.sigma, np.zeros(2), len(pairs)
-    raw = _unweighted(pairs, frames, motions)
+    n = len(pairs)
     for _ in range(_MAX_REML_ITERATIONS):
-        W = replace(noise, sigma=sigma).whitening(pairs.oriented)
-        y, A = _whitened(*raw, W)
+        sigma = noise.sigma
+        y, A = _whitened(pairs, frames, noise, motions)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * s[0]]
-        remaining = (y - U @ (U.T @ y))[: 6 * n].reshape(n, 6)
-        W_T = np.swapaxes(W, 1, 2)
-        Py = (W_T @ remaining[:, :, None])[:, :, 0]
-        spread = W_T @ U[: 6 * n].reshape(n, 6, -1)
-        diagonal = (W**2).sum(axis=1) - (spread**2).sum(axis=2)
-        squares = (Py**2).reshape(-1, 2, 3).sum(axis=(0, 2))
-        traces = diagonal.reshape(-1, 2, 3).sum(axis=(0, 2))
+        w, remaining = noise.weights(pairs.oriented), (y - U @ (U.T @ y))[: 6 * n].reshape(n, 6)
+        left = 1.0 - np.sum(U[: 6 * n] ** 2, axis=1).reshape(n, 6)
+        squares, traces = (
+            (w**2 * of_rows).reshape(n, 2, 3).sum(axis=(0, 2)) for of_rows in (remaining**2, left)
+        )
         dof = sigma**2 * traces
         ratio = np.sqrt(squares / np.maximum(traces, 1e-300))
         ratio[list(noise.stated)] = 1.0
         ratio[dof < 1e-6] = 1.0
-        after = np.maximum(sigma * ratio, np.where(noise.stated, sigma, MIN_SIGMA))
-        converged = bool(np.abs(after / sigma - 1.0).max() < 0.1 * _SIGMA_TOLERANCE)
-        sigma = after
-        if converged:
+        least = np.where(noise.stated, sigma, MIN_SIGMA)
+        noise = replace(noise, sigma=np.maximum(sigma * ratio, least))
+        if np.abs(noise.sigma / sigma - 1.0).max() < 0.1 * _SIGMA_TOLERANCE:
             break
-    return sigma, dof
+    return noise.sigma, dof
 
 
-def frame_design(design: Array) -> Array:
-    """Return the columns (m, 12) of the frames, projected off the errors of the model."""
-    F, E = design[:, :N_STEP], design[:, N_STEP:]
-    if E.shape[1] == 0:
-        return F
-    Q, _ = np.linalg.qr(E)
-    return np.asarray(F - Q @ (Q.T @ F))
-
-
-def _unweighted(pairs: PosePairs, frames: Array, motions: Array | None) -> tuple[Array, Array]:
-    """Return residuals (n, 6) and their design (n, 6, 12 + k)."""
-    design = jacobian(frames, pairs) * pairs.scale
+def _derivatives(pairs: PosePairs, frames: Array, motions: Array | None) -> tuple[Array, Array]:
+    """Return derivatives of the poses by a step (n, 6, 12) and by errors of the model (n, 6, k)."""
+    by_model = np.zeros((len(pairs), 6, 0))
     if motions is not None:
-        design = np.concatenate([design, tool_motions(motions, frames, pairs)], axis=2)
-    return residuals(frames, pairs), design
+        by_model = tool_motions(motions, frames, pairs)
+    return jacobian(frames, pairs), by_model
 
 
-def _whitened(r: Array, design: Array, W: Array) -> tuple[Array, Array]:
-    """Return residuals and design in standard deviations, with the priors below."""
-    y, A = (W @ r[:, :, None]).ravel(), (W @ design).reshape(r.size, -1)
-    k = A.shape[1] - N_STEP
-    if k == 0:
-        return y, A
-    priors = np.hstack([np.zeros((k, N_STEP)), np.eye(k)])
-    return np.concatenate([y, np.zeros(k)]), np.vstack([A, priors])
+def _whitened(
+    pairs: PosePairs, frames: Array, noise: PoseNoise, motions: Array | None
+) -> tuple[Array, Array]:
+    """Return residuals (6n + k,) and design (6n + k, 12 + k) in standard deviations.
 
-
-def hold_tool(
-    measurements: ToolMeasurements,
-    frame_fit: FrameFit,
-    open_at: Callable[[Array], Array],  # returns the undetermined directions (12, k) at frames
-    tool_position: Array,  # (3,): position of the tool in the platform [m]
-) -> FrameFit:
-    """Return the most likely frames with the tool held at a given position.
-
-    Along undetermined directions the tool is moved as near to the given position, and to the axes
-    of the platform, as possible; all other directions stay most likely.
+    The priors of the k errors of the model stand below.
     """
-    pairs, frames = measurements.pairs, frame_fit.frames
-    for _ in range(_MAX_HOLD_ROUNDS):
-        basis = open_at(frames)
-        turn = Rotation.from_matrix(frames[1, :, :3]).inv().as_rotvec()
-        offset = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
-        slide = basis @ np.linalg.lstsq(basis[6:], offset, rcond=None)[0]
-        size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
-        frames = frames_after(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
-        of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
-        frames = _most_likely(pairs, frames, frame_fit.noise, measurements.by_model, of_tool)
-        if np.abs(slide).max() < _HOLD_TOLERANCE:
-            break
-    return fit_at(pairs, frames, frame_fit.noise, measurements.by_model)
+    by_step, by_model = _derivatives(pairs, frames, motions)
+    w, k = noise.weights(pairs.oriented), by_model.shape[2]
+    design = w[..., None] * np.concatenate([by_step * pairs.scale, by_model], axis=2)
+    y = np.append(w * residuals(frames, pairs), np.zeros(k))
+    return y, np.vstack([design.reshape(-1, N_STEP + k), np.eye(k, N_STEP + k, N_STEP)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,7 +371,7 @@ def determine(
     if basis.shape[1]:
         _check_machine(measurements, fit, basis, name)
         fit = hold_open_part(measurements, fit, tool_position)
-        basis = _open_at(measurements, fit, basis.shape[1], fit.frames)
+        basis = _least_determined(measurements, fit, basis.shape[1])
         parts = _open_parts(basis, fit.frames)
         words = _held_words(parts, tool_position)
     scale = pairs.scale
@@ -421,13 +381,27 @@ def determine(
 
 
 def hold_open_part(measurements: ToolMeasurements, fit: FrameFit, tool_position: Array) -> FrameFit:
-    """Return the fit moved along its undetermined directions until the tool is at its position."""
+    """Return the most likely frames with the tool (3,) held where nothing determines it.
+
+    Along undetermined directions the tool is moved as near to the given position, and to the axes
+    of the platform, as possible; all other directions stay most likely.
+    """
     k = _open_directions(fit.frame_design, oriented=measurements.is_oriented).shape[1]
-    if k == 0:
-        return fit
-    return hold_tool(
-        measurements, fit, lambda frames: _open_at(measurements, fit, k, frames), tool_position
-    )
+    pairs, by_model = measurements.pairs, measurements.by_model
+    for _ in range(_MAX_HOLD_ROUNDS if k else 0):
+        basis = _least_determined(measurements, fit, k)
+        turn = Rotation.from_matrix(fit.frames[1, :, :3]).inv().as_rotvec()
+        offset = np.concatenate([(tool_position - fit.frames[1, :, 3]) / pairs.length, turn])
+        slide = basis @ np.linalg.lstsq(basis[6:], offset, rcond=None)[0]
+        size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
+        step = slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale
+        of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
+        frames = frames_after(fit.frames, step)
+        frames = _most_likely(pairs, frames, fit.noise, by_model, of_tool)
+        fit = fit_at(pairs, frames, fit.noise, by_model)
+        if np.abs(slide).max() < _HOLD_TOLERANCE:
+            break
+    return fit
 
 
 def _open_directions(
@@ -439,7 +413,8 @@ def _open_directions(
     oriented: bool,
 ) -> Array:
     """Return an orthonormal basis (12, k) of the undetermined directions of a design."""
-    return _unseen(design, oriented, lambda s: (s < RANK_TOLERANCE * s[0]) | (s * _MAX_SIGMA < 1.0))
+    s, V = _directions(design, oriented)
+    return V[:, (s < RANK_TOLERANCE * s[0]) | (s * _MAX_SIGMA < 1.0)]
 
 
 def _shown_elsewhere(
@@ -451,20 +426,23 @@ def _shown_elsewhere(
     oriented: bool,
 ) -> Array:
     """Return the undetermined directions (12, k) that other poses of the machine determine."""
-    undetermined = _unseen(jacobian, oriented, lambda s: s < _MACHINE_TOLERANCE * s[0])
+    s, V = _directions(jacobian, oriented)
+    undetermined = V[:, s < _MACHINE_TOLERANCE * s[0]]
     U, s, _ = np.linalg.svd(basis - undetermined @ (undetermined.T @ basis), full_matrices=False)
     return np.asarray(U[:, s > 0.5])
 
 
-def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]) -> Array:
-    """Return the right singular vectors (12, k) whose singular values are too small."""
-    n = 12 if oriented else 9
+def _least_determined(measurements: ToolMeasurements, fit: FrameFit, k: int) -> Array:
+    """Return the k least determined directions (12, k) of a fit."""
+    V = _directions(fit.frame_design, measurements.is_oriented)[1]
+    return V[:, V.shape[1] - k :]
+
+
+def _directions(design: Array, oriented: bool) -> tuple[Array, Array]:
+    """Return singular values (n,), the largest first, and singular vectors (12, n) of a design."""
+    n = N_STEP if oriented else 9
     _, s, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
-    s = np.concatenate([s, np.zeros(n - len(s))])
-    small = is_open(s)
-    basis = np.zeros((12, int(small.sum())))
-    basis[:n] = Vt[small].T
-    return basis
+    return np.append(s, np.zeros(n - len(s))), np.pad(Vt.T, ((0, N_STEP - n), (0, 0)))
 
 
 def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
@@ -479,17 +457,6 @@ def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
         if directions:
             parts.append(OpenPart(frame=frame, kind=kind, directions=directions))
     return parts
-
-
-def _open_at(measurements: ToolMeasurements, fit: FrameFit, k: int, frames: Array) -> Array:
-    """Return the k least determined directions (12, k) at given frames."""
-    n = 12 if measurements.is_oriented else 9
-    raw = _unweighted(measurements.pairs, frames, measurements.by_model)
-    design = frame_design(_whitened(*raw, fit.noise.whitening(measurements.pairs.oriented))[1])
-    _, _, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
-    basis = np.zeros((12, k))
-    basis[:n] = Vt[n - k :].T
-    return basis
 
 
 def _workspace(measurements: ToolMeasurements) -> PosePairs:
@@ -549,22 +516,14 @@ def _held_words(parts: list[OpenPart], tool_position: Array) -> str:
     )
 
 
-def _kept_directions(basis: Array) -> Array:
-    """Return a basis (12, 12 - k) of the steps that leave the held part of the tool at rest."""
-    held = basis.copy()
-    held[:6] = 0.0
-    U, s, _ = np.linalg.svd(held, full_matrices=True)
-    return np.asarray(U[:, int(np.sum(s > 0.0)) :])
-
-
 def _covariance_with(
     information: Array,  # (12, 12): inverse covariance of a step in the same units
     basis: Array,  # (12, k): undetermined directions
     *,
     oriented: bool,  # whether the orientation of the tool is known; else its rows are zero
 ) -> Array:
-    """Return the covariance (12, 12) of a step; zero along held directions."""
-    Z = _kept_directions(basis) if basis.shape[1] else np.eye(N_STEP)
+    """Return the covariance (12, 12) of a step; zero along the held directions of the tool."""
+    Z = null_space(np.vstack([np.zeros_like(basis[:6]), basis[6:]]).T)
     if not oriented:
         U, s, _ = np.linalg.svd(Z[:9], full_matrices=False)
         Z = np.zeros((N_STEP, int(np.sum(s > _RESOLVED))))

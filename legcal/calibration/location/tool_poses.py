@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.brief import brief
+from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.calibration.location.frames import PosePairs
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
@@ -43,7 +44,6 @@ from legcal.files.table import (
 )
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.equations import pose_sensitivity
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.kinematics import forward_kinematics_many, platforms_in_base
 from legcal.machine.model import Machine
@@ -227,11 +227,11 @@ class PoseNoise:
     # whether each was stated; otherwise it is estimated
     stated: tuple[bool, bool]
 
-    def whitening(self, oriented: BoolArray) -> Array:
-        """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero if not measured."""
-        W = np.tile(np.diag(np.repeat(1.0 / self.sigma, 3)), (len(oriented), 1, 1))
-        W[~oriented, 3:] = 0.0
-        return W
+    def weights(self, oriented: BoolArray) -> Array:
+        """Return the inverse standard deviations (n, 6); zero for what was not measured."""
+        weights = np.tile(np.repeat(1.0 / self.sigma, 3), (len(oriented), 1))
+        weights[~oriented, 3:] = 0.0
+        return weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,19 +342,17 @@ def _motions_by_model(machine: Machine, poses: Sequence[RigidTransform]) -> Arra
             [f"The covariance of the model could not be used: {p}" for p in error.problems]
         ) from error
     parametrization = parametrization_of(machine, twists=True)
-    R, t = _joint_frames(machine, poses)
-    by_parameters = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, R, t)
+    by_parameters = platform_by_parameters(
+        geometries(machine),
+        parametrization,
+        machine.frame_legs,
+        platforms_in_base(machine, poses),
+    )
     values, vectors = np.linalg.eigh(result.covariance)
     significant = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
     root = vectors[:, significant] * np.sqrt(values[significant])
     columns = [parametrization.names.index(name) for name in result.names]
     return _of_link(machine, poses, by_parameters[:, :, columns] @ root)
-
-
-def _joint_frames(machine: Machine, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
-    """Return rotations and positions of R_e in R_b."""
-    matrices = np.array([T.as_matrix() for T in platforms_in_base(machine, poses)])
-    return matrices[:, :3, :3], matrices[:, :3, 3]
 
 
 def _of_link(machine: Machine, poses: Sequence[RigidTransform], moved: Array) -> Array:
