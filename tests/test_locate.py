@@ -119,6 +119,16 @@ def test_positions_alone_find_all_but_the_orientation_of_the_tool() -> None:
     assert np.all(found.covariance[9:] == 0.0)
 
 
+def test_mirrored_poses_of_a_planar_machine_turn_its_base_over_and_a_note_says_so() -> None:
+    right = unoriented(made("3-rpr", 8).poses)
+    mirrored = replace(right, position=right.position * [-1.0, 1.0, 1.0])
+    says = [
+        any("mirrored" in note and "upside down" in note for note in found.notes)
+        for found in (locate(shipped("3-rpr"), poses) for poses in (right, mirrored))
+    ]
+    assert sorted(says) == [False, True]
+
+
 def test_exact_poses_give_exact_frames_where_the_open_part_is_fixed_at_its_truth() -> None:
     """A machine that only translates: held parts have no variance."""
     exact, fixed = made("3-upu", 8, 0.0), [6, 7, 8]

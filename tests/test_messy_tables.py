@@ -104,6 +104,35 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
              "Max. length (mm),Tube OD (mm),Rod dia. (mm)", "380", "500", "28", "16", leg="{}"),
         (14, 8)),
     "no headings": (points("", "Boden{}", "Plattform{}"), ()),
+    "typeset minus, inch of a diameter sign": (
+        wide("Bein;" + SIX.format("Boden", "Plattform") + ";Durchmesser", "Ø 20 mm", leg="{}")
+        .replace("-", "−"), (10, 10)),
+    "bars": (
+        "\n".join(
+            f"| {' | '.join(row.split(';'))} |".replace(",", ".")
+            for row in wide("Leg;" + SIX.format("Base", "Top") + "\n" + ";".join(["---"] * 7),
+                            leg="{}").splitlines()), ()),
+    "a column for each leg": (
+        "\n".join(map(";".join, zip(*(
+            row.split(";") for row in wide("Bein;" + SIX.format("Boden", "Plattform"),
+                                           leg="Bein {}").splitlines()), strict=True))), ()),
+    "one block below the other": (
+        "".join(f"{side}\nNr.;X [mm];Y [mm];Z [mm]\n" + "".join(
+            f"{j};{x:g};{y:g};0\n" for j, (x, y) in enumerate(joints, 1)) + "\n"
+                for side, joints in (("Boden", BASE), ("Plattform", PLATFORM))), ()),
+    "retracted and extended": (
+        wide("No.,Lower ball X mm,Lower ball Y mm,Lower ball Z mm,Upper ball X mm,Upper ball Y mm,"
+             "Upper ball Z mm,Retracted length mm,Extended length mm", "380", "500", leg="{}"), ()),
+    "capitals, empty columns": (
+        wide("LEG;BASE_X_MM;BASE_Y_MM;BASE_Z_MM;TOP_X_MM;TOP_Y_MM;TOP_Z_MM;;", "", "", leg="L{}"),
+        ()),
+    "unit in a remark": (
+        "# Hexapod, all in mm\n"
+        + wide("i;Ax;Ay;Az;Bx;By;Bz;Länge eingefahren;Länge ausgefahren", "380", "500", leg="{}"),
+        ()),
+    "axis first": (
+        wide("Jambe,X base,Y base,Z base,X plate-forme,Y plate-forme,Z plate-forme", leg="J{}"),
+        ()),
     "letters": (wide("bx,by,bz,px,py,pz"), ()),
     "one row": (one_row("B", "P"), ()),
     "platform first": ("\n".join([POINTS, *B_AND_P.splitlines()[:0:-1]]), ()),

@@ -356,6 +356,22 @@ def _downloaded(path: Path) -> list[dict[str, str]]:
     return _rows(path.read_text("utf-8"))
 
 
+def test_a_photograph_fills_the_editor_on_a_telephone(
+    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+) -> None:
+    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+    try:
+        editor = Editor(browser, detection[0].parent / "found" / "index.html", tmp_path)
+        editor.open(0)
+        stage = editor.find(".stage").size
+        editor.close()
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert stage["width"] > 300
+    assert stage["height"] > 200
+
+
 def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:

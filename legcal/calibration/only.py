@@ -9,11 +9,13 @@ what the posterior means of all else do to it. The predicted error contains what
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import Doubt, MotorZero
 from legcal.calibration.doubts import MOST_MOVED, TOLERANCE
@@ -143,6 +145,23 @@ class GroupEstimate:
         return found
 
 
+def joint_error(machine: Machine, tolerance: Tolerance) -> float:
+    """Return how far joints may be from where the model has them, of the mean leg length.
+
+    One standard deviation, of machines with these tolerances over their workspace; infinite where
+    readings do not determine the pose.
+    """
+    fitted = fitted_legs(machine)
+    legs = in_joint_frames(fitted.nominal, machine.frame_legs)
+    poses = workspace_poses(machine, legs) if machine.is_determined else None
+    if poses is None:
+        return math.inf
+    errors = part_errors(fitted, tolerance)
+    of_parts = _platform_by_parts(machine, legs, errors.J, poses) * errors.sigma
+    moved = float(np.sqrt(np.sum(of_parts**2, axis=1).mean()))
+    return math.hypot(moved, tolerance.joints or 0.0) / machine.size
+
+
 def likely_teeth(
     machine: Machine, solution: Solution, built: Tolerance, wide: Tolerance, step: float
 ) -> list[tuple[float, dict[str, float]]]:
@@ -246,12 +265,19 @@ def _serving_platform(
     poses = workspace_poses(machine, legs) if machine.is_determined else None
     if poses is None:
         return more
+    G = _platform_by_parts(machine, legs, J, poses)
+    more[chosen] = np.linalg.lstsq(G[:, chosen], G @ others, rcond=_WELL)[0]
+    return more
+
+
+def _platform_by_parts(
+    machine: Machine, legs: tuple[Leg, ...], J: Array, poses: Sequence[RigidTransform]
+) -> Array:
+    """Return motions of the platform (n, m) [m] by errors of parts; rotations as joints move."""
     parametrization = parametrization_of(machine, twists=True)
     G = platform_by_parameters(legs, parametrization, machine.frame_legs, poses) @ J
     arm = 0.5 * float(np.linalg.norm(np.ptp(machine.B_platform, axis=0)))
-    G = (G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, len(others))
-    more[chosen] = np.linalg.lstsq(G[:, chosen], G @ others, rcond=_WELL)[0]
-    return more
+    return np.asarray((G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, J.shape[1]))
 
 
 def _with_group(

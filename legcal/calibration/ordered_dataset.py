@@ -6,6 +6,7 @@ never reordered later. A job restores the order of the files at its end.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -74,6 +75,7 @@ class OrderedDataset:
     seen_poses: Mapping[int, RigidTransform] = field(default_factory=dict)
     # edge pairs of searched images, by row among all images
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
+    joint_error: float = math.inf  # of joints of the model where stated, of the mean leg length
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -92,6 +94,7 @@ class OrderedDataset:
             keep=self.order.reorder(self.plan.keep),
             edge_pairs=self.edge_pairs,
             clicked_poses=self._clicked_poses(),
+            joint_error=self.joint_error,
         )
 
     @property

@@ -53,7 +53,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.only import RARE, estimate_group, likely_teeth
+from legcal.calibration.only import RARE, estimate_group, joint_error, likely_teeth
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -263,18 +263,21 @@ def estimate_teeth(
     With tolerances as priors, and a spline that the model states. A first estimate leaves the zeros
     open by a tooth and says which horns may be on others. Each of these is fitted with readings
     corrected, so that zeros have their tolerance as prior about there, and the likeliest wins;
-    images are searched again. If the first finds no legs, motors are tried a tooth further and
-    back, those first with which images agree best.
+    images are searched again. If the first finds no legs in many images, motors are tried a tooth
+    further and back, those first with which images agree best, and most outlines win.
 
     Return also by how much motors stand further than they read [rad].
     """
     machine, built = data.machine, options.choices.built
+    if built is not None:  # legs are where the model has them, as well as it is built
+        data = replace(data, joint_error=joint_error(machine, built))
     if built is None or machine.spline_teeth is None:
         return estimate_parameters(data, file_rows, options), {}
     step = 2.0 * np.pi / machine.spline_teeth
     wide = replace(built, angles_at_zero=max(step, built.angles_at_zero or 0.0))
     first = replace(options, choices=replace(options.choices, built=wide))
     failure: LegcalError | None = None
+    best: tuple[int, Estimate, dict[str, float], bool] | None = None
     for guess in _guesses(data, step):
         try:
             near = estimate_parameters(data.turned(guess), file_rows, first)
@@ -300,11 +303,19 @@ def estimate_teeth(
         if not fits:
             continue
         _, turned, fit = min(fits, key=lambda one: one[0])
-        if turned != guess and len(data.photographs.detect):
-            return estimate_parameters(data.turned(turned), file_rows, options), turned
-        return replace(near, fitted=fit.fitted, solution=fit.solution, steps=fit.steps), turned
-    assert failure is not None
-    raise failure
+        o = fit.solution.outlines
+        if best is None or o.used.sum() > best[0]:
+            found = replace(near, fitted=fit.fitted, solution=fit.solution, steps=fit.steps)
+            best = int(o.used.sum()), found, turned, turned != guess
+        if len(np.unique(o.row[o.used])) >= (1.0 - MAX_LEFT_OUT) * len(file_rows):
+            break
+    if best is None:
+        assert failure is not None
+        raise failure
+    _, found, turned, is_elsewhere = best
+    if is_elsewhere and len(data.photographs.detect):
+        return estimate_parameters(data.turned(turned), file_rows, options), turned
+    return found, turned
 
 
 def _guesses(data: OrderedDataset, step: float) -> Iterator[dict[str, float]]:

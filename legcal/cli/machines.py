@@ -88,8 +88,6 @@ def new(
     as_json: JsonOption = False,
 ) -> None:
     """Write a model, YAML and URDF, from a table of joints, a firmware or a few dimensions."""
-    from rich.text import Text
-
     from legcal.descriptions.new_model import (
         Dimensions,
         create_model,
@@ -151,7 +149,7 @@ def new(
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report([Text(printable(line), overflow="ignore") for line in ("", *lines)]),
+        lambda: report(list(map(printable, lines))),
     )
 
 

@@ -809,6 +809,7 @@ _DIAMETERS = {"diameter": "radius", "tube diameter": "tube", "rod diameter": "ro
 _NOT_LENGTHS = ("deg", "-")  # units of other columns
 _LETTERS = ("a", "b", "p", "t")  # of sides, as in A1
 _XYZ = ("x", "y", "z")
+_REMARK = re.compile(rf"\b(?:in|en) ({'|'.join(LENGTH)})\b")
 _RADII = ("radius", "tube", "rod")
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
@@ -931,8 +932,12 @@ def _shared(table: Table, name: str) -> str | None:
 
 
 def _unit(table: Table, given: str | None) -> str:
-    """Return the unit of the column, or the given one."""
+    """Return the unit of the column, the given one, or that of a remark (``all in mm``)."""
     stated = _shared(table, "unit") or given
+    if stated is None:
+        text = content_of(table.path, FILE_KIND).decode("utf-8", errors="replace")
+        remarked = set(_REMARK.findall(text))
+        stated = remarked.pop() if len(remarked) == 1 else None
     if stated is None:
         raise DatasetError(
             f"{table.path}: the lengths could not be read: found no unit, needed one of "
@@ -947,7 +952,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     ``names`` are the names of the columns. Unknown headings stay, in lower case, and a column
     ``unit`` is added if headings of joints state one.
     """
-    lines = _with_headings(lines, path)
+    lines = _with_headings(_upright(lines), path)
     number, header = lines[0]
     units = [split_heading(text, others=True)[1] for text in header]
     of_lengths = [
@@ -984,6 +989,18 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
         lines = [(number, header), *lines[1:]]
     stated = {"unit": of_lengths[0] if of_lengths else "", "platform_in": "base" if at_home else ""}
     return _of_legs(lines, stated)
+
+
+def _upright(lines: Lines) -> Lines:
+    """Return a table with a column for each leg as one with a row for each leg."""
+    first = [cells[0] for _, cells in lines[1:]]
+    if not first or len({len(cells) for _, cells in lines}) > 1:
+        return lines
+    places = [_place(text) for text in first]
+    if {place[2] for place in places if place} != {*_XYZ} or any(map(_place, lines[0][1][1:])):
+        return lines
+    turned = zip(*(cells for _, cells in lines), strict=True)
+    return [(lines[0][0], [text or "leg" for text in cells]) for cells in turned]
 
 
 def _column(text: str, names: Sequence[str]) -> str:

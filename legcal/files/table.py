@@ -47,6 +47,8 @@ _WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)\s*({'|'.join(_UNITS_BELOW)})", re.AS
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
+_RULE = re.compile(r"[:-]*-{3}[:-]*")
+_MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–-]?)(\d[^\"″]*)([\"″]?)")
 _BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
 
@@ -268,11 +270,12 @@ def read_table(
     """Return a CSV file as a table, with the problems of its cells still to be raised.
 
     ``reshape`` converts free-form tables into the declared columns; such tables may be separated by
-    semicolons or tabs, with decimal commas, below comments and a title, above a row of units.
+    semicolons, tabs or bars, with decimal commas, below comments and a title, above a row of units.
     """
     lines = _read_lines(path, noun, loose=reshape is not None)
-    if reshape is not None and (lines := _with_units(_without_title(lines))):
-        lines = reshape(lines)
+    if reshape is not None:
+        lines = _with_units(_without_title(_one_block(_without_empty(lines))))
+        lines = reshape(lines) if lines else lines
     if needed and len(lines) < 2:
         actual = f"{'a' if lines else 'no'} header and no row"
         raise DatasetError(
@@ -376,20 +379,22 @@ WORDS: dict[str, str] = {
     "platform": "platform plat top moving mobile upper effector plattform oben beweglich nacelle "
     "plateforme plateau haut superieur",
     "joint": "joint joints point points pt gelenk gelenke gelenkpunkt punkt kugelgelenk kardan "
-    "articulation rotule liaison centre center mitte",
+    "ball balls kugel hinge pivot anchor articulation rotule liaison centre center mitte",
     "leg": "leg legs strut struts cylinder cylinders actuator limb axis drive motor bein strebe "
     "stab zylinder aktuator aktor antrieb achse spindel jambe verin axe actionneur moteur",
     "rail": "rail tower carriage column slide slider turm schiene saule schlitten wagen colonne "
     "chariot glissiere",
     "home": "home grundstellung ruhelage nullstellung referenzlage repos",
     "name": "name label id bezeichnung nom designation",
-    "number": "number nr no num nummer numero #",
+    "number": "number nr no num nummer numero index i #",
     "side": "side seite cote",
     "type": "type typ",
     "unit": "unit units einheit einheiten unite",
     "length": "length len lengths l lange langen laenge longueur",
-    "min": "min minimum minimal minimale lowest low kleinste mini",
-    "max": "max maximum maximal maximale highest high grosste maxi",
+    "min": "min minimum minimal minimale lowest low kleinste mini retracted "
+    "eingefahren rentre rentree",
+    "max": "max maximum maximal maximale highest high grosste maxi extended ausgefahren "
+    "sorti sortie",
     "short": "shortest kurzeste kuerzeste",
     "long": "longest langste laengste",
     "reading": "reading readings q travel lesung wert lecture",
@@ -456,7 +461,8 @@ def _folded(text: str) -> str:
 @cache
 def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
     """Return the pattern of headings that end with one of some units."""
-    unit_pattern = "|".join([*map(re.escape, units), "µm", "μm"])
+    large = [unit.upper() for unit in units if len(unit) > 1]
+    unit_pattern = "|".join([*map(re.escape, (*units, *large)), "µm", "μm"])
     return re.compile(rf"(.*?)(?:\s*[\[(]\s*({unit_pattern})\s*[\])]|[\s_/]({unit_pattern}))?")
 
 
@@ -474,6 +480,7 @@ def split_heading(
         name, unit = stated[1], stated[2].strip()
         unit = "" if re.fullmatch(r"\w+( [^\W\d_]+)+", unit) else unit
     letters = "".join(letter for letter in _folded(name) if letter.isalnum())
+    unit = unit.lower() if unit.lower() in units else unit
     return letters, "um" if unit in ("µm", "μm") else unit
 
 
@@ -509,6 +516,8 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
         lines: Lines = []
         for cells in reader:
             cells = [cell.strip() for cell in cells]
+            if loose:
+                cells = [_number_of_people(cell) for cell in cells]
             if delimiter != ",":
                 cells = [_with_point(cell) for cell in cells]
             lines.append((reader.line_num, cells))
@@ -558,6 +567,31 @@ def _cell_text(value: object) -> str:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return "" if value is None else str(value).strip()
+
+
+def _without_empty(lines: Lines) -> Lines:
+    """Return lines without columns that are empty in all, and without rules (``|---|---|``)."""
+    lines = [(n, cells) for n, cells in lines if not _RULE.fullmatch("".join(cells))]
+    kept = {i for _, cells in lines for i, cell in enumerate(cells) if cell}
+    return [(n, [x for i, x in enumerate(cells) if i in kept]) for n, cells in lines]
+
+
+def _one_block(lines: Lines) -> Lines:
+    """Return tables of the joints of each side, below its name alone, as one table."""
+    sides = ({"base"}, {"platform"})
+    at = [
+        k
+        for k, (_, cells) in enumerate(lines[:-1])
+        if sum(map(bool, cells)) == 1 and set(concepts("".join(cells))) - {"joint"} in sides
+    ]
+    if len(at) != 2 or lines[at[0] + 1][1] != lines[at[1] + 1][1]:
+        return lines
+    rows = [
+        (n, [f"{''.join(lines[k][1])} {cells[0]}", *cells[1:]])
+        for k, end in zip(at, (at[1], len(lines)), strict=True)
+        for n, cells in lines[k + 2 : end]
+    ]
+    return [lines[at[0] + 1], *rows]
 
 
 def _without_title(lines: Lines) -> Lines:
@@ -638,7 +672,7 @@ def _decoded(content: bytes, *, loose: bool) -> str:
 def _delimiter(text: str) -> str:
     """Return the separator of cells, the first that is in most of the lines that are not blank."""
     lines = [line for line in map(str.strip, text.splitlines()) if line]
-    counts = {mark: sum(mark in line for line in lines) for mark in ";\t, "}
+    counts = {mark: sum(mark in line for line in lines) for mark in ";\t|, "}
     counts[","] -= sum(map(_has_decimal_commas, lines))
     return next((mark for mark, n in counts.items() if 2 * n > len(lines)), ",")
 
@@ -648,6 +682,12 @@ def _has_decimal_commas(line: str) -> bool:
     words = line.split()
     with_comma = [word for word in words if "," in word]
     return len(words) > 1 and bool(with_comma) and all(map(_COMMA.fullmatch, with_comma))
+
+
+def _number_of_people(cell: str) -> str:
+    """Return a number as computers write it: minus, diameter and inch marks; others unchanged."""
+    match = _MARKED.fullmatch(cell)
+    return f"{'-' * bool(match[1])}{match[2]}{' in' * bool(match[3])}" if match else cell
 
 
 def _with_point(cell: str) -> str:

@@ -187,7 +187,9 @@ def _picture(one: Assumption, row: int) -> Picture:
     view = int(search.measurements.view[row])
     corners = sensor_extent(search.measurements.views[view].camera)
     pairs = as_if(search.edge_pairs[row], corners, one.flip[row], one.focal)
-    return Picture(pairs, search.targets(row, view), corners / one.focal, search.size)
+    return Picture(
+        pairs, search.targets(row, view), corners / one.focal, search.size, search.joint_error
+    )
 
 
 def _agreement(task: _Task) -> Agreement:

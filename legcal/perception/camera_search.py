@@ -195,18 +195,18 @@ def place_camera(
         if len(poses) == 0:
             continue
         first = Pictures.of(best_first[:done])
-        poses = refined(first, poses, SEARCHING[2:4], JOINT_ERROR)
+        poses = refined(first, poses, SEARCHING[2:4], every.joint_error)
         some = Pictures.of(best_first[: max(SOME_PICTURES, done)])
         score = scores(some, poses, SEARCHING[3])
         poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         # From far a flat machine looks alike with near and far exchanged.
         ahead, ends = poses.take(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
         poses = CameraPoses.joined([poses, depth_reversed(ahead, ends) if len(ends) else ahead])
-        poses = refined(some, poses, SEARCHING[3:], JOINT_ERROR)
+        poses = refined(some, poses, SEARCHING[3:], every.joint_error)
         score = scores(some, poses, SEARCHING[-1])
         poses = poses.take(_best(score, N_KEPT[3]))
         poses = CameraPoses.joined([poses, _polished(some.take(slice(N_POLISHING)), poses)])
-        best = _candidates(every, refined(every, poses, FITTING, JOINT_ERROR))
+        best = _candidates(every, refined(every, poses, FITTING, every.joint_error))
     return best
 
 
@@ -221,7 +221,7 @@ def _near_known(pictures: Pictures, known: Sequence[RigidTransform], n_legs: int
 def _approached(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     """Return rough poses after all steps that lead to the pairs."""
     poses = refined(pictures, poses, SEARCHING[:3])
-    return refined(pictures, poses, (*SEARCHING[2:], *FITTING), JOINT_ERROR)
+    return refined(pictures, poses, (*SEARCHING[2:], *FITTING), pictures.joint_error)
 
 
 def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
@@ -233,7 +233,7 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
     polished = []
     for i in range(min(N_POLISHED, len(poses))):
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
-        around = refined(pictures, around, POLISH, JOINT_ERROR)
+        around = refined(pictures, around, POLISH, pictures.joint_error)
         score = scores(pictures, around, POLISH[-1])
         polished.append(around.take(_best(score, 1)))
     return CameraPoses.joined([*polished, poses.take(np.zeros(0, dtype=np.intp))])
@@ -349,7 +349,7 @@ def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     matches = match_pairs(pictures, poses, FITTING[-1])
     value = matches.exclusive_score
     support, expected = (_by_legs(pictures, x).T for x in (value, matches.visible))
-    joint_error = JOINT_ERROR * pictures.size
+    joint_error = pictures.joint_error * pictures.size
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
     score = support.sum(axis=1) - SHIFT_COST * cost
     order = _different(pictures, poses, matches, value >= MIN_MATCH_SCORE, score)

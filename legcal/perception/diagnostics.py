@@ -385,7 +385,7 @@ def _picture(
     wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
     targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
     corners = sensor_extent(search.measurements.views[view].camera)
-    return Picture(pairs, targets, corners, search.size)
+    return Picture(pairs, targets, corners, search.size, search.joint_error)
 
 
 def _share(

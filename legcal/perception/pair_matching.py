@@ -28,7 +28,7 @@ from legcal.geometry.types import Array, Image, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.profiles import Samples
-from legcal.perception.tuning import WIDTH_ERROR
+from legcal.perception.tuning import JOINT_ERROR, WIDTH_ERROR
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
 from legcal.vision.visibility import visible_segments
@@ -142,6 +142,7 @@ class Picture:
     targets: LegSegments  # segments of legs at its reading
     corners: Array  # (2, 2) least and greatest x and y of the sensor plane that it shows
     size: float  # mean leg length of the machine, which tolerances are parts of [m]
+    joint_error: float = JOINT_ERROR  # of the joints of the model, of the size
     # Its camera frame, where poses are those of another one that is fixed to it: X_camera = R X + t
     R: Array = field(default_factory=lambda: np.eye(3))
     t: Array = field(default_factory=lambda: np.zeros(3))
@@ -166,6 +167,7 @@ class Pictures:
     t: Array  # (n_pictures, 3)
     corners: Array  # (n_pictures, 2, 2)
     size: float  # mean leg length of the machine, which tolerances are parts of [m]
+    joint_error: float  # of the joints of the model, of the size
 
     @classmethod
     def of(cls, pictures: Sequence[Picture]) -> Pictures:
@@ -198,6 +200,7 @@ class Pictures:
             np.array([p.t for p in pictures]).reshape(-1, 3),
             np.array([p.corners for p in pictures]).reshape(-1, 2, 2),
             pictures[0].size if pictures else 1.0,
+            pictures[0].joint_error if pictures else JOINT_ERROR,
         )
 
     def __len__(self) -> int:
@@ -216,7 +219,8 @@ class Pictures:
 
     def take(self, chosen: slice) -> Pictures:
         """Return some of the pictures."""
-        arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "size"}
+        names = (one.name for one in fields(self) if one.name not in ("size", "joint_error"))
+        arrays = {name: getattr(self, name) for name in names}
         return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
     def blocks(self, n_poses: int) -> Iterator[Pictures]:

@@ -10,6 +10,7 @@ it.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -40,7 +41,7 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.recognition import place_views
-from legcal.perception.tuning import WINDOW_PX
+from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision.camera import Camera, shared_cameras
@@ -60,6 +61,7 @@ MIN_VIEWS = 2  # in which a part must show another radius than the model's
 MIN_WRONG_SHARE = 0.6  # of the outlines of one part alone, before a fit has told more of it
 MIN_CHANGE = 0.08  # of a radius from the model, as a logarithm: less does no harm
 MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
+LEAST_JOINT_ERROR = 0.004  # of the mean leg length: edges of images are known no better
 LegRadius = tuple[int, float]  # leg, and radius in the model [m]
 
 
@@ -83,6 +85,7 @@ class Photographs:
     # T_base_platform by clicks, by pose, where readings do not give it
     clicked_poses: FreePosesOf = field(default_factory=dict)
     still: dict[int, Still] = field(default_factory=dict)  # static background by view
+    joint_error: float = math.inf  # of joints of the model where stated, of the mean leg length
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -123,6 +126,7 @@ class Photographs:
             {} if blur is None else blur,
             self.machine.occluders,
             self.still,
+            float(np.clip(self.joint_error, LEAST_JOINT_ERROR, JOINT_ERROR)),
         )
 
     def with_found(self, outlines: Outlines) -> Outlines:

@@ -32,7 +32,7 @@ from legcal.perception.candidate_pairs import (
     segments_of_reduced,
 )
 from legcal.perception.pair_matching import EdgeMaps, LegSegments, Picture, leg_segments
-from legcal.perception.tuning import WINDOW_PX
+from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey, shrink
 from legcal.vision.visibility import PredictedLeg, predict_legs
@@ -63,6 +63,7 @@ class Search:
     blur: Mapping[int, float] = field(default_factory=dict)  # of their images, roughly [px]
     occluders: Sequence[Occluder] = ()  # occluders besides legs and arms
     still: Mapping[int, Still] = field(default_factory=dict)  # static background by view
+    joint_error: float = JOINT_ERROR  # of the joints of the model, of the size
 
     @property
     def n_legs(self) -> int:
@@ -74,7 +75,8 @@ class Search:
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
         extent = sensor_extent(camera)
-        return Picture(self.pairs(row, view), self.targets(row, view), extent, self.size)
+        pairs, targets = self.pairs(row, view), self.targets(row, view)
+        return Picture(pairs, targets, extent, self.size, self.joint_error)
 
     def pairs(self, row: int, view: int) -> CandidatePairs:
         """Return the edge pairs of an image as if the camera of a view had taken it."""

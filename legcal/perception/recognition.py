@@ -43,7 +43,7 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.tuning import EVIDENCE_RATIO, JOINT_ERROR
+from legcal.perception.tuning import EVIDENCE_RATIO
 from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
@@ -224,7 +224,8 @@ def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int
     T: list[RigidTransform | None] = [None] * n_views
     for v in group.views:
         T[v] = candidates.pose(i) * group.T_group_camera[v]
-    placement = Placement(search.A_base, search.B_base, tuple(T), POSE_JOINT_ERROR)
+    error = min(POSE_JOINT_ERROR, search.joint_error)
+    placement = Placement(search.A_base, search.B_base, tuple(T), error)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
@@ -293,7 +294,7 @@ def _gathered(
     views = search.measurements.views
     T, unplaced = list(hints), dict[str, NotPlaced]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
-    error: Array = np.full((len(views), search.n_legs), JOINT_ERROR)
+    error: Array = np.full((len(views), search.n_legs), search.joint_error)
     unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
     flipped = []
     for g in unclear:  # those pictures by which it was placed, with left and right exchanged
@@ -320,7 +321,7 @@ def _gathered(
         for v in group.views:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, JOINT_ERROR)
+            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, search.joint_error)
     placement = Placement(search.A_base, search.B_base, tuple(T), error)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 

@@ -44,7 +44,7 @@ from legcal.machine.leg import main_cylinders
 from legcal.perception.outline import Method, measure, measure_outlines
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, NotPlaced, Placement, Search
-from legcal.perception.tuning import EVIDENCE, JOINT_ERROR, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
+from legcal.perception.tuning import EVIDENCE, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
@@ -149,8 +149,8 @@ def fit_view(
     state = _State(pose, shift, np.zeros((lines.n_items, 3)))
     problem = _problem(group, lines, state, middle)
     weight = np.ones(lines.n_items)
-    size = search.size
-    joint_sigma, image_sigma = JOINT_ERROR * size, IMAGE_SIGMA * size
+    size, usual = search.size, search.joint_error * search.size
+    joint_sigma, image_sigma = usual, IMAGE_SIGMA * size
     try:
         linear = linearize(problem, state)
         for iteration in range(ITERATIONS):
@@ -197,7 +197,7 @@ def fit_view(
         state.offset,
         np.sqrt(square / lines.size),
         middle,
-        _evidence(lines, linear["outlines"], state, joint_sigma, size),
+        _evidence(lines, linear["outlines"], state, max(joint_sigma, usual), size),
     )
 
 
@@ -312,8 +312,7 @@ def _evidence(
     square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA * size)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
-    joint = max(JOINT_ERROR * size, joint_sigma)
-    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
+    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint_sigma**2)
 
 
 def min_evidence(group: Group) -> float:

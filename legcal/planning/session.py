@@ -84,7 +84,7 @@ def write_session(
         texts = {
             CAMERA: camera_info(plan.camera, "camera"),
             **_dataset(plan, yaml_path.relative_to(folder).as_posix()),
-            POSES_NAME: _poses(plan),
+            POSES_NAME: format_table(*poses_to_take(plan)),
             PLAN_NAME: json.dumps(plan.document(), indent=1, allow_nan=False) + "\n",
             **(pictures or {}),
         }
@@ -152,9 +152,10 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     return plan.sigma_q
 
 
-def _poses(plan: Plan) -> str:
-    """Return ``poses.csv``."""
-    motors, rows, labels = list(plan.machine.motors), [], plan.labels
+def poses_to_take(plan: Plan) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of ``poses.csv``."""
+    motors, labels = list(plan.machine.motors), plan.labels
+    rows = list[list[str]]()
     shown = [SHOWN_IN[plan.machine.legs[j].reading_unit] for j in motors]
     scale = np.array([size for size, _ in shown])
     for name, image, label, v, k in images_of(plan):
@@ -174,7 +175,7 @@ def _poses(plan: Plan) -> str:
     pose = [*(f"{x} [mm]" for x in "xyz"), *(f"{x} [deg]" for x in ("roll", "pitch", "yaw"))]
     camera = [f"camera {x} [mm]" for x in "xyz"]
     header = ["view", "pose", "image", "on the way", *joints, *pose, *camera]
-    return format_table(header, rows)
+    return header, rows
 
 
 # The plan

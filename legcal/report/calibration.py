@@ -60,19 +60,19 @@ def summary(
         colour = "red"
     verdict = Text(calibration.verdict.sentence, style=f"bold {colour}")
     written = f"Written to {output}."
-    following = list[str | Text]()  # of doubts it stands in the verdict and beside each of them
+    following = list[str]()  # of doubts it stands in the verdict and beside each of them
     if calibration.verdict.trustworthy:
         steps = next_steps(calibration, str(output), command)
         first = next(one for one in steps if one.command)
         following = [f"Next: {first.what[0].lower()}{first.what[1:]}"]
-        following.append(Text(printable(f"  {first.command}"), overflow="ignore"))
+        following.append(printable(f"  {first.command}"))
     if not verbose:
         platform = None if result.platform is None else platform_table(result.platform)
         changes = _largest_changes(result) if calibration.verdict.trustworthy else None
         taken = [calibration.verdict.sentence, *([""] * 5 if platform else [])]
         taken += [
             *([""] * (_LARGEST + 2) if changes else []),
-            *(["", *map(str, following)] if following else []),
+            *(["", *following] if following else []),
         ]
         brief = [*brief_sentences(result), *(f"Note: {note}" for note in result.notes)]
         last = f"{written} All parameters: --verbose, or the files there."

@@ -18,7 +18,7 @@ from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Drawing, Items, Picture, Row, page_html
 from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
-from legcal.planning.session import Plan, views_in_words
+from legcal.planning.session import Plan, poses_to_take, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
 from legcal.scene.motions import pyramid
@@ -63,7 +63,7 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
     legs = ", ".join(names)
     length = scale_option(plan.machine, board=plan.board is not None)
     return report(
-        heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"),
+        [heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"), plan.sentence],
         table(
             "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {printable(legs)}",
             rows=[tuple(map(printable, row)) for row in views],
@@ -80,7 +80,7 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
             ">images", ">expected", rows=growth,
             title="Expected error vs. number of images",
         ),
-        [plan.sentence, *map(printable, plan.notes)],
+        list(map(printable, plan.notes)),
         [] if output is None else [
             printable(f"written: {output}"),
             *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
@@ -227,7 +227,15 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
         )
         for name, data in previews.items()
     ]
+    header, rows = poses_to_take(plan)
+    settings = [0, 1, 3, *range(4, 4 + len(plan.machine.motors))]  # view, pose, way, motors
+    poses = table(
+        *(f"{'>' * (i > 3)}{printable(header[i])}" for i in settings),
+        rows=[[printable(row[i]) for i in settings] for row in rows],
+        title="Poses to take, in this order",
+    )
     blocks: list[Any] = [
+        poses,
         Drawing(in_page, "Camera places from above and from the side."),
         Row(images),
         Items(checklist(plan), ordered=True, title="Checklist"),

@@ -28,7 +28,8 @@ from legcal.pages.document import Text as Paragraphs
 from legcal.version import __version__
 
 Part = str | Text | Table
-_ITEM = "- "
+_ITEM, COMMAND = "- ", "  legcal "
+_NAME = 8  # characters of names in a first column that do not break
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
 
 
@@ -89,12 +90,15 @@ def heading(name: str, rest: str) -> Text:
 
 
 def safe_text(text: str | Text) -> Text:
-    """Return text with control characters and markup escaped for the terminal."""
+    """Return text with control characters and markup escaped for the terminal.
+
+    Commands to copy stay on one line.
+    """
     if isinstance(text, Text):
         if text.plain != (plain := escaped(text.plain)):
             return Text(plain, style=text.style, overflow=text.overflow)
         return text
-    return Text(escaped(text))
+    return Text(escaped(text), overflow="ignore" if text.startswith(COMMAND) else None)
 
 
 def _number(word: str) -> Cell:
@@ -113,12 +117,14 @@ def _on_terminal(table: Table) -> RichTable:
     )
     for k, column in enumerate(table.columns):
         is_number = column.startswith(">")
+        words = (column, *(row[k] for row in table.rows)) if k == 0 else ()
+        longest = max((len(word) for word in words if isinstance(word, str)), default=0)
         text.add_column(
             safe_text(column.removeprefix(">")),
             justify="right" if is_number else "left",
             overflow="fold",
             no_wrap=is_number,
-            min_width=table.least.get(k),
+            min_width=table.least.get(k, min(longest, _NAME)) or None,
         )
     for row in table.rows:
         text.add_row(*(safe_text(cell if isinstance(cell, str) else cell.text) for cell in row))

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
@@ -17,9 +17,11 @@ from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
-from legcal.recordings.importing import Import
 from legcal.report.machine import scale_option, understood
 from legcal.report.render import Report, heading, report, table
+
+if TYPE_CHECKING:
+    from legcal.recordings.importing import Import
 
 _MOST = 200  # largest number of rows shown
 _OFTEN = 0.5  # smallest share of images with a leg without a remark
@@ -92,7 +94,7 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
         [
             Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),
             "Calibrate it:",
-            Text(printable(f"  legcal calibrate {folder} -o OUT{length}"), overflow="ignore"),
+            printable(f"  legcal calibrate {folder} -o OUT{length}"),
         ]
     )
 

@@ -287,7 +287,7 @@ def _judge(
         tool_angle_sigma=tool_angle,
         status=status,
         sentence=_sentence(measurements, determined, left_out, too_large),
-        notes=tuple(_notes(measurements, inliers)),
+        notes=tuple(_notes(measurements, inliers, base)),
     )
 
 
@@ -404,8 +404,16 @@ def _sentence(
     )
 
 
-def _notes(measurements: ToolMeasurements, inliers: Inliers) -> list[str]:
+def _notes(
+    measurements: ToolMeasurements, inliers: Inliers, T_world_base: RigidTransform
+) -> list[str]:
     notes = list(measurements.poses.notes)
+    if not measurements.machine.spatial and T_world_base.rotation.as_matrix()[2, 2] < 0.0:
+        notes.append(
+            "The base lies upside down in the world, its z axis down. If it does not, the poses "
+            "are mirrored, which a machine that moves in a plane cannot show: change the sign of "
+            "one of their coordinates, x or y."
+        )
     if measurements.by_model is None:
         notes.append(
             "Nothing is known of the errors of the model, which move all poses at once: the "
