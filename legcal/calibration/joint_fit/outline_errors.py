@@ -34,7 +34,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
-from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_GAMMA_SIGMA, MIN_BIAS_GAIN, POLISHED_BIAS_PX
+from legcal.calibration.tuning import (
+    GAMMA_SIGMA,
+    LIMB_GAMMA_SIGMA,
+    LIMB_SHARES,
+    MIN_BIAS_GAIN,
+    POLISHED_BIAS_PX,
+)
 from legcal.data.measurements import few_views
 from legcal.estimation.variances import Effects, estimate_variances, expected_variances
 from legcal.geometry.covariances import whitener
@@ -61,6 +67,7 @@ KINDS = (
     "change of that bias over the image",
     "change of that tilt over the image",
 )
+_IN_VIEWS = KINDS[2:4]  # errors that a fit to few images absorbs
 PLACES = ("bias of an edge at a place", "tilt of an edge at a place")  # not estimated
 GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the suffix of its names
 N_KINDS = len(KINDS) + 1
@@ -342,6 +349,14 @@ class EdgeBiases:
         sigma = self.sigma[: len(KINDS)].tolist()
         return dict(zip(KINDS, sigma, strict=True)) if np.any(self.kind != GAMMA) else {}
 
+    @property
+    def shifts(self) -> Array:
+        """Shifts of both ends of outlines by one standard deviation of each bias, (n, 2, b)."""
+        shifts = np.zeros((len(self.index), 2, len(self)))
+        for index, shift in zip(self.index.T, np.swapaxes(self.shift, 0, 1), strict=True):
+            shifts[np.arange(len(index)), :, index] += shift
+        return shifts * self.sigmas
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -481,6 +496,21 @@ def shifts_at_places(outlines: ObservedOutlines, used: BoolArray) -> Array:
     for k, members in enumerate(clusters):
         shifts[members, :, :, k] = shifts_of_edges(len(members))
     return shifts.reshape(*shifts.shape[:2], len(PLACES) * len(clusters))
+
+
+def least_in_views(noise: NoiseModel, claimed: Array) -> Array:
+    """Return least standard deviations (N_KINDS,) of biases of edges in photographs [px].
+
+    Of those of a leg in a view, in parts of the noise of single outlines, whose covariances (n, 2,
+    2) are *claimed* [px^2]: residuals show little of them where a fit to few images absorbs them.
+    """
+    least = np.zeros(N_KINDS)
+    if len(claimed):
+        C = noise.covariance(claimed)
+        variances = np.stack([_SUM @ C @ _SUM, _DIFFERENCE @ C @ _DIFFERENCE])
+        single = 0.5 * np.sqrt(np.median(variances, axis=1))
+        least[[KINDS.index(kind) for kind in _IN_VIEWS]] = LIMB_SHARES * single
+    return least
 
 
 def least_at_places(outlines: ObservedOutlines, shifts: Array) -> Array:

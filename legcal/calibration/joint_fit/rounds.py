@@ -36,6 +36,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     estimated_biases,
     expected_biases,
     least_at_places,
+    least_in_views,
     possible_biases,
     robust_noise,
     shifts_at_places,
@@ -76,9 +77,9 @@ class Fit:
     noise: NoiseModel
     edge_biases: EdgeBiases
     weight: Array  # (n_outlines,) from 1 for inliers to 0 for outliers
-    # Errors of edges that return to places, not estimated as biases: root mean squares (2,) of
-    # ``PLACES`` [px], and what they add to the covariance of the kept unknowns; None without any
-    at_places: tuple[Array, Array] | None = None
+    # Errors that the fit absorbs, not estimated as biases: their sizes by kind [px], and what they
+    # add to the covariance of the kept unknowns; None without any
+    absorbed: tuple[dict[str, float], Array] | None = None
     notes: tuple[str, ...] = ()  # changes of the last round, if not converged
     edge_scale: float = 1.0  # of the standard deviations of edges of bodies
 
@@ -113,8 +114,7 @@ class Fit:
     @property
     def shared_px(self) -> dict[str, float]:
         """Standard deviations of common-mode errors by kind [px]."""
-        there = () if self.at_places is None else self.at_places[0].tolist()
-        return self.edge_biases.sizes | dict(zip(PLACES, there, strict=False))
+        return self.edge_biases.sizes | ({} if self.absorbed is None else self.absorbed[0])
 
 
 def first_minimum(
@@ -202,7 +202,7 @@ def _fit_in_rounds(problem: FitProblem, first: Minimum[State]) -> Fit:
     _refuse_disagreement(fit)
     return replace(
         fit,
-        at_places=_repeated_errors(fit),
+        absorbed=_absorbed_errors(fit, possible),
         notes=check_convergence(changes, problem.outlines.covariance, problem.settings),
     )
 
@@ -297,30 +297,40 @@ def _without_wrong_readings(
     return problem, minimum
 
 
-def _repeated_errors(fit: Fit) -> tuple[Array, Array] | None:
-    """Return errors at places and their effect on the covariance; None where there are none.
+def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], Array] | None:
+    """Return errors that the fit absorbs, and their effect on the covariance; None without any.
 
-    They are estimated where residuals show biases at all; those of polished parts are there anyway.
+    Errors at places are estimated where residuals show biases at all; those of polished parts are
+    there anyway. In photographs, biases of a leg in a view have a least size beside their estimate.
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
-    if not (fit.edge_biases.are_shown or problem.outlines.polished):
-        return None
-    shifts = shifts_at_places(problem.outlines, fit.accepted)
-    if not shifts.size:
-        return None
-    least = least_at_places(problem.outlines, shifts)
-    columns = {"outlines": problem.factor("outlines").whitening @ shifts}
-    shown = np.zeros(len(PLACES))
-    if fit.edge_biases.are_shown:
-        plain = normal_equations(problem, state, linear)
-        shown = sigmas_at_places(*score_test(problem, linear, plain, columns))
-    of_places = np.maximum(np.repeat(shown, shifts.shape[2] // len(shown)), least)
-    if not of_places.any():
+    whitening, o = problem.factor("outlines").whitening, problem.outlines
+    sizes, shifts = dict[str, float](), [np.zeros((len(o), 2, 0))]
+    if fit.edge_biases.are_shown or o.polished:
+        at_places = shifts_at_places(o, fit.accepted)
+        sigma = least_at_places(o, at_places)
+        if fit.edge_biases.are_shown and at_places.size:
+            plain = normal_equations(problem, state, linear)
+            columns = {"outlines": whitening @ at_places}
+            shown = sigmas_at_places(*score_test(problem, linear, plain, columns))
+            sigma = np.maximum(np.repeat(shown, at_places.shape[2] // len(shown)), sigma)
+        if sigma.any():
+            shifts.append(at_places * sigma)
+            mean = np.sqrt(np.mean(sigma.reshape(len(PLACES), -1) ** 2, axis=1))
+            sizes |= dict(zip(PLACES, mean.tolist(), strict=True))
+    if problem.choices.least_shared_px:
+        claimed = o.covariance[fit.accepted]
+        least = np.maximum(least_in_views(fit.noise, claimed), fit.edge_biases.sigma)
+        beyond = possible.of_sizes(np.sqrt(least**2 - fit.edge_biases.sigma**2))
+        if len(beyond):
+            shifts.append(beyond.shifts)
+            sizes |= beyond.of_sizes(least).sizes
+    moved = np.concatenate(shifts, axis=2)
+    if not moved.any():
         return None
     normal = information(problem, state, linear, problem.loss)
-    moved = response(problem, linear, normal, columns) * of_places
-    sigma = np.sqrt(np.mean(of_places.reshape(len(PLACES), -1) ** 2, axis=1))
-    return sigma, moved @ moved.T
+    moved = response(problem, linear, normal, {"outlines": whitening @ moved})
+    return sizes, moved @ moved.T
 
 
 def _approach_minimum(

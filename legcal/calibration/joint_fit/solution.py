@@ -248,8 +248,8 @@ def assemble_solution(
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     kept = normal.kept_covariance()
-    if fit.at_places is not None:
-        kept = kept + fit.at_places[1]
+    if fit.absorbed is not None:
+        kept = kept + fit.absorbed[1]
     covariance = named_covariance(problem, state, kept)
     quality = _goodness_of_fit(fit, normal, len(held.basis))
     cameras = CameraResiduals(problem, state, linear)
