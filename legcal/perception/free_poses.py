@@ -134,8 +134,8 @@ class _Scene:
             for image in self.images[k]:
                 camera = cameras[n, image.view]
                 shown = replace(own, share=own.share * self.wanted[image.view, own.leg])
-                at = camera[:, :3], camera[:, 3]
-                found.append(Picture(image.pairs, shown, image.corners, self.machine.size, *at))
+                at = {"R": camera[:, :3], "t": camera[:, 3]}
+                found.append(Picture(image.pairs, shown, image.corners, self.machine.size, **at))
                 index.append(n)
         return Pictures.of(found), np.array(index, dtype=np.intp)
 
