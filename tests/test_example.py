@@ -1,12 +1,17 @@
-"""The dataset that comes with legcal: copied whole or not at all."""
+"""The dataset that comes with legcal: copied whole or not at all; a view found only in the end."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import run
 
-from legcal import load_dataset
+from legcal import calibrate, load_dataset
+from legcal.causes import Cause
 from legcal.data import new_dataset
+from legcal.perception import photographs
+from legcal.perception.placement import NotPlaced, Placement
 
 EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"
 
@@ -31,3 +36,27 @@ def test_an_installation_without_the_example_says_so(
     assert run(monkeypatch, "example", "-o", str(tmp_path / "copy")) == 1
     assert "install it again" in capsys.readouterr().err
     assert not (tmp_path / "copy").exists()
+
+
+def test_a_view_that_is_not_recognised_at_first_is_placed_near_the_fit_to_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    place_views, n_searched = photographs.place_views, list[int]()
+
+    def without_last(*args: Any, **options: Any) -> Placement:
+        placement = place_views(*args, **options)
+        n_searched.append(len(args[1]))
+        if len(n_searched) > 1:
+            return placement
+        missed = NotPlaced("c3", Cause("its legs are not recognised"))
+        cameras = (*placement.T_base_camera[:-1], None)
+        return replace(placement, T_base_camera=cameras, unplaced={"c3": missed})
+
+    monkeypatch.setattr(photographs, "place_views", without_last)
+    calibration = calibrate(EXAMPLE, use_cache=False)
+    assert n_searched == [45, 15]
+    assert calibration.verdict.trustworthy
+    outlines, view = calibration.solution.outlines, calibration.dataset.measurements.view
+    used = view[outlines.row[outlines.used]]
+    assert min((used == v).sum() for v in range(3)) > 80
+    assert not [note for note in calibration.notes if "recognised" in note]

@@ -57,14 +57,15 @@ from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.body_edges import has_bodies, measure_body_edges
 from legcal.perception.diagnostics import is_visible, reject_images
-from legcal.perception.outline import used_as_before
+from legcal.perception.outline import measure_in_brief, used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,
     measure_photographs,
+    place_and_measure,
     with_measured_radii,
 )
-from legcal.perception.placement import Placement, placed_arms
+from legcal.perception.placement import Joined, Placement, placed_arms
 
 # Least common bias of all outlines in photographs [px]: limb shading outside of the model acts like
 # a change of the radii, so that residuals never show it.
@@ -199,6 +200,50 @@ def unseen_legs(machine: Machine, measurements: Measurements, outlines: Outlines
         for j, leg in enumerate(machine.legs)
         if j not in shown and leg.cylinders and any(view.uses(leg.name) for view in views)
     ]
+
+
+def more_views(
+    data: OrderedDataset, first: Estimate, seen: MeasuredImages, joined: Joined
+) -> MeasuredImages:
+    """Place views that have no camera yet where the fit to the others has the legs.
+
+    Joints are known far better then than in the nominal model. Return *seen* itself where that
+    places none. *joined* are T_board_camera of views that are placed together.
+    """
+    view = data.measurements.view
+    missing = [k for k, T in enumerate(seen.placement.T_base_camera) if T is None]
+    rows = seen.photographs.detect[np.isin(view[seen.photographs.detect], missing)]
+    here = first.fitted.with_fitted_poses(first.solution.T_Rb_Re)
+    near = _fitted_placement(replace(data, seen_poses=here.seen_poses), first.solution, seen)
+    search = replace(seen.photographs.narrowed(rows, seen.outlines), joint_error=0.0)
+    again = place_and_measure(search, near, data.progress, joined, method=measure_in_brief)
+    cameras = tuple(
+        found if T is None else T
+        for T, found in zip(
+            seen.placement.T_base_camera, again.placement.T_base_camera, strict=True
+        )
+    )
+    if all(cameras[k] is None for k in missing):
+        return seen
+    placed = replace(
+        seen.placement,
+        T_base_camera=cameras,
+        unplaced=again.placement.unplaced,
+        notes=tuple(dict.fromkeys((*seen.placement.notes, *again.placement.notes))),
+        barely={**seen.placement.barely, **again.placement.barely},
+    )
+    of_others = {row: why for row, why in seen.left_out.items() if row not in set(rows.tolist())}
+    blur = tuple(
+        other if k in missing else own
+        for k, (own, other) in enumerate(zip(seen.blur, again.blur, strict=True))
+    )
+    return replace(
+        seen,
+        placement=placed,
+        outlines=again.outlines,
+        left_out=of_others | again.left_out,
+        blur=blur,
+    )
 
 
 # Outlines are measured again while this percentile of the joints moves by more, at most so often

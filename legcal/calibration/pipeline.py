@@ -38,6 +38,7 @@ from legcal.calibration.estimate import (
     Estimate,
     fit_outlines,
     measure_again,
+    more_views,
     not_found_again,
     shown_near,
 )
@@ -408,6 +409,13 @@ def _estimate(
     # 3 and 4. Four steps and joint fit.
     settings = TRIAL if diagnosis else DEFAULT_SETTINGS
     first = fit_outlines(fitted, seen.outlines, seen.placement, board, options, settings)
+    if seen.placement.unplaced and not diagnosis:
+        more = more_views(data, first, seen, T_board_camera)
+        if more is not seen:
+            seen = more
+            first = fit_outlines(
+                fitted, seen.outlines, seen.placement, board, options, settings, steps=first.steps
+            )
     # 5. Measure again near that fit, and fit again.
     try:
         estimate = first if diagnosis else measure_again(data, first, seen, board, options)
