@@ -10,8 +10,8 @@ from command_line import run
 from legcal import calibrate, load_dataset
 from legcal.causes import Cause
 from legcal.data import new_dataset
-from legcal.perception import photographs
 from legcal.perception.placement import NotPlaced, Placement
+from legcal.perception.recognition import place_views
 
 EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"
 
@@ -41,7 +41,7 @@ def test_an_installation_without_the_example_says_so(
 def test_a_view_that_is_not_recognised_at_first_is_placed_near_the_fit_to_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    place_views, n_searched = photographs.place_views, list[int]()
+    n_searched = list[int]()
 
     def without_last(*args: Any, **options: Any) -> Placement:
         placement = place_views(*args, **options)
@@ -52,7 +52,7 @@ def test_a_view_that_is_not_recognised_at_first_is_placed_near_the_fit_to_the_ot
         cameras = (*placement.T_base_camera[:-1], None)
         return replace(placement, T_base_camera=cameras, unplaced={"c3": missed})
 
-    monkeypatch.setattr(photographs, "place_views", without_last)
+    monkeypatch.setattr("legcal.perception.photographs.place_views", without_last)
     calibration = calibrate(EXAMPLE, use_cache=False)
     assert n_searched == [45, 15]
     assert calibration.verdict.trustworthy
