@@ -409,7 +409,7 @@ def _estimate(
     # 3 and 4. Four steps and joint fit.
     settings = TRIAL if diagnosis else DEFAULT_SETTINGS
     first = fit_outlines(fitted, seen.outlines, seen.placement, board, options, settings)
-    if seen.placement.unplaced and not diagnosis:
+    if seen.placement.unplaced and data.machine.is_determined and not diagnosis:
         more = more_views(data, first, seen, T_board_camera)
         if more is not seen:
             seen = more
