@@ -174,7 +174,8 @@ def fit_outlines(
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in fitted_outlines.source:
-        choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
+        least_px = {**LIMB_BIAS, **choices.least_shared_px}
+        choices = replace(choices, least_shared_px=least_px, of_photographs=True)
     solution = refine(
         fitted.fitted_legs,
         fitted.measurements,
@@ -215,6 +216,11 @@ def more_views(
     rows = seen.photographs.detect[np.isin(view[seen.photographs.detect], missing)]
     here = first.fitted.with_fitted_poses(first.solution.T_Rb_Re)
     near = _fitted_placement(replace(data, seen_poses=here.seen_poses), first.solution, seen)
+    hints = [
+        view.T_base_camera if T is None else T
+        for T, view in zip(near.T_base_camera, data.measurements.views, strict=True)
+    ]
+    near = replace(near, T_base_camera=tuple(hints))
     search = replace(seen.photographs.narrowed(rows, seen.outlines), joint_error=0.0)
     again = place_and_measure(search, near, data.progress, joined, method=measure_in_brief)
     cameras = tuple(
@@ -223,8 +229,8 @@ def more_views(
             seen.placement.T_base_camera, again.placement.T_base_camera, strict=True
         )
     )
-    if all(cameras[k] is None for k in missing):
-        return seen
+    if all(cameras[k] is None for k in missing) or again.photographs is not search:
+        return seen  # nothing, or only with other radii than those of the fit
     placed = replace(
         seen.placement,
         T_base_camera=cameras,

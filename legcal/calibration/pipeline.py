@@ -18,6 +18,7 @@ Held-out images are searched like the others, and not fitted. Phases 2 to 5 work
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -410,12 +411,14 @@ def _estimate(
     settings = TRIAL if diagnosis else DEFAULT_SETTINGS
     first = fit_outlines(fitted, seen.outlines, seen.placement, board, options, settings)
     if seen.placement.unplaced and data.machine.is_determined and not diagnosis:
-        more = more_views(data, first, seen, T_board_camera)
-        if more is not seen:
-            seen = more
-            first = fit_outlines(
-                fitted, seen.outlines, seen.placement, board, options, settings, steps=first.steps
-            )
+        with suppress(NotVisible, NotIdentifiable, DidNotConverge):  # the others are enough
+            more = more_views(data, first, seen, T_board_camera)
+            if more is not seen:
+                outlines, steps = more.outlines, first.steps
+                first = fit_outlines(
+                    fitted, outlines, more.placement, board, options, settings, steps=steps
+                )
+                seen = more
     # 5. Measure again near that fit, and fit again.
     try:
         estimate = first if diagnosis else measure_again(data, first, seen, board, options)

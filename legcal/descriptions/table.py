@@ -809,7 +809,11 @@ _DIAMETERS = {"diameter": "radius", "tube diameter": "tube", "rod diameter": "ro
 _NOT_LENGTHS = ("deg", "-")  # units of other columns
 _LETTERS = ("a", "b", "p", "t")  # of sides, as in A1
 _XYZ = ("x", "y", "z")
-_REMARK = re.compile(rf"\b(?:in|en) ({'|'.join(LENGTH)})\b")
+_REMARK = re.compile(
+    r"\b(?:all|lengths?|dimensions?|units?|alle|maße|längen|tout|cotes)\b[^\n,;|]{0,30}?"
+    rf"\b(?:in|en) ({'|'.join(LENGTH)})\b",
+    re.IGNORECASE,
+)
 _RADII = ("radius", "tube", "rod")
 _POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
@@ -936,7 +940,7 @@ def _unit(table: Table, given: str | None) -> str:
     stated = _shared(table, "unit") or given
     if stated is None:
         text = content_of(table.path, FILE_KIND).decode("utf-8", errors="replace")
-        remarked = set(_REMARK.findall(text))
+        remarked = set(map(str.lower, _REMARK.findall(text)))
         stated = remarked.pop() if len(remarked) == 1 else None
     if stated is None:
         raise DatasetError(

@@ -48,7 +48,7 @@ _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
 _RULE = re.compile(r"[:-]*-{3}[:-]*")
-_MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–-]?)(\d[^\"″]*)([\"″]?)")
+_MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–+-]?)([.,]?\d[^\"″']*)([\"″]?)")
 _BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
 _WORKBOOKS = {b"PK\x03\x04": "an XLSX or ODS workbook", b"\xd0\xcf\x11\xe0": "an XLS workbook"}
 
@@ -501,7 +501,8 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     content = content_of(path, noun)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
-        return _sheet(path, noun, content, workbook)
+        sheet = _sheet(path, noun, content, workbook)
+        return [(number, list(map(_number_of_people, cells))) for number, cells in sheet]
     try:
         text = _decoded(content, loose=loose)
         delimiter = _delimiter(text) if loose else ","
@@ -687,7 +688,10 @@ def _has_decimal_commas(line: str) -> bool:
 def _number_of_people(cell: str) -> str:
     """Return a number as computers write it: minus, diameter and inch marks; others unchanged."""
     match = _MARKED.fullmatch(cell)
-    return f"{'-' * bool(match[1])}{match[2]}{' in' * bool(match[3])}" if match else cell
+    if match is None:
+        return cell
+    sign = "-" if match[1] not in ("", "+") else ""
+    return f"{sign}{match[2].replace('−', '-')}{' in' * bool(match[3])}"
 
 
 def _with_point(cell: str) -> str:

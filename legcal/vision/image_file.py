@@ -57,6 +57,7 @@ FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along 
 # between fx and fy (pixels are square)
 FOCAL_SIGMA, ASPECT_SIGMA = 0.04, 0.002
 _ROUNDING_35MM = 1.0 / np.sqrt(12.0)  # standard deviation of whole millimetres [mm]
+_LEAST_M = 0.1  # distance in focus that EXIF may say
 _NEAR_M = 0.7  # distance of machines: a focused lens stands out by the focal length over that
 _FORMATS, _SAME_FORMAT = (4.0 / 3.0, 3.0 / 2.0), 0.02  # of whole sensors: longer over shorter side
 _MOST_CROP = 20.0  # of film over a sensor, the smallest having 13; some programs write nonsense
@@ -201,13 +202,11 @@ def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) 
     or the cut to another format such as 16:9, others do not: f is between both, and its standard
     deviation reaches to either. None if they state no focal length, several, or nonsense.
     """
-    stated = {
-        (photo.device, photo.focal_length_35mm, photo.digital_zoom or 1.0, photo.taken_size)
-        for photo in facts
-    }
-    first = facts[0]
+    sizes = {photo.taken_size for photo in facts if photo.taken_size is not None}
+    stated = {(photo.device, photo.focal_length_35mm, photo.digital_zoom or 1.0) for photo in facts}
+    first = max(facts, key=lambda photo: photo.taken_size is not None)
     focal, zoom = first.focal_length_35mm, max(first.digital_zoom or 1.0, 1.0)
-    if len(stated) != 1 or focal is None:
+    if len(stated) != 1 or len(sizes) > 1 or focal is None:
         return None
     if first.focal_length and focal > _MOST_CROP * zoom * first.focal_length:
         return None
@@ -221,8 +220,8 @@ def camera_of_photographs(facts: Sequence[ImageFacts], width: int, height: int) 
         whole = max(whole, float(np.hypot(*first.taken_size)))
     most = zoom * whole / diagonal  # by which f may be longer
     f = focal * diagonal / float(FILM_DIAGONAL) * float(np.sqrt(most))
-    near = 1e-3 * (first.focal_length or 0.0) / (first.focus_distance or _NEAR_M)
-    parts = FOCAL_SIGMA, _ROUNDING_35MM / focal, near, (most - 1.0) / (most + 1.0)
+    near = 1e-3 * (first.focal_length or 0.0) / max(first.focus_distance or _NEAR_M, _LEAST_M)
+    parts = FOCAL_SIGMA, _ROUNDING_35MM / focal, near, float(np.sqrt(most)) - 1.0
     sigma_f = f * float(np.linalg.norm(parts))
     K = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     camera = Camera(K, width, height)

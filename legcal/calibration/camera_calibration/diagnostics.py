@@ -86,7 +86,7 @@ def repeat_noise(fit: RobustFit, repeats: BoardImages, first: Sequence[int]) -> 
     off = adjusted.residual[~is_first] - adjusted.residual[is_first]
     square = np.bincount(pair[is_first], 0.5 * np.sum(off**2, axis=1))
     dof = 2 * np.bincount(pair[is_first]) - 6  # a pair determines how the board moved
-    differ = square > dof * _SAME_PX**2
+    differ = (dof > 0) & (square > dof * _SAME_PX**2)
     if not differ.any():
         return None
     part, _ = part_of(repeats, is_first & differ[pair], len(starts))

@@ -50,7 +50,8 @@ def from_scratch(
         return None
     poses = _chosen_again(found, corners)
     is_other = any(T is not before for T, before in zip(poses, found.T_camera_board, strict=True))
-    return readjust(found, poses, corners) if is_other else found
+    again = readjust(found, poses, corners) if is_other else None
+    return found if again is None else again
 
 
 def _chosen_again(adjusted: AdjustedBoard, corners: BoardImages) -> list[RigidTransform]:

@@ -352,6 +352,8 @@ def _refine_minimum(
             break
         except (DidNotConverge, NotIdentifiable) as failure:
             within, at = held_at_nominal(problem, first.state, held)
+            if len(held.basis):
+                at = first_minimum(within, at, must_converge=False).state
             more = _open_farther_on(problem, within, at, len(held.basis))
             if more is None:
                 refuse_contradicted_values(problem, start, at, with_priors=True)

@@ -62,7 +62,8 @@ class Choices:
     priors: Mapping[str, Prior] = field(default_factory=dict)  # in place of those by default
     values: Mapping[str, float] = field(default_factory=dict)  # [m, rad, px], axes as angles
     notes: tuple[str, ...] = ()  # on overridden choices
-    least_shared_px: Mapping[str, float] = field(default_factory=dict)  # by edge_biases.KINDS
+    least_shared_px: Mapping[str, float] = field(default_factory=dict)  # by outline_errors.KINDS
+    of_photographs: bool = False  # whether outlines were measured in photographs
     # by the representative view of a camera, in place of the covariance of its file
     cameras: Mapping[str, KnownIntrinsics] = field(default_factory=dict)
     # complete tolerances that are priors of all kinematic parameters, beside those above

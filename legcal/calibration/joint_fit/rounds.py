@@ -163,8 +163,8 @@ def first_minimum(
 def fit_in_rounds(problem: FitProblem, first: Minimum[State], held: HeldDirections) -> Fit:
     """Reject outliers until the inliers are stable, then estimate noise and fit, in rounds.
 
-    *first* is the result of :func:`first_minimum`, where the directions to be held are open: with
-    them at nominal, there is another one. Readings of redundant motors that contradict
+    *first* is the result of :func:`first_minimum`. Directions in *held* are set to nominal first,
+    and the first minimum is computed again. Readings of redundant motors that contradict
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
 
@@ -318,7 +318,7 @@ def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], 
             shifts.append(at_places * sigma)
             mean = np.sqrt(np.mean(sigma.reshape(len(PLACES), -1) ** 2, axis=1))
             sizes |= dict(zip(PLACES, mean.tolist(), strict=True))
-    if problem.choices.least_shared_px:
+    if problem.choices.of_photographs:
         claimed = o.covariance[fit.accepted]
         least = np.maximum(least_in_views(fit.noise, claimed), fit.edge_biases.sigma)
         beyond = possible.of_sizes(np.sqrt(least**2 - fit.edge_biases.sigma**2))
