@@ -299,24 +299,20 @@ def _truth(folder: Path) -> dict[str, Any]:
     return dict(json.loads((folder / "truth" / "truth.json").read_text()))
 
 
+def _with_board(factory: pytest.TempPathFactory, **settings: Any) -> Path:
+    folder = factory.mktemp("board") / "session"
+    simulate(machine(), folder, SimulationSettings(level=Level.OUTLINES, views=1, **settings))
+    return folder
+
+
 @pytest.fixture(scope="module")
 def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("board") / "standing"
-    settings = SimulationSettings(
-        level=Level.OUTLINES, poses=2, views=1, board="charuco", board_pose=True, seed=3
-    )
-    simulate(machine(), folder, settings)
-    return folder
+    return _with_board(tmp_path_factory, poses=2, board="charuco", board_pose=True, seed=3)
 
 
 @pytest.fixture(scope="module")
 def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("board") / "held"
-    settings = SimulationSettings(
-        level=Level.OUTLINES, poses=3, views=1, board="aprilgrid", hand_held=True, sigma_px=0.0
-    )
-    simulate(machine(), folder, settings)
-    return folder
+    return _with_board(tmp_path_factory, poses=3, board="aprilgrid", hand_held=True, sigma_px=0.0)
 
 
 def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:

@@ -67,7 +67,7 @@ KINDS = (
     "change of that bias over the image",
     "change of that tilt over the image",
 )
-_IN_VIEWS = KINDS[2:4]  # errors that a fit to few images absorbs
+_IN_VIEWS = slice(2, 4)  # of these: bias and tilt of a leg in a view
 PLACES = ("bias of an edge at a place", "tilt of an edge at a place")  # not estimated
 GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the suffix of its names
 N_KINDS = len(KINDS) + 1
@@ -509,7 +509,7 @@ def least_in_views(noise: NoiseModel, claimed: Array) -> Array:
         C = noise.covariance(claimed)
         variances = np.stack([_SUM @ C @ _SUM, _DIFFERENCE @ C @ _DIFFERENCE])
         single = 0.5 * np.sqrt(np.median(variances, axis=1))
-        least[[KINDS.index(kind) for kind in _IN_VIEWS]] = LIMB_SHARES * single
+        least[_IN_VIEWS] = LIMB_SHARES * single
     return least
 
 
