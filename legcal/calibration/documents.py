@@ -380,27 +380,15 @@ class DiagnosisBlock(Document):
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something that speaks against a result; effects are null where they cannot be computed.
+    """Something that speaks against a result; effects are null where they cannot be computed."""
 
-    Attributes
-    ----------
-    code : str
-        What was tested; codes do not change.
-    what : str
-        What was found, as a clause.
-    remedy : str
-        What to do, as a clause.
-    sigma_dX_m, sigma_dE_rad : float or None
-        How far the platform would be displaced and turned if it were true [m, rad].
-    is_grave : bool
-        The result is not to be loaded; no part of the document.
-    """
-
-    code: str
-    what: str
-    remedy: str
+    code: str  # what was tested; codes do not change
+    what: str  # what was found, as a clause
+    remedy: str  # what to do, as a clause
+    # how far the platform would be displaced and turned if it were true [m, rad]
     sigma_dX_m: float | None = None
     sigma_dE_rad: float | None = None
+    # the result is not to be loaded; no part of the document
     is_grave: Annotated[bool, Field(exclude=True), SkipJsonSchema()] = False
 
     @property
