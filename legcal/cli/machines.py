@@ -120,7 +120,7 @@ def new(
             )
         written = write_template(output, dimensions, force=force)
         lines = (
-            f"written: {' '.join(map(str, written))}",
+            *(f"written: {path}" for path in written),
             "Next:",
             f"  legcal new {shlex.quote(str(written[0]))} -o .",
         )
@@ -141,7 +141,7 @@ def new(
     created = create_model(description_of(table, dimensions), output, force=force, before=shown)
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     lines = (
-        f"written: {paths['yaml']} {paths['urdf']}",
+        *(f"written: {path}" for path in paths.values()),
         "Next, with a folder of photographs and a table of readings:",
         f"  legcal init PHOTOGRAPHS --readings READINGS.csv --model {shlex.quote(paths['yaml'])} "
         "-o session",

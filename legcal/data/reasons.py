@@ -47,6 +47,7 @@ class Reason(StrEnum):
     NO_BOARD_POSE = "no_board_pose"
     CORNER_OFF = "corner_off"
     NOT_BEFORE = "not_before"
+    LITTLE_GAIN = "little_gain"
     # Problems of a whole image
     BLACK = "black"
     OVEREXPOSED_IMAGE = "overexposed_image"
@@ -101,6 +102,10 @@ WORDS_BY_CODE: dict[str, tuple[str, str]] = {
         "{} px from where the other corners put it",
     ),
     Reason.NOT_BEFORE: ("not used in the previous measurement", ""),
+    Reason.LITTLE_GAIN: (
+        "edges of bodies add too little to what the rods tell",
+        "edges of bodies lower the predicted error of the platform by {} only",
+    ),
     Reason.BLACK: ("the image is black", "the image is black, at most {} of 255 grey levels"),
     Reason.OVEREXPOSED_IMAGE: (
         "the image is overexposed",

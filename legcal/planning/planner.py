@@ -650,6 +650,7 @@ class _Search:
             n_given=task.n_given,
             notes=tuple(notes),
             parts=parts,
+            only=predictor.choices.only,
         )
 
     def _growth(self, contributions: Sequence[Contributions]) -> Array:

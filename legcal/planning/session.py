@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.joint_fit.outline_errors import KINDS, PLACES
+from legcal.calibration.joint_fit.parameter_choices import Group
 from legcal.calibration.joint_fit.part_errors import PartSigma
 from legcal.calibration.joint_fit.platform import PlatformError
 from legcal.calibration.joint_fit.predicted import PredictedNoise
@@ -253,6 +254,7 @@ class Plan:
     notes: tuple[str, ...] = ()
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     parts: tuple[PartSigma, ...] = ()  # what is expected of parts, with tolerances as priors
+    only: Group | None = None  # the group of parts asked for
 
     @property
     def n_images(self) -> int:

@@ -61,7 +61,11 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
     ]
     legs = ", ".join(names)
-    length = scale_option(plan.machine, board=plan.board is not None)
+    option = (
+        scale_option(plan.machine, board=plan.board is not None)
+        if plan.only is None  # tolerances of the lengths are the scale then
+        else f" --only {plan.only}"
+    )
     return report(
         [heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"), plan.sentence],
         table(
@@ -86,7 +90,7 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
             *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
             "photograph it, and calibrate:",
             printable(f"  legcal shoot {output} --watch FOLDER"),
-            printable(f"  legcal calibrate {plan.given or output} -o OUT{length}"),
+            printable(f"  legcal calibrate {plan.given or output} -o OUT{option}"),
         ],
     )  # fmt: skip
 
@@ -157,6 +161,7 @@ def checklist(plan: Plan) -> list[str]:
         else f"Set the tripod to within {float(f'{cm:.2g}'):g} cm and {deg:.3g} deg: measure the "
         "distances from the lens, then turn the camera until the picture looks as its preview."
     )
+    by_way = ", via the pose in the column 'on the way'" if _has_ways(plan) else ""
     items = [
         first,
         place,
@@ -168,8 +173,8 @@ def checklist(plan: Plan) -> list[str]:
         "nor background.",
         "A background that differs from the legs in brightness along their whole length.",
         "A remote release or two seconds of delay; lossless files, or JPEG of quality 95.",
-        "Move the machine through the poses of poses.csv in order, via the pose in the column "
-        f"'on the way'. It starts at home, where motors read {_home_in_words(plan)}.",
+        f"Move the machine through the poses of poses.csv in order{by_way}. It starts at home, "
+        f"where motors read {_home_in_words(plan)}.",
         "Wait until it is at rest; record the encoder values, not the commands, in "
         "measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
@@ -179,7 +184,7 @@ def checklist(plan: Plan) -> list[str]:
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
     measured = plan.machine.rod_for_scale(has_length=plan.board is not None)
-    if measured is not None:
+    if measured is not None and plan.only is None:
         items.insert(
             1,
             f"Measure the rod of {measured[0].name} from joint centre to joint centre: readings of "
@@ -187,6 +192,11 @@ def checklist(plan: Plan) -> list[str]:
             f"{plan.machine.length_option}.",
         )
     return items
+
+
+def _has_ways(plan: Plan) -> bool:
+    """Whether some pose is reached by another one."""
+    return any(via for view in plan.views for via in view.via)
 
 
 def _home_in_words(plan: Plan) -> str:
@@ -228,9 +238,12 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
         for name, data in previews.items()
     ]
     header, rows = poses_to_take(plan)
-    settings = [0, 1, 3, *range(4, 4 + len(plan.machine.motors))]  # view, pose, way, motors
+    first_motor = 4
+    settings = [0, 1, *range(first_motor, first_motor + len(plan.machine.motors))]  # view, pose
+    if _has_ways(plan):
+        settings.insert(2, 3)
     poses = table(
-        *(f"{'>' * (i > 3)}{printable(header[i])}" for i in settings),
+        *(f"{'>' * (i >= first_motor)}{printable(header[i])}" for i in settings),
         rows=[[printable(row[i]) for i in settings] for row in rows],
         title="Poses to take, in this order",
     )
