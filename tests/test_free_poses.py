@@ -248,6 +248,17 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.parametrize(("kind", "seed"), [("3-RPS, two motors", 8), ("3-SPS + passive UPS", 16)])
+def test_poses_that_a_few_lines_leave_ambiguous_are_searched_from_many_places(
+    kind: str, seed: int, tmp_path: Path
+) -> None:
+    machine = write_machine(tmp_path, drawn(kind), Layout())
+    made = simulate(machine, tmp_path / "set", settings(poses=10, seed=seed))
+    found = legcal.calibrate(made.folder)
+    assert np.all(found.solution.outlines.used)  # from one start, those of an image are not
+    assert found.verdict.trustworthy
+
+
 @pytest.mark.system
 def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
     tmp_path: Path,
