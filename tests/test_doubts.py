@@ -103,10 +103,10 @@ def _yaml(change: Callable[[dict[str, Any]], None]) -> Spoil:
     return changed
 
 
-def _rejected(is_out: Callable[[dict[str, str]], bool]) -> Spoil:
+def _rejected(is_out: Callable[[dict[str, str]], bool], why: str = "faint") -> Spoil:
     def change(row: dict[str, str]) -> None:
         if is_out(row):
-            row |= {"verdict": "rejected", "reason": "faint"}
+            row |= {"verdict": "rejected", "reason": why}
 
     return _table("observations.csv", change)
 
@@ -149,6 +149,13 @@ _stated_wrongly = _yaml(_tolerance_and_hint)
         ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
         ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
         ("few_outlines", _rejected(lambda row: row["edge"] == "1"), "50 %"),
+        (
+            "not_round",
+            _rejected(
+                lambda row: "_rod" in row["part"] and _number(row["image"]) % 2 == 0, "width"
+            ),
+            "leg1_rod",
+        ),
         ("tolerance", _stated_wrongly, "tolerance 0.02"),
         ("strayed_camera", _stated_wrongly, "view c2"),
         ("scale", _table("measurements.csv", _stretched), "travel of the motors alone"),

@@ -49,7 +49,7 @@ from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import components
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.parameters import geometries, vector_of
@@ -60,6 +60,7 @@ CAMERA = "camera"  # code of the doubt in cameras that the measurements contradi
 TOLERANCE = "tolerance"  # code of the doubt in parameters that moved far
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
+MOST_WIDTHS, MIN_WIDTHS = 0.45, 8  # share of the images of a part with another width; and number
 MOST_OFF = 2.0  # times what was expected of held-out images, in pixels
 MOST_SQUARES = 2.0  # times what was expected of left-out images, in squared sigmas
 _SURE = 5.0  # standard deviations of these squares
@@ -108,6 +109,7 @@ def doubts_of(
     motors = {one.subject for one in session.findings if one.kind in codes}
     motors |= {subject.partition(".")[0] for subject in motors}  # legs of joints
     explained = {leg.name for leg in dataset.machine.legs if motors & {leg.motor_label, leg.name}}
+    causes = [*_not_round(dataset.machine.legs, solution.outlines), *causes]
     symptoms = (
         []
         if causes
@@ -256,6 +258,45 @@ def _views(dataset: Dataset, solution: Solution, corners: Corners | None) -> lis
         remedy = "see in the notes why, and take them again, or leave them out"
         doubts.append(Doubt("images_left_out", what, remedy))
     return doubts
+
+
+def _not_round(legs: Sequence[Leg], outlines: Outlines) -> list[Doubt]:
+    """Return the parts that seldom are as wide as their cylinders, those of one radius together.
+
+    Both edges of a body that is not round are found, and their distance changes with its roll.
+    """
+    alike: dict[float, list[tuple[int, str]]] = {}
+    for j, leg in enumerate(legs):
+        for part, radius in leg.radius_along.items():
+            alike.setdefault(round(radius, 6), []).append((j, part))
+    is_wide, part_of, doubts = (
+        outlines.rejected_for(Reason.WIDTH),
+        np.array(outlines.part),
+        list[Doubt](),
+    )
+    for radius, parts in alike.items():
+        of_part = [(outlines.leg == j) & (part_of == part) for j, part in parts]
+        is_wrong = [len(np.unique(outlines.row[of & is_wide])) for of in of_part]
+        is_right = [_rows_with_both(outlines, of & outlines.used) for of in of_part]
+        n, n_wrong = sum(is_wrong) + sum(is_right), sum(is_wrong)
+        if n_wrong < max(MIN_WIDTHS, MOST_WIDTHS * n):
+            continue
+        names = [part for (_, part), wrong in zip(parts, is_wrong, strict=True) if wrong]
+        what = (
+            f"the edges of {few(names)} are not as far apart as those of a cylinder of radius "
+            f"{1e3 * radius:.3g} mm in {n_wrong} of the {n} times that both were seen"
+        )
+        remedy = (
+            "if it is not round, draw it as a box in the URDF, or leave it out; else correct its "
+            "radius"
+        )
+        doubts.append(Doubt("not_round", what, remedy))
+    return doubts
+
+
+def _rows_with_both(outlines: Outlines, of: BoolArray) -> int:
+    """Return the number of images with both outlines of a part."""
+    return int(np.sum(np.bincount(outlines.row[of]) > 1))
 
 
 def _few_outlines(outlines: Outlines) -> list[Doubt]:
