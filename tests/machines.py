@@ -13,9 +13,8 @@ import legcal
 from legcal.descriptions.new_model import Created, Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, LegKind, main_cylinders
+from legcal.machine.leg import LegKind, main_cylinders
 from legcal.machine.model import Machine
-from legcal.machine.parameters import free_coordinates
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -276,11 +275,3 @@ def four_upu() -> MachineSpec:
         for a, b, axis, kind in zip(A, B, axes, ["actuated"] * 3 + ["passive"], strict=True)
     )
     return MachineSpec(legs, RigidTransform.from_translation([0.0, 0.0, 0.4]))
-
-
-def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> KinematicParameters:
-    """Return the parameters of a vector in the order of :func:`to_vector`."""
-    free = free_coordinates(n_legs, frame_legs)
-    base, platform = np.zeros((n_legs, 3)), np.zeros((n_legs, 3))
-    base[free], platform[free], offsets = np.split(vector, [free.sum(), 2 * free.sum()])
-    return KinematicParameters(base, platform, offsets.copy())
