@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import yaml
 from clicked_joints import camera_beside, seen_from, write_clicks
-from command_outcomes import run, words_of
+from command_line import run, words_of
 from dataset_folder import JOINTS, SERVOS, dataset_of_readings
 from machines import TRIPOD
 from made_inputs import ROOT, copy_of
@@ -68,7 +68,7 @@ class Refusal:
             edit(spoiled)
         before = _files(folder)
         places: dict[str, Path | str] = {"in": spoiled, "out": folder / "out", "here": folder}
-        outcome = run([*words_of(self.command, places), "--json"], inside=folder)
+        outcome = run(*words_of(self.command, places), "--json", inside=folder)
         assert outcome.code != 0, f"{self.name} was not refused: {outcome.out[:200]}"
         after = _files(folder)
         error = outcome.document["error"]

@@ -90,15 +90,13 @@ def out(of_one_view: Path, tmp_path: Path) -> Path:
 
 
 def test_folder_json_and_summary_tell_the_same(
-    examined: Examination,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    examined: Examination, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = folder
     monkeypatch.setattr("legcal.calibration.doctor.doctor", lambda *_, **__: examined)
-    assert run(monkeypatch, "detect", "dataset", "-o", out, "--json") == 1  # c2 shows no leg
-    document = json.loads(capsys.readouterr().out)
+    outcome = run("detect", "dataset", "-o", out, "--json")
+    assert outcome.code == 1  # c2 shows no leg
+    document = outcome.document
     rows = read_rows(out / "observations.csv")
     assert document["outlines"] == len(rows)
     assert document["used"] == sum(row["verdict"] == "used" for row in rows) > 20

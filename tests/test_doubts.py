@@ -2,7 +2,6 @@
 
 import ast
 import io
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -317,14 +316,13 @@ def test_exit_code_document_summary_and_page_agree(
     calibrated: Callable[[Spoil], Calibration],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     calibration, out = calibrated(spoil), tmp_path / "result"
     folder = calibration.dataset.folder
     again = Run(folder, out, calibration, ()).written_again
     monkeypatch.setattr("legcal.calibration.pipeline.calibrate", again)
-    code = run(monkeypatch, "calibrate", folder, "-o", out, "--json")
-    printed = json.loads(capsys.readouterr().out)
+    outcome = run("calibrate", folder, "-o", out, "--json")
+    code, printed = outcome.code, outcome.document
     following = printed.pop("next")  # in what is printed alone
     written = load_result(out).result
     read = load_result(out).verdict

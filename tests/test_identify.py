@@ -410,13 +410,12 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
 
 
 @pytest.mark.usefixtures("without_remedies")
-def test_the_document_is_that_of_the_report(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_document_is_that_of_the_report() -> None:
     found = report("hexapod", VIEWS[2], board=True)
     words = [word for view in found.views for word in ("--view", ",".join(view))]
-    assert run(monkeypatch, "identify", "hexapod", *words, "--board", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    outcome = run("identify", "hexapod", *words, "--board", "--json")
+    assert outcome.code == 0
+    document = outcome.document
     assert document == json.loads(json.dumps(found.document()))
     sizes = {"spatial": True, "n": 6, "n_d": 3, "r": 0, "n_ac": 6}
     assert {k: document[k] for k in sizes} == sizes

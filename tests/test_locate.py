@@ -1,6 +1,5 @@
 """``legcal locate``: what poses of real machines determine, outliers, the table, files, the fit."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -300,23 +299,24 @@ def in_part() -> Location:
     return locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
 
 
-def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(tmp_path: Path) -> None:
     hexapod = made("hexapod", 5)
     position = hexapod.poses.position.copy()
     position[4] += 0.05
     write_poses(tmp_path / "poses.csv", hexapod, replace(hexapod.poses, position=position))
-    words: list[str | Path] = ["hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml"]
-    assert run(monkeypatch, "locate", *words, "--urdf", tmp_path / "out", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    words = ("locate", "hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml")
+    outcome = run(*words, "--urdf", tmp_path / "out", "--json")
+    assert outcome.code == 0
+    document = outcome.document
     names = [Path(p).relative_to(tmp_path).as_posix() for p in document.pop("written")]
     assert names == ["out/models/hexapod.yaml", "out/urdf/hexapod.urdf", "a.yaml"]
     assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == document
-    assert run(monkeypatch, "locate", *words, "--tool-position", "0,0,5mm") == 0
-    assert "Row 5 was left out: 8" in " ".join(capsys.readouterr().out.split())
-    assert run(monkeypatch, "locate", *words, "--position-sigma", "0.001mm") == 1
-    assert "Doubtful" in capsys.readouterr().out
+    outcome = run(*words, "--tool-position", "0,0,5mm")
+    assert outcome.code == 0
+    assert "Row 5 was left out: 8" in outcome.said
+    outcome = run(*words, "--position-sigma", "0.001mm")
+    assert outcome.code == 1
+    assert "Doubtful" in outcome.out
     assert yaml.safe_load((tmp_path / "a.yaml").read_text())["status"] == "doubtful"
 
 

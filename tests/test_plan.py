@@ -158,17 +158,16 @@ def test_the_command_writes_what_python_plans(
     planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
     session, lens = tmp_path / "session", tmp_path / "lens.yaml"
     lens.write_text(f"# calibrated\n{camera_info(planned.camera, 'lens')}")
-    assert run(monkeypatch, *WORDS, "--camera", lens, "--json", "-o", session) == 0
+    outcome = run(*WORDS, "--camera", lens, "--json", "-o", session)
+    assert outcome.code == 0
     assert (session / "camera_info.yaml").read_bytes() == lens.read_bytes()
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == planned.document() == json.loads((session / "plan.json").read_text())
+    assert outcome.document == planned.document() == json.loads((session / "plan.json").read_text())
     header = (session / "dataset.yaml").read_text().partition("\n")[0]
     assert (session / header.rpartition("=")[2]).name == "dataset.json"
     assert (session / header.rpartition("=")[2]).is_file()
@@ -190,7 +189,6 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
 
     def stopped(*found: Any, **more: Any) -> Any:
@@ -203,10 +201,10 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
-    assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
-    printed = capsys.readouterr()
-    assert json.loads(printed.out)["error"]["kind"] == "Interrupted"
-    assert f"written to {tmp_path / 'session'}, with the best plan" in printed.err
+    outcome = run(*WORDS, "--json", "-o", tmp_path / "session")
+    assert outcome.code == 130
+    assert outcome.document["error"]["kind"] == "Interrupted"
+    assert f"written to {tmp_path / 'session'}, with the best plan" in outcome.err
     document = json.loads((tmp_path / "session" / "plan.json").read_text())
     assert document["images"] == 6
     assert planned.value < document["value"] < planned.growth[1, 1]
