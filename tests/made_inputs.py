@@ -110,5 +110,5 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "tables": _tables,
     "tool-poses": _tool_poses,
     "result": _result,
-    **{style: _written(style) for style in ("mjcf bodies", "loop_joint", "gepetto")},
+    **{style: _written(style) for style in ("mjcf", "loop_joint", "gepetto")},
 }

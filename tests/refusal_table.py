@@ -938,7 +938,7 @@ def _formats() -> Iterable[Refusal]:
         ("outside", tied("leg1_seat", "leg2_tube"),
          ("check <equality>", "--base LINK --platform LINK")),
     ]  # fmt: skip
-    yield from _of_file("mjcf", "machine.xml", "mjcf bodies", mjcf)
+    yield from _of_file("mjcf", "machine.xml", "mjcf", mjcf)
     rest: Rows = [
         ("all-at-once",
          (swap("machine.xml", motor, '<position joint="leg1"/>'),
@@ -949,7 +949,7 @@ def _formats() -> Iterable[Refusal]:
         ("two-mechanisms", _second_mechanism,
          ("found 2 mechanisms, which have no moving body in common",)),
     ]  # fmt: skip
-    yield from _spoiled("mjcf", "inspect {in}/machine.xml", "mjcf bodies", rest)
+    yield from _spoiled("mjcf", "inspect {in}/machine.xml", "mjcf", rest)
     link1 = '<link1 link="leg1_tube"'
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
