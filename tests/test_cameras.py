@@ -133,21 +133,6 @@ def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) 
     assert undistort_with_derivatives(camera, PIXELS, (), near)[1].shape == (2, 2, 2, 0)
 
 
-def test_intrinsics_are_those_of_the_model() -> None:
-    plumb_bob = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-    for camera, names in (
-        (PLAIN, plumb_bob),
-        (FIVE, plumb_bob),
-        (CAMERAS[2], plumb_bob),
-        (CAMERAS[3], (*plumb_bob, "k4", "k5", "k6")),
-        (CAMERAS[4], (*plumb_bob, "k4", "k5", "k6", "s1", "s2", "s3", "s4")),
-        (CAMERAS[5], ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
-        (PINHOLE, ("fx", "fy", "cx", "cy")),  # it has skew, which OpenCV's distortion lacks
-    ):
-        assert intrinsic_names(camera) == names
-    assert [intrinsic_unit(name) for name in ("fx", "cy", "k1", "p2")] == ["px", "px", "", ""]
-
-
 def test_views_of_one_camera_share_its_intrinsics_in_any_order() -> None:
     again = Camera(STRAIGHT.copy(), *SIZE, np.zeros(5))  # the same camera, written at length
     for names, cameras in (

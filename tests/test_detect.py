@@ -17,12 +17,11 @@ from command_line import run
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from lxml import html
-from outline_tables import assert_same
 from scipy.spatial.transform import RigidTransform
 
-from legcal import detect, doctor, load_dataset
+from legcal import detect, doctor
 from legcal.calibration.detection import Detection, Examination
-from legcal.data.outlines import QUALITY, Outlines, read_observations, unmeasured
+from legcal.data.outlines import Outlines, unmeasured
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
@@ -192,16 +191,6 @@ def test_a_served_page_answers_its_own_browser_alone(
         assert (row["joint"], float(row["u"]), float(row["v"])) == ("leg1.base", 5.0, 6.0)
     finally:
         server.close()
-
-
-def test_the_written_table_is_read_as_what_was_found(
-    session: Spoiled, found: Detection, folder: Path
-) -> None:
-    dataset = load_dataset(session.path)
-    path, legs = folder / "observations.csv", dataset.machine.legs
-    assert_same(read_observations(path, legs, dataset.measurements), found.outlines)
-    for name in QUALITY:
-        assert np.all(np.isfinite(getattr(found.outlines, name)[found.outlines.used]))
 
 
 def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(out: Path) -> None:

@@ -110,18 +110,3 @@ def test_motors_that_turn_know_their_size_as_well_as_the_mean_of_the_radii() -> 
     wanted = relative / np.sqrt(len(design.parts))
     for leg, name in zip(design.legs.nominal, design.legs.names, strict=True):
         assert sigma[f"{name}.length"] / leg.q0 == pytest.approx(wanted, rel=1e-3)
-
-
-def test_noise_of_sessions_has_the_covariance_that_outlines_carry() -> None:
-    design = _design("3-rpr")
-    exact, offsets, readings = design.outlines, [], []
-    for seed in range(40):
-        session = _session("3-rpr", seed=seed)
-        xy = design.camera.undistort(session.outlines.ends)
-        offsets.append(design.camera.line_offset(exact.h[:, None], xy))
-        readings.append(session.measurements.q - design.q[design.pose])
-    root = np.linalg.cholesky(exact.covariance)
-    white = np.linalg.solve(root, np.array(offsets)[..., None])[..., 0].reshape(-1, 2)
-    assert np.allclose(white.T @ white / len(white), np.eye(2), atol=0.05)
-    assert np.std(readings) == pytest.approx(NOISE.sigma_q, rel=0.05)
-    assert np.array_equal(design.outlines.covariance, session.outlines.covariance)
