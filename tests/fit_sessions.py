@@ -15,12 +15,7 @@ from outline_sessions import NONCOPLANAR, closed_poses, moved_poses, true_machin
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners
-from legcal.calibration.joint_fit.variables import (
-    FittedLegs,
-    Start,
-    fitted_legs,
-    start_from,
-)
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, unmeasured
@@ -110,7 +105,7 @@ class MachineSession:
 
     def errors(self, legs: Sequence[Leg]) -> Array:
         """Return the errors of the kinematic parameters of legs [m, rad]."""
-        return self.legs.vector(legs) - self.legs.vector(self.truth.legs)
+        return self.legs.vector(tuple(legs)) - self.legs.vector(self.truth.legs)
 
 
 def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outlines:

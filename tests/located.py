@@ -9,14 +9,11 @@ import numpy as np
 from csv_rows import write_rows
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import ToolPoses
+from legcal import Machine, ToolPoses, inverse_kinematics, load_mechanism, random_configurations
 from legcal.calibration.location.frames import PosePairs, predicted, transforms
 from legcal.geometry.rotations import rotation_matrices
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations, random_configurations
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
+from legcal.machine.configurations import Configurations
 
 SIGMA_POSITION = 0.02e-3
 SIGMA_ANGLE = float(np.radians(0.01))

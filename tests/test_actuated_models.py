@@ -8,25 +8,18 @@ import yaml
 from machines import ROOT, read_table, with_round_arms
 from scipy.spatial.transform import RigidTransform
 
+from legcal import Machine, export, forward_kinematics, inverse_kinematics, load_mechanism
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.errors import ModelError
-from legcal.exports.formats import export
 from legcal.exports.subject import Subject
 from legcal.geometry.types import Array
 from legcal.machine.home import home_of_legs
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import ARMS as ARM_KINDS
 from legcal.machine.leg import ParameterId
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, readings_at
+from legcal.machine.model import readings_at
 from legcal.machine.model_writer import write_model
-from legcal.machine.parameters import (
-    geometries,
-    moved_legs,
-    parametrization_of,
-    vector_of,
-)
+from legcal.machine.parameters import geometries, moved_legs, parametrization_of, vector_of
 from legcal.simulation.truth import write_model_with
 
 TABLES = ROOT / "models" / "tables"

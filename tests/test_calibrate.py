@@ -19,19 +19,14 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
 from scipy.spatial.transform import RigidTransform
 from simulated import files_of, simulated
 
-from legcal import calibrate, evaluate, load_mechanism, load_result
+from legcal import Calibration, calibrate, evaluate, load_mechanism, load_result
 from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
-from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
 from legcal.data.corners import found_corners
-from legcal.errors import (
-    DatasetError,
-    NotIdentifiable,
-    NotVisible,
-)
+from legcal.errors import DatasetError, NotIdentifiable, NotVisible
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of

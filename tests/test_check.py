@@ -11,7 +11,7 @@ import pytest
 from csv_rows import read_rows, write_rows
 from simulated import files_of, simulated
 
-from legcal import calibrate, check
+from legcal import Dataset, calibrate, check, load_dataset, load_mechanism
 from legcal.calibration.verification import (
     Change,
     Movement,
@@ -21,17 +21,11 @@ from legcal.calibration.verification import (
     noise_dof,
     possible_changes,
 )
-from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
-from legcal.machine.loader import load_mechanism
-from legcal.machine.parameters import (
-    geometries,
-    parametrization_of,
-    vector_of,
-)
+from legcal.machine.parameters import geometries, parametrization_of, vector_of
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 

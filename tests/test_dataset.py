@@ -10,13 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from dataset_folder import (
-    JOINTS,
-    SIZE,
-    Folder,
-    folder,
-    readings,
-)
+from dataset_folder import JOINTS, SIZE, Folder, folder, readings
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
@@ -24,12 +18,7 @@ from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError
 from legcal.geometry.types import Image
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import (
-    BadImage,
-    image_size,
-    inspect_image,
-    read_image,
-)
+from legcal.vision.image_file import BadImage, image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 

@@ -14,10 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 import legcal
-from legcal import calibrate
-from legcal.calibration.result import Calibration
+from legcal import Calibration, Machine, calibrate
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.machine.model import Machine
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 

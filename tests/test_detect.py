@@ -26,9 +26,7 @@ from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
-from legcal.perception.overlays import (
-    marks_of_image,
-)
+from legcal.perception.overlays import marks_of_image
 from legcal.viewer.click_server import ClickServer
 from legcal.viewer.server import TOKEN_HEADER
 from legcal.vision.camera import Camera

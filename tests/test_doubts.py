@@ -21,6 +21,8 @@ from rich.console import Console
 from simulated import simulated
 
 from legcal import (
+    Calibration,
+    Machine,
     SimulationSettings,
     calibrate,
     load_dataset,
@@ -33,10 +35,8 @@ from legcal.calibration.documents import Doubt
 from legcal.calibration.doubts import model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
-from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
-from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
 from legcal.report.calibration import next_steps, summary
 from legcal.simulation.settings import Level

@@ -16,12 +16,7 @@ from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.paper.criteria import Criteria
-from legcal.paper.four_steps import (
-    StagedResult,
-    run_base_steps,
-    run_platform_steps,
-    run_steps,
-)
+from legcal.paper.four_steps import StagedResult, run_base_steps, run_platform_steps, run_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 from legcal.simulation.observe import moved_outlines
 from legcal.simulation.paper import platform_errors

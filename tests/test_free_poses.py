@@ -15,20 +15,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
+from legcal import LegcalError, Machine, load_mechanism, simulate
 from legcal.calibration.joint_fit.fit import refine
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import LegcalError, NotIdentifiable, UsageError
+from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry.motions import look_at, pose_distance
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, vector_of
 from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.free_poses import find_free_poses
 from legcal.perception.pair_matching import leg_segments
 from legcal.perception.placement import Search
-from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Level
 from legcal.vision.camera import Camera
 from legcal.workers import in_turn

@@ -23,7 +23,7 @@ from rich.console import Console
 from uncertainty import compared
 
 import legcal
-from legcal import identifiability
+from legcal import Dataset, Machine, identifiability, load_dataset
 from legcal.calibration.identify.identifiability import (
     Analysis,
     check_identifiable,
@@ -34,13 +34,11 @@ from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import Session, planned_session, recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
-from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
 from legcal.errors import NotIdentifiable
 from legcal.geometry.motions import motion_of
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.model import Machine
 from legcal.machine.parameters import parametrization_of, parametrize
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.paper.four_steps import run_steps

@@ -30,12 +30,7 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import (
-    FittedLegs,
-    RefinementSettings,
-    Start,
-    State,
-)
+from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings, Start, State
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable

@@ -11,14 +11,12 @@ from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 
-from legcal import calibrate
+from legcal import Calibration, calibrate, load_dataset, load_mechanism
 from legcal.calibration.doubts import click_notes
-from legcal.calibration.result import Calibration, Verdict
+from legcal.calibration.result import Verdict
 from legcal.calibration.verdict import judge
-from legcal.data.dataset import load_dataset
 from legcal.data.landmarks import Landmarks, joint_name
 from legcal.geometry.motions import components, pose_distance
-from legcal.machine.loader import load_mechanism
 from legcal.machine.model import readings_at
 from legcal.machine.rods import ends_at_poses
 

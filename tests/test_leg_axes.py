@@ -7,22 +7,13 @@ import pytest
 from fit_sessions import PINHOLE, irregular_hexapod, machine_session
 from scipy.spatial.transform import Rotation
 
-from legcal.data.outlines import (
-    LegAxes,
-    axes_of_table,
-)
+from legcal.data.outlines import LegAxes, axes_of_table
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
-from legcal.simulation.observe import (
-    TableNoise,
-    table_of,
-    table_of_lines,
-)
+from legcal.simulation.observe import TableNoise, table_of, table_of_lines
 from legcal.vision.camera import Camera, sample_camera
-from legcal.vision.cylinder import (
-    direction_of_angles,
-)
+from legcal.vision.cylinder import direction_of_angles
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 

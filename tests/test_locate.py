@@ -30,12 +30,7 @@ from located import (
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal import (
-    Location,
-    ToolPoses,
-    load_mechanism,
-    locate,
-)
+from legcal import Location, ToolPoses, load_mechanism, locate
 from legcal.calibration.location.document import write_located_model
 from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (

@@ -13,15 +13,12 @@ import yaml
 from model_formats import FORMATS, write_format
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import load_mechanism
-from legcal.errors import LegcalError, UsageError
+from legcal import LegcalError, Machine, load_mechanism
+from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.machine.chain import ClosedChain
 from legcal.machine.mjcf import MjcfReader
-from legcal.machine.model import Machine
-from legcal.machine.model_writer import (
-    write_model,
-)
+from legcal.machine.model_writer import write_model
 from legcal.machine.spanning_tree import close_loops
 from legcal.machine.urdf import XmlProblems, parse_xml
 

@@ -10,16 +10,22 @@ import pytest
 import yaml
 from simulated import simulated
 
-from legcal import calibrate, load_dataset, load_mechanism
-from legcal.calibration.identify.identifiability import identifiability
+from legcal import (
+    Calibration,
+    ParameterErrors,
+    Spread,
+    calibrate,
+    identifiability,
+    load_dataset,
+    load_mechanism,
+)
 from legcal.calibration.joint_fit.parameter_choices import Group
 from legcal.calibration.joint_fit.part_errors import part_errors, with_zeros
 from legcal.calibration.joint_fit.variables import fitted_legs
-from legcal.calibration.result import Calibration
 from legcal.errors import UsageError
 from legcal.machine.parameters import geometries, in_joint_frames, vector_of
 from legcal.machine.tolerance import TYPICAL
-from legcal.simulation.settings import Distribution, ParameterErrors, Spread
+from legcal.simulation.settings import Distribution
 
 TOOTH = 2.0 * np.pi / 25
 

@@ -34,9 +34,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     possible_biases,
 )
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import (
-    with_edge_biases,
-)
+from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.calibration.tuning import LIMB_GAMMA_SIGMA

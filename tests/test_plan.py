@@ -19,16 +19,18 @@ from csv_rows import read_rows
 from scipy.spatial.transform import RigidTransform
 
 import legcal
-from legcal.calibration.joint_fit.predicted import (
-    WHITE,
+from legcal import (
+    Machine,
+    SimulationSettings,
+    inverse_kinematics,
+    load_dataset,
+    load_mechanism,
+    simulate,
 )
-from legcal.data.dataset import load_dataset
+from legcal.calibration.joint_fit.predicted import WHITE
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
 from legcal.machine.configurations import Configurations
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import choose
@@ -36,8 +38,7 @@ from legcal.planning.places import Place, Setting, default_setting, parse_bounds
 from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
 from legcal.planning.session import Plan, write_session
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.settings import Level
 from legcal.vision.camera import sample_camera
 from legcal.vision.camera_file import camera_info
 

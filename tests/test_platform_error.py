@@ -5,17 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from legcal import evaluate
+from legcal import Machine, evaluate, load_mechanism, random_configurations
 from legcal.calibration.joint_fit.platform import (
     expected_error,
     platform_accuracy,
     platform_by_parameters,
 )
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import (
     Parametrization,

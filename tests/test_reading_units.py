@@ -13,11 +13,10 @@ from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
 from test_init import own_folder
 
-from legcal.data.dataset import load_dataset
+from legcal import LegcalError, load_dataset, load_mechanism
 from legcal.data.reading_units import sigmas_of
 from legcal.descriptions.new_model import create_model
-from legcal.errors import LegcalError, ModelError, UsageError
-from legcal.machine.loader import load_mechanism
+from legcal.errors import ModelError, UsageError
 from legcal.machine.model_writer import write_model
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]

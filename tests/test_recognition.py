@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal import inverse_kinematics, load_mechanism, random_configurations
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.geometry.types import Array, Image
-from legcal.machine.configurations import random_configurations
-from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import Cylinder
-from legcal.machine.loader import load_mechanism
 from legcal.perception import recognition
 from legcal.perception.camera_search import (
     PoseCandidates,
@@ -39,11 +37,7 @@ from legcal.perception.pair_matching import (
     match_pairs,
 )
 from legcal.perception.placement import Group, Search, group_views
-from legcal.perception.view_fit import (
-    ViewFit,
-    fit_view,
-    min_evidence,
-)
+from legcal.perception.view_fit import ViewFit, fit_view, min_evidence
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

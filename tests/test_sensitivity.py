@@ -5,12 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from fit_sessions import (
-    PINHOLE,
-    MachineSession,
-    irregular_hexapod,
-    with_camera,
-)
+from fit_sessions import PINHOLE, MachineSession, irregular_hexapod, with_camera
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices

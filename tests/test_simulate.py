@@ -15,25 +15,25 @@ from boards import CHARUCO
 from simulated import files_of, settings, simulated, small_camera
 
 import legcal
-from legcal.data.dataset import load_dataset
-from legcal.data.outlines import read_observations
-from legcal.errors import NotVisible, UsageError
-from legcal.files.motions import motion_from_xyz_quat
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
-from legcal.perception.board_adjustment import camera_poses_by_board
-from legcal.perception.board_corners import find_corners
-from legcal.simulation.cameras import mild_lens, read_lens
-from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset, simulate
-from legcal.simulation.observe import OutlineNoise, Viewpoint
-from legcal.simulation.settings import (
-    Distribution,
-    Level,
+from legcal import (
+    Machine,
     ParameterErrors,
     SimulationSettings,
     Spread,
-    requested,
+    Viewpoint,
+    load_dataset,
+    load_mechanism,
+    simulate,
 )
+from legcal.data.outlines import read_observations
+from legcal.errors import NotVisible, UsageError
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.perception.board_adjustment import camera_poses_by_board
+from legcal.perception.board_corners import find_corners
+from legcal.simulation.cameras import mild_lens, read_lens
+from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset
+from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.settings import Distribution, Level, requested
 from legcal.vision.board import parse_board
 
 FEW = settings(poses=1, views=1)

@@ -11,14 +11,13 @@ import pytest
 from machines import ROOT
 from scipy.spatial.transform import RigidTransform
 
+from legcal import Machine, forward_kinematics, inverse_kinematics, load_mechanism, singularity
 from legcal.errors import DatasetError, DidNotConverge, ModelError
 from legcal.geometry.types import Array
-from legcal.machine.closing import dimensionless, is_on_same_side, singularity
+from legcal.machine.closing import dimensionless, is_on_same_side
 from legcal.machine.configurations import JITTER, MIN_SINGULARITY, Configurations
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.model import vectors_A_to_B
 from legcal.simulation import session as module
 from legcal.simulation.session import commanded_poses, draw_poses, given_poses
 from legcal.simulation.settings import DEFAULT_ERRORS, Sampling

@@ -10,10 +10,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
+from legcal import Machine, load_mechanism
 from legcal.errors import ModelError
-from legcal.machine.loader import load_mechanism
 from legcal.machine.meshes import ray_caster
-from legcal.machine.model import Machine
 from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import (
     Box,

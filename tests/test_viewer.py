@@ -16,8 +16,7 @@ from hexapod_example import HEXAPOD, Run
 from layouts import Layout, write_machine
 from machines import of_types
 
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.loader import load_mechanism
+from legcal import inverse_kinematics, load_mechanism
 from legcal.viewer.server import Address
 from legcal.viewer.source import Photographs, Source, open_source
 from legcal.viewer.view_server import Motion, ViewServer
