@@ -103,6 +103,12 @@ class MachineSession:
         radii = {part: radius for (_, part), radius in self.legs.radii.items()}
         return axes_from_outlines(self.outlines, self.measurements, radii)
 
+    @property
+    def true_values(self) -> dict[str, float]:
+        """The true kinematic parameters, counted from the nominal legs."""
+        values = self.legs.vector(self.truth.legs).tolist()
+        return dict(zip(self.legs.parametrization.names, values, strict=True))
+
     def errors(self, legs: Sequence[Leg]) -> Array:
         """Return the errors of the kinematic parameters of legs [m, rad]."""
         return self.legs.vector(tuple(legs)) - self.legs.vector(self.truth.legs)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_sessions import MachineSession, body_edges, machine_session
+from machines import ROOT
 from simulated import PLACES, settings, small_camera
 
 from legcal import Viewpoint, calibrate, load_dataset, load_mechanism, simulate
@@ -26,7 +27,6 @@ from legcal.perception.photographs import nominal_placement
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.settings import Level
 
-ROOT = Path(__file__).parents[1]
 BODY = (
     '<visual><origin xyz="0.004 -0.003 -0.255" rpy="0 0 0"/>'
     '<geometry><box size="0.03 0.03 0.11"/></geometry></visual>'

@@ -42,16 +42,10 @@ from legcal.machine.leg import ARMS, ParameterId, radius_name
 from legcal.simulation.observe import moved_outlines
 
 
-def true_values(session: MachineSession) -> dict[str, float]:
-    """Return the true kinematic parameters, counted from the nominal legs, and radii."""
-    legs = session.legs
-    kinematic = legs.vector(session.truth.legs).tolist()
-    values = dict(zip(legs.parametrization.names, kinematic, strict=True))
-    return values | {radius_name(legs.names[j], part): r for (j, part), r in legs.radii.items()}
-
-
 def errors(session: MachineSession, found: Solution) -> dict[str, float]:
-    truth = true_values(session)
+    legs = session.legs
+    radii = {radius_name(legs.names[j], part): r for (j, part), r in legs.radii.items()}
+    truth = session.true_values | radii
     return {
         name: abs(found.estimates.values[name] - truth[name])
         for name in found.estimates.names

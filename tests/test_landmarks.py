@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from dataset_folder import dataset_of_readings
+from machines import ROOT
 from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 from simulated import simulated
@@ -21,8 +22,6 @@ from legcal.machine.model import readings_at
 from legcal.machine.rods import ends_at_poses
 
 pytestmark = pytest.mark.usefixtures("without_steps")
-
-ROOT = Path(__file__).parents[1]
 
 
 def without_motors(text: str) -> str:

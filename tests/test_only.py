@@ -1,6 +1,5 @@
 """``--only``: tolerances as priors, one group of parameters, horns on other teeth."""
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from csv_rows import read_rows, write_rows
 from simulated import simulated
 
 from legcal import (
@@ -42,13 +42,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "dataset.yaml").write_text(
         yaml.safe_dump({**entry, "machine_kind": "machined", "spline_teeth": 25})
     )
-    with (folder / "measurements.csv").open() as table:
-        header, *rows = csv.reader(table)
-    column = header.index("servo4")
-    for row in rows:
-        row[column] = repr(float(row[column]) - TOOTH)
-    with (folder / "measurements.csv").open("w") as table:
-        csv.writer(table).writerows([header, *rows])
+    rows = read_rows(folder / "measurements.csv")
+    turned = [row | {"servo4": repr(float(row["servo4"]) - TOOTH)} for row in rows]
+    write_rows(folder / "measurements.csv", turned)
     return folder
 
 

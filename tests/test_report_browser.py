@@ -129,6 +129,15 @@ def detection(examined: tuple[Path, Examination]) -> tuple[Path, Detection]:
     return folder, found.detection
 
 
+def _downloaded(path: Path) -> str:
+    """Wait for a file and return its text."""
+    end = time.monotonic() + PATIENCE
+    while not path.exists():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return path.read_text("utf-8")
+
+
 class Editor:
     """The editor of a page, used as people do."""
 
@@ -202,11 +211,7 @@ class Editor:
         path = self.downloads / "observations.csv"
         path.unlink(missing_ok=True)
         self.find("[data-download]").click()
-        end = time.monotonic() + PATIENCE
-        while not path.exists():
-            assert time.monotonic() < end
-            time.sleep(0.02)
-        return path.read_text("utf-8")
+        return _downloaded(path)
 
 
 def _rows(text: str) -> list[dict[str, str]]:
@@ -348,14 +353,6 @@ class Placer:
         return float(self.browser.execute_script(script))
 
 
-def _downloaded(path: Path) -> list[dict[str, str]]:
-    end = time.monotonic() + PATIENCE
-    while not path.exists():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return _rows(path.read_text("utf-8"))
-
-
 def test_a_photograph_fills_the_editor_on_a_telephone(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:
@@ -395,7 +392,7 @@ def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
         placer.click(seen[joint])
     placer.press_delete("leg6.platform")
     placer.find("[data-landmarks]").click()
-    table = _downloaded(tmp_path / "landmarks.csv")
+    table = _rows(_downloaded(tmp_path / "landmarks.csv"))
     clicked = {line["joint"]: np.array([float(line["u"]), float(line["v"])]) for line in table}
     assert list(clicked) == ["leg1.base", "leg2.base", "leg4.base", "leg1.platform",
                              "leg3.platform", "leg5.platform"]  # fmt: skip

@@ -295,10 +295,6 @@ def machine() -> Machine:
     return load_mechanism("3-rps")
 
 
-def _truth(folder: Path) -> dict[str, Any]:
-    return dict(json.loads((folder / "truth" / "truth.json").read_text()))
-
-
 def _with_board(factory: pytest.TempPathFactory, **settings: Any) -> Path:
     folder = factory.mktemp("board") / "session"
     simulate(machine(), folder, SimulationSettings(level=Level.OUTLINES, views=1, **settings))
@@ -322,7 +318,7 @@ def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
     assert corners is not None
     assert T_base_board is not None
     view = dataset.measurements.views[0]
-    truth = _truth(standing)["views"]["c1"]["T_base_camera"]
+    truth = truth_of(standing)["views"]["c1"]["T_base_camera"]
     T = motion_from_xyz_quat(**truth).inv() * T_base_board
     exact = view.camera.project(T.apply(board.points))[corners.corner]
     assert len(corners) >= 2 * 0.5 * board.n_corners
@@ -338,7 +334,7 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
     poses, _ = camera_poses_by_board(
         dataset.corners, dataset.boards[0].board, m, [view.name for view in m.views]
     )
-    truth = _truth(held)
+    truth = truth_of(held)
     T_base_board = parse_board(truth["board"], held).T_link_board
     assert T_base_board is not None
     places = []
@@ -360,7 +356,7 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     assert dataset.corners is None
     board = dataset.boards[0].board
     number, px, sigma = find_corners(board, dataset.image_reader([0])(0))
-    truth = _truth(tmp_path / "seen")
+    truth = truth_of(tmp_path / "seen")
     T_base_board = parse_board(truth["board"], tmp_path).T_link_board
     assert T_base_board is not None
     T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board

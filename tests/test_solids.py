@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from machines import ROOT
 from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
@@ -25,7 +26,6 @@ from legcal.simulation.solids import (
     solids_of,
 )
 
-ROOT = Path(__file__).resolve().parents[1]
 STL = b"""solid one
 facet normal 0 0 1
 outer loop

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import ROOT
 
 import legcal
 from legcal.errors import NotVisible
@@ -150,9 +150,6 @@ def test_what_sight_predicts_of_legs_is_what_rays_at_their_solids_meet(name: str
 
 
 # Solids that are not measured
-
-
-ROOT = Path(__file__).parents[1]
 
 
 def visual(shape: str, xyz: str, rpy: str = "0 0 0") -> str:
