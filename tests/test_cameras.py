@@ -289,7 +289,6 @@ def test_files_of_all_programs_are_read_and_written_for_ros(
         (f"1 PINHOLE 1024 768 {AT_CORNER}\n2 PINHOLE 1024 768 {AT_CORNER}\n", ("2 cameras",)),
         ("1 PINHOLE 1024\n", ("camera 1 could not be read", "'1024'", "width and height")),
         ("1 PINHOLE 1024 768 1.2.3 1 5 5\n", ("'1.2.3'", "parameters of PINHOLE")),
-        (f"1 PINHOLE 1e400 768 {AT_CORNER}\n", ("'1e400'", "COLMAP's cameras.txt")),
         (MATLAB | {"K": 3 * [[1.0, 2.0]]}, ("K could not be used", "three rows of three numbers")),
         (opencv("a.yaml", PLUMB_BOB, camera_model="fisheye"),
          ("found 5 coefficients, needed 4 for equidistant",)),

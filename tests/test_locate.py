@@ -228,8 +228,6 @@ def _unreachable() -> Located:
     [
         (lambda: near_home("hexapod", 10, 0.02, (0, 0, 1)), {}, NotIdentifiable,
          ("tool in the platform along (0, 0, 1)", "another axis")),
-        (lambda: near_home("hexapod", 10, 0.0, (0, 0, 1)), {}, NotIdentifiable,
-         ("these 10 poses",)),
         (_along_a_line, {}, NotIdentifiable, ("displaced in another direction",)),
         (lambda: _rows([0]), {}, NotIdentifiable, ("1 pose", "3 poses")),
         (lambda: _rows([0, 1, 2], oriented=False), {}, NotIdentifiable, ("4 poses", "positions")),
