@@ -347,21 +347,19 @@ def place_of_board(session: MachineSession) -> RigidTransform:
     return RigidTransform.from_components(middle, turn)
 
 
-def corners_of(
-    session: MachineSession, board: Board = BOARD, *, seed: int | None = None
-) -> Corners:
+def corners_of(session: MachineSession, *, seed: int | None = None) -> Corners:
     """Return the corners in every image, exact or with the errors that they claim."""
     T_Rb_board = place_of_board(session)
     seen, views = [], session.measurements.view
     for row, v in enumerate(views.tolist()):
         camera = session.measurements.views[v].camera
-        in_camera = (session.truth.T_camera_Rb[v] * T_Rb_board).apply(board.points)
+        in_camera = (session.truth.T_camera_Rb[v] * T_Rb_board).apply(BOARD.points)
         seen.append((np.full(len(in_camera), row), camera.project(in_camera)))
     of_row = np.concatenate([r for r, _ in seen])
     px: Array = np.concatenate([p for _, p in seen])
     if seed is not None:
         px = px + SIGMA_PX * np.random.default_rng(seed).standard_normal(px.shape)
-    corner = np.tile(np.arange(board.n_corners), len(views))
+    corner = np.tile(np.arange(BOARD.n_corners), len(views))
     return found_corners(of_row, corner, px, np.full(len(px), SIGMA_PX))
 
 

@@ -132,9 +132,7 @@ def origin(T: RigidTransform) -> str:
     return f'<origin xyz="{numbers(T.translation)}" rpy="{numbers(rpy)}"/>'
 
 
-def write_machine(
-    folder: Path, description: MachineSpec, layout: Layout, name: str = "machine"
-) -> Path:
+def write_machine(folder: Path, description: MachineSpec, layout: Layout) -> Path:
     """Write a machine in a layout and return its YAML."""
     text = Text()
     text.link("base")
@@ -176,8 +174,8 @@ def write_machine(
         "legcal": block,
     }  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.urdf").write_text(text.robot(name))
-    path = folder / f"{name}.yaml"
+    (folder / "machine.urdf").write_text(text.robot("machine"))
+    path = folder / "machine.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
     return path
 

@@ -86,9 +86,9 @@ def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> 
     return np.array([T.as_matrix()[:3] for T in (T_world_base, T_platform_tool)])
 
 
-def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8, seed: int = 0) -> PosePairs:
+def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8) -> PosePairs:
     """Return exact tool poses of a platform that goes anywhere within 0.1 m and 30 degrees."""
-    chance = np.random.default_rng(seed)
+    chance = np.random.default_rng(0)
     R = rotation_matrices(chance.uniform(-0.5, 0.5, (n, 3)))
     t = chance.uniform(-0.1, 0.1, (n, 3)) + np.array([0.0, 0.0, 0.4])
     blank = PosePairs(R, t, np.tile(np.eye(3), (n, 1, 1)), t, np.ones(n, dtype=np.bool_), 0.1)
@@ -119,7 +119,7 @@ def motion_error(T: RigidTransform, true: RigidTransform) -> Array:
 
 
 def write_poses(
-    path: Path, machine: Located, poses: ToolPoses | None = None, *, quaternions: bool = True
+    path: Path, machine: Located, poses: ToolPoses | None = None
 ) -> list[dict[str, str]]:
     """Write the table of measured poses and return its rows."""
     poses = machine.poses if poses is None else poses
@@ -128,9 +128,8 @@ def write_poses(
     for q, p, M in zip(poses.q, poses.position, poses.rotation, strict=True):
         numbers = dict(zip(joints, q[list(machine.machine.motors)], strict=True))
         numbers |= dict(zip("xyz", p, strict=True))
-        if quaternions:
-            quaternion = Rotation.from_matrix(M).as_quat()
-            numbers |= dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
+        quaternion = Rotation.from_matrix(M).as_quat()
+        numbers |= dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
         rows.append({name: repr(float(x)) for name, x in numbers.items()})
     write_rows(path, rows)
     return rows

@@ -143,9 +143,9 @@ def write_table(folder: Path, **changes: Any) -> Path:
     return path
 
 
-def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Any:
+def read_table(path: Path) -> Any:
     """Return what a table describes."""
-    return description_of(path, Dimensions(unit=unit, name=name))
+    return description_of(path, Dimensions())
 
 
 def regular(legs: str, platform_radius: float = 150.0) -> Any:

@@ -77,10 +77,9 @@ def _camera_file(folder: Path) -> Path:
     return path
 
 
-def _table(motion: Motion, path: Path, times: Array, unit: str = "mm") -> Path:
+def _table(motion: Motion, path: Path, times: Array) -> Path:
     joints = [column.name for column in reading_columns(load_mechanism(MODEL).legs)]
-    scale = {"mm": 1e3, "m": 1.0}[unit]
-    rows = [",".join([f"{t + 1.7e9:.4f}", *(f"{scale * x:.6f}" for x in q)])
+    rows = [",".join([f"{t + 1.7e9:.4f}", *(f"{1e3 * x:.6f}" for x in q)])
             for t, q in zip(times, motion.readings(times), strict=True)]  # fmt: skip
     path.write_text("\n".join([",".join(["time", *joints]), *rows]))
     return path

@@ -38,14 +38,13 @@ endsolid one
 """
 
 
-def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Machine:
-    """Return the hexapod with visuals on its platform and materials in its file."""
+def hexapod_showing(folder: Path, visuals: str) -> Machine:
+    """Return the hexapod with visuals on its platform."""
     (folder / "models").mkdir()
     (folder / "urdf").mkdir()
     (folder / "models" / "hexapod.yaml").write_text((ROOT / "models/hexapod.yaml").read_text())
     text = (ROOT / "urdf/hexapod.urdf").read_text()
     text = text.replace('<link name="platform"/>', f'<link name="platform">{visuals}</link>')
-    text = text.replace('<link name="base"/>', f'{materials}<link name="base"/>')
     (folder / "urdf" / "hexapod.urdf").write_text(text)
     return load_mechanism(folder / "models" / "hexapod.yaml")
 
