@@ -158,9 +158,10 @@ def in_other_frames(axes: LegAxes, R: Array) -> LegAxes:
     )
 
 
-def test_turned_cameras_change_nothing() -> None:
+@pytest.mark.parametrize("name", ["3-rps", "tricept"])
+def test_turned_cameras_change_nothing(name: str) -> None:
     """Nor do other orders of legs and views, by test_calibrate.py."""
-    session = shipped("3-rps", noise=0.1)
+    session = shipped(name, noise=0.1)
     turns = np.array([T.rotation.as_matrix() for T in session.truth.T_camera_Rb])
     of_rows = turns[session.measurements.view[session.axes.row]]
     turned = in_other_frames(session.axes, of_rows)
