@@ -179,12 +179,12 @@ def created_hexapod(folder: Path) -> Created:
     )
 
 
-def with_round_arms(name: str, radius: float = 8.0) -> Any:
-    """Return a shipped machine with arms that are cylinders [mm]."""
-    table = yaml.safe_load((ROOT / "models" / "tables" / f"{name}.yaml").read_text())
+def delta_with_round_arms(radius: float = 8.0) -> Any:
+    """Return the shipped Delta with arms that are cylinders [mm]."""
+    table = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
     for motor in table["actuators"].values():
         motor["arm_radius"] = radius
-    return described_machine(table, Path(name))
+    return described_machine(table, Path("delta"))
 
 
 def made(folder: Path, **changes: Any) -> Machine:

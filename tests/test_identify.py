@@ -17,7 +17,7 @@ from fit_sessions import machine_session
 from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import with_round_arms
+from machines import delta_with_round_arms
 from random_legs import closed_leg
 from rich.console import Console
 from uncertainty import compared
@@ -247,7 +247,7 @@ def test_remedies_were_tried_and_are_true() -> None:
 
 
 def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
-    machine = create_model(with_round_arms("delta"), tmp_path).machine
+    machine = create_model(delta_with_round_arms(), tmp_path).machine
     with_arms, without = (
         Analysis(planned_session(m, [range(6)] * 2, 15)) for m in (machine, model("delta"))
     )

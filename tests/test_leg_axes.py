@@ -81,15 +81,6 @@ def _observed(u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | 
     return axes_of_table(*table_of(*_indices(len(u)), u, A, noise, rng))
 
 
-def _random_lines(n: int, seed: int = 0) -> tuple[Array, Array]:
-    """Return n directions well away from the plane y = 0, and points before the camera."""
-    rng = np.random.default_rng(seed)
-    u = rng.normal(size=(n, 3))
-    u[:, 1] = np.copysign(0.3 + np.abs(u[:, 1]), u[:, 1])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], (n, 3))
-
-
 def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z() -> None:
     rng = np.random.default_rng(0)
     psi, theta = rng.uniform(-1.5, 1.5, 50), rng.uniform(-3.1, 3.1, 50)
@@ -117,7 +108,9 @@ def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
 
 
 def test_the_table_of_a_line_leads_back_to_it() -> None:
-    u, A = _random_lines(200, seed=3)
+    rng = np.random.default_rng(3)
+    u, A = rng.normal(size=(200, 3)), rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], (200, 3))
+    u[:, 1] = np.copysign(0.3 + np.abs(u[:, 1]), u[:, 1])  # away from the plane y = 0
     u[:4] = [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1e-9, -1.0, 0.0], [1e-5, 1e-4, 1.0]]
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     found = table_of_lines(u, A)

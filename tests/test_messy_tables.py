@@ -56,9 +56,9 @@ B_AND_P = points(POINTS, "B{}", "P{}")
 SIX = "{0} X [mm];{0} Y [mm];{0} Z [mm];{1} X [mm];{1} Y [mm];{1} Z [mm]"
 
 
-def one_row(base: str, platform: str) -> str:
-    points = {f"{base}{j + 1}": A for j, A in enumerate(BASE)}
-    points |= {f"{platform}{j + 1}": B for j, B in enumerate(PLATFORM)}
+def one_row() -> str:
+    points = {f"B{j + 1}": A for j, A in enumerate(BASE)}
+    points |= {f"P{j + 1}": B for j, B in enumerate(PLATFORM)}
     header = ",".join(f"{name}{axis}" for name in points for axis in "xyz")
     return header + "\n" + ",".join(f"{x:g},{y:g},0" for x, y in points.values()) + "\n"
 
@@ -134,7 +134,7 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
         wide("Jambe,X base,Y base,Z base,X plate-forme,Y plate-forme,Z plate-forme", leg="J{}"),
         ()),
     "letters": (wide("bx,by,bz,px,py,pz"), ()),
-    "one row": (one_row("B", "P"), ()),
+    "one row": (one_row(), ()),
     "platform first": ("\n".join([POINTS, *B_AND_P.splitlines()[:0:-1]]), ()),
     "points by side": (points(POINTS, "Base joint {}", "Platform joint {}"), ()),
 }  # fmt: skip
@@ -344,7 +344,7 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
     (points(POINTS, "{}", "{}"), OPTIONS, ("'1'", "B1 and P1")),
     (wide("bx,by,bz,px,py,pz").partition("\n")[2], OPTIONS, ("numbers in the first line",)),
     (wide("u,v,w,r,s,t"), OPTIONS, ("columns 'u', 'v', 'w', 'r', 's', 't'", "columns 'base_x'")),
-    (one_row("B", "P") * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
+    (one_row() * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--max-length", "500", "--type", "UPS"),
      ("max_length alone",)),
 ]  # fmt: skip

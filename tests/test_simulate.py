@@ -30,7 +30,7 @@ from legcal.errors import NotVisible, UsageError
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.perception.board_adjustment import camera_poses_by_board
 from legcal.perception.board_corners import find_corners
-from legcal.simulation.cameras import mild_lens, read_lens
+from legcal.simulation.cameras import mild_lens
 from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset
 from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.settings import Distribution, Level, requested
@@ -160,12 +160,6 @@ def test_repeated_photographs_differ_by_the_noise_of_the_sensor(tmp_path: Path) 
     assert (view.camera.gamma, view.camera.gamma_is_given) == (1.8, True)
 
 
-def _from_the_side(name: str, camera: Path | None, x: float, *legs: str) -> Viewpoint:
-    """Return a camera that sees the hexapod from a side."""
-    T = motion_from_xyz_quat((x, 0.26, 0.19), (0.411, 0.574, -0.552, -0.443))
-    return Viewpoint(name, mild_lens() if camera is None else read_lens(camera), T, legs or None)
-
-
 def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:
     noise = OutlineNoise(sigma_px=0.2, n_points=50)
     rng = np.random.default_rng(0)
@@ -178,7 +172,8 @@ def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points()
 # --- settings
 
 
-VIEW = _from_the_side("side", None, 0.93)
+FROM_THE_SIDE = motion_from_xyz_quat((0.93, 0.26, 0.19), (0.411, 0.574, -0.552, -0.443))
+VIEW = Viewpoint("side", mild_lens(), FROM_THE_SIDE)  # of a hexapod
 
 
 def test_options_become_settings(tmp_path: Path) -> None:
