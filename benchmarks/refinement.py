@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from fit_sessions import disturbed_start, irregular_hexapod, noisy_outlines, noisy_readings
+from fit_sessions import irregular_hexapod
 from plain_fit import PlainFit
 
 from legcal.calibration.joint_fit.fit import refine
@@ -49,9 +49,7 @@ def shortest_ms(call: Callable[[], object], repeats: int = REPEATS) -> float:
 def measure(n_images: int, with_scipy: bool) -> None:
     """Print one row: sizes and times of a session; then what SciPy needs."""
     session = irregular_hexapod(n_images // 3)
-    rng = np.random.default_rng(0)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-    start = disturbed_start(session)
+    (measurements, outlines), start = session.noisy(0), session.start
     building = shortest_ms(lambda: build_fit(session.legs, measurements, outlines))
     problem = build_fit(session.legs, measurements, outlines)
     begin = problem.begin(start)

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.dataset import load_dataset
+from legcal import forward_kinematics, load_dataset
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import forward_kinematics
 
 COLUMNS = "view,image,joint,u,v,sigma"
 

@@ -94,10 +94,8 @@ def answered_signals() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _commands_and_models_are_read_once() -> Iterator[None]:
-    """Read signatures of commands, make machines and sample their workspaces once a process."""
-    import typer.main
-
+def _models_are_read_once() -> Iterator[None]:
+    """Make machines and sample their workspaces once a process."""
     from legcal.machine import configurations, loader
 
     load = loader._load
@@ -125,7 +123,6 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
         return readings.copy(), list(poses)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
         patch.setattr(configurations, "random_poses", draw_once)
         patch.setattr(loader, "_load", load_once)
         yield

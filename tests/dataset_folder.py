@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
+from legcal import Machine, load_mechanism
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"

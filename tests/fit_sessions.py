@@ -1,47 +1,31 @@
-"""Simulated sessions in memory for the tests of the fit: exact, noisy, and started from far away.
+"""Sessions in memory for the tests of steps and fit: exact, noisy, and started from far away.
 
-Outlines of any shipped machine, of a hexapod whose joints lie in no plane, corners of a board
-beside them.
+Outlines of any shipped machine, of a hexapod whose joints lie in no plane, corners of boards and
+edges of bodies beside them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
-from hexapod_sessions import plain_scene
-from machines import from_vector
-from outline_sessions import closed_poses, moved_poses, true_machine
+from outline_sessions import NONCOPLANAR, closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners
-from legcal.calibration.joint_fit.variables import (
-    FittedLegs,
-    Start,
-    fitted_legs,
-    start_from,
-)
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines, unmeasured
+from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
-from legcal.machine.leg import (
-    KinematicParameters,
-    Leg,
-    LegKind,
-    point_like_legs,
-)
+from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
-from legcal.machine.parameters import (
-    geometries,
-    moved_legs,
-    to_vector,
-)
+from legcal.machine.parameters import geometries, moved_legs
 from legcal.machine.rods import (
     actuator_index,
     arms_at,
@@ -49,34 +33,24 @@ from legcal.machine.rods import (
     measured_readings,
     readings_of_rods,
 )
+from legcal.paper.unknowns import NominalMachine
 from legcal.simulation import observe
 from legcal.simulation.observe import (
+    Images,
     OutlineNoise,
+    Scene,
     Viewpoint,
     moved_outlines,
     outlines_of,
 )
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
+from legcal.vision.visibility import Seen
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])
 PINHOLE = Camera(K, 1024, 768)
 LENS = Camera(K, 1024, 768, np.array([-0.12, 0.05, 1e-3, -5e-4, 0.0]))
-SHIPPED = (
-    "hexapod",
-    "hexapod-rod",
-    "hexapod-strut",
-    "nategh-agheli",
-    "6-sps",
-    "3-rpr",
-    "3-rps",
-    "3-spr",
-    "3-upu",
-    "3-upu-tilted",
-    "tricept",
-    "hexaglide",
-    "linear-delta",
-)
 SIGMA_Q = 2e-6  # [m]
 _TURN, _SHIFT = 0.12, 0.06  # of poses: [rad], of the length of a leg
 
@@ -105,11 +79,39 @@ class MachineSession:
     truth: Start
     start: Start
 
-    def noisy(self, seed: int) -> tuple[Measurements, Outlines]:
+    def noisy(self, seed: int | np.random.Generator) -> tuple[Measurements, Outlines]:
         """Return readings and outlines with the errors that they claim."""
         rng, m = np.random.default_rng(seed), self.measurements
         q = m.q + m.sigma_q * rng.standard_normal(m.q.shape)
         return replace(m, q=q), observe.noisy_outlines(self.outlines, m.views[0].camera, rng)
+
+    def with_noise(self, noise: float, seed: int) -> MachineSession:
+        """Return the session with the errors of its readings and outlines, times a factor."""
+        covariance = noise**2 * self.outlines.covariance
+        claimed = replace(self, outlines=replace(self.outlines, covariance=covariance))
+        measurements, outlines = claimed.noisy(seed)
+        return replace(self, measurements=measurements, outlines=outlines)
+
+    @property
+    def nominal(self) -> NominalMachine:
+        """The nominal legs as the four steps take them."""
+        return NominalMachine(self.legs.names, self.legs.nominal, self.legs.frame_legs)
+
+    @cached_property
+    def axes(self) -> LegAxes:
+        """The axes that the outlines give."""
+        radii = {part: radius for (_, part), radius in self.legs.radii.items()}
+        return axes_from_outlines(self.outlines, self.measurements, radii)
+
+    @property
+    def true_values(self) -> dict[str, float]:
+        """The true kinematic parameters, counted from the nominal legs."""
+        values = self.legs.vector(self.truth.legs).tolist()
+        return dict(zip(self.legs.parametrization.names, values, strict=True))
+
+    def errors(self, legs: Sequence[Leg]) -> Array:
+        """Return the errors of the kinematic parameters of legs [m, rad]."""
+        return self.legs.vector(tuple(legs)) - self.legs.vector(self.truth.legs)
 
 
 def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outlines:
@@ -126,6 +128,8 @@ def machine_session(
     n_views: int = 3,
     n_poses: int = 6,
     camera: Camera = LENS,
+    distance: float = 4.0,
+    repeats: int = 1,
 ) -> MachineSession:
     """Return a session of a shipped model, or of one that is made, which is the truth.
 
@@ -139,34 +143,20 @@ def machine_session(
         Number of cameras, and of poses that each of them sees alone.
     camera : Camera
         Intrinsics of all cameras.
+    distance : float
+        From the cameras to the middle of the machine, in sizes of it.
+    repeats : int
+        How often in succession the platform comes to each place, with a pose of its own each time.
     """
     rng = np.random.default_rng(0)
     machine = true_machine(name)
-    legs, fitted = geometries(machine), fitted_legs(machine)
+    legs, home = geometries(machine), platform_in_base(machine, machine.home)
+    fitted = replace(fitted_legs(machine), home=home)
     R, t = _poses(machine, legs, n_views * n_poses, rng)
-    fitted = replace(fitted, home=platform_in_base(machine, machine.home))
-    wrong = (0.003, float(np.deg2rad(1.0)), camera_shift, camera_turn)
-    return session_of_legs(fitted, R, t, _readings(fitted, R, t), wrong, n_views, camera, rng)
-
-
-def session_of_legs(
-    fitted: FittedLegs,
-    R: Array,
-    t: Array,
-    q: Array,
-    wrong_by: tuple[float, float, float, float],
-    n_views: int,
-    camera: Camera,
-    rng: np.random.Generator,
-) -> MachineSession:
-    """Return a session of true legs with a home, whose views see the poses in turn.
-
-    Errors are those of lengths and angles of legs, then of places and turns of cameras [m, rad].
-    """
-    legs, length, angle, camera_shift, camera_turn = fitted.nominal, *wrong_by
-    view = np.repeat(np.arange(n_views), len(t) // n_views)
-    assert fitted.home is not None
-    T_camera_Rb = _cameras(fitted.home, legs, n_views, camera)
+    first = np.arange(len(t)) // repeats * repeats
+    R, t = R[first], t[first]
+    q, view = _readings(fitted, R, t), np.repeat(np.arange(n_views), n_poses)
+    T_camera_Rb = _cameras(home, legs, n_views, distance)
     measurements = Measurements(
         tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
         tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
@@ -176,16 +166,15 @@ def session_of_legs(
         SIGMA_Q,
     )
     truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
-    away = _wrong(fitted, legs, length, angle, rng)
-    home = (fitted.home,) * len(t)
+    away = _wrong(fitted, legs, 0.003, float(np.deg2rad(1.0)), rng)
     rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
-    wrong = replace(fitted, nominal=away)
+    wrong, at_home = replace(fitted, nominal=away), (home,) * len(t)
     return MachineSession(
         wrong,
         measurements,
-        shown_outlines(fitted.radii, measurements, truth, q),
+        _shown_outlines(fitted.radii, measurements, truth, q),
         truth,
-        start_from(away, measurements, wrong, rough, home, "nominal"),
+        start_from(away, measurements, wrong, rough, at_home, "nominal"),
     )
 
 
@@ -213,7 +202,7 @@ def _readings(fitted: FittedLegs, R: Array, t: Array) -> Array:
 
 
 def _cameras(
-    home: RigidTransform, legs: tuple[Leg, ...], n_views: int, camera: Camera
+    home: RigidTransform, legs: tuple[Leg, ...], n_views: int, distance: float
 ) -> tuple[RigidTransform, ...]:
     """Return T_camera_Rb of cameras around the middle of the machine."""
     joints = np.array([leg.A for leg in legs] + [home.apply(leg.B) for leg in legs])
@@ -223,32 +212,51 @@ def _cameras(
     for v in range(n_views):
         turn = 0.4 + 2.1 * v
         outward = np.array([np.cos(turn), np.sin(turn), 0.35 + 0.1 * v])
-        centre = middle + 4.0 * size * outward / np.linalg.norm(outward)
+        centre = middle + distance * size * outward / np.linalg.norm(outward)
         found.append(look_at(centre, middle).inv())
     return tuple(found)
 
 
-def shown_outlines(
-    radii: Mapping[tuple[int, str], float],
-    m: Measurements,
-    truth: Start,
-    q: Array | None = None,
+def _shown_outlines(
+    radii: Mapping[tuple[int, str], float], m: Measurements, truth: Start, q: Array
 ) -> Outlines:
-    """Return both outlines of every part of every leg in every image.
+    """Return both outlines of every part of every leg in every image; nothing is hidden.
 
-    Joints at A that motors move are where readings q (n_poses, n_legs) have them, if given.
+    Joints at A that motors move are where readings q (n_poses, n_legs) have them.
     """
     R, t = components(truth.T_Rb_Re)
-    read = None if q is None else measured_readings(truth.legs, R, t, q)
-    A, ends = ends_at_poses(truth.legs, R, t, read)
+    read = measured_readings(truth.legs, R, t, q)
+    A, B = ends_at_poses(truth.legs, R, t, read)
+    arms = arms_at(truth.legs, read)
+    links = {j: arm.link for j in arms if (arm := truth.legs[j].arm) is not None}
+    of_arm = np.array([links.get(j) == part for j, part in radii], dtype=np.bool_)
+    leg, radius = np.array([j for j, _ in radii]), np.array(list(radii.values()))
+    span, shown = np.array([0.15, 0.85]), list[Seen]()  # the part of their length that is seen
+    for v, k in zip(m.view.tolist(), m.pose.tolist(), strict=True):
+        ends = np.array(
+            [
+                arms[j][k] if moved else (A[k, j], B[k, j])
+                for j, moved in zip(leg, of_arm, strict=True)
+            ]
+        )
+        ends = truth.T_camera_Rb[v].apply(ends.reshape(-1, 3)).reshape(-1, 2, 3)
+        along = ends[:, 1] - ends[:, 0]
+        h = outlines_of_axis(
+            along / np.linalg.norm(along, axis=1, keepdims=True), ends[:, 0], radius
+        )
+        axis = ends[:, :1] + span[:, None] * along[:, None]
+        touching = axis[:, None] + steps_to_outlines(h, radius)[:, :, None]
+        px = m.views[v].camera.project(touching)
+        length = np.linalg.norm(px[:, :, 1] - px[:, :, 0], axis=-1).mean(axis=1)
+        parts = tuple(part for _, part in radii)
+        view = np.zeros(len(leg), dtype=np.intp)
+        shown.append(Seen(view, leg, of_arm, parts, h, px, np.tile(span, (len(leg), 1)), length))
     views = [
         Viewpoint(view.name, view.camera, T.inv())
         for view, T in zip(m.views, truth.T_camera_Rb, strict=True)
     ]
-    arms = {} if read is None else arms_at(truth.legs, read)
-    of_parts = {(j, arm.link): arms[j] for j in arms if (arm := truth.legs[j].arm) is not None}
-    scene = plain_scene(A, ends, views, m.view, m.pose, radii, arms=of_parts)
-    return outlines_of(scene, OutlineNoise(0.2, 150))
+    images = Images(m.view, m.pose, np.zeros(m.n_rows, dtype=np.intp), tuple(shown))
+    return outlines_of(Scene(A, B, tuple(views), images), OutlineNoise(0.2, 150))
 
 
 def _wrong(
@@ -266,6 +274,52 @@ def _wrong(
     return moved_legs(legs, parametrization.place, step)
 
 
+def disturbed_start(
+    session: MachineSession,
+    *,
+    joints: float = 0.002,
+    camera: float = 0.005,
+    angle: float = 0.01,
+    seed: int = 1,
+) -> Start:
+    """Return a start whose every parameter, camera and pose is wrong by that much [m, rad]."""
+    rng, truth = np.random.default_rng(seed), session.truth
+    return Start(
+        _wrong(session.legs, truth.legs, joints, angle, rng),
+        tuple(_shaken(T, camera, angle, rng) for T in truth.T_camera_Rb),
+        tuple(_shaken(T, camera, angle, rng) for T in truth.T_Rb_Re),
+        "nominal",
+    )
+
+
+@cache
+def irregular_hexapod(
+    n_poses: int = 15,
+    *,
+    camera: Camera = PINHOLE,
+    legs_seen: int = 4,
+    sigma_px: float = 0.1,
+    n_views: int = 3,
+    repeats: int = 1,
+) -> MachineSession:
+    """Return a session of a hexapod whose joints lie in no plane.
+
+    Each view shows the tubes of the legs whose base joints are nearest to it, and ends of outlines
+    have errors that do not depend on each other.
+    """
+    session = machine_session(
+        NONCOPLANAR, n_views=n_views, n_poses=n_poses, camera=camera, distance=2.5, repeats=repeats
+    )
+    A = np.array([leg.A for leg in session.truth.legs])
+    depth = np.array([T.apply(A)[:, 2] for T in session.truth.T_camera_Rb])
+    is_near = depth.argsort(axis=1).argsort(axis=1) < legs_seen
+    o = session.outlines
+    is_tube = np.array([part.endswith("_tube") for part in o.part])
+    shown = o.choose(is_tube & is_near[session.measurements.view[o.row], o.leg])
+    white = np.tile(sigma_px**2 * np.eye(2), (len(shown), 1, 1))
+    return replace(session, outlines=replace(shown, covariance=white))
+
+
 def _shaken(
     T: RigidTransform, distance: float, angle: float, rng: np.random.Generator
 ) -> RigidTransform:
@@ -275,150 +329,6 @@ def _shaken(
     return RigidTransform.from_components(
         T.translation + distance * shift / np.linalg.norm(shift), rotation * T.rotation
     )
-
-
-# A hexapod with point-like joints
-
-FRAME_LEGS = (0, 2, 4)
-RADIUS = 0.010
-TRUTH = KinematicParameters(
-    np.array(
-        [
-            [0.0, 0.0, 0.0],
-            [0.392, -0.083, -0.004],
-            [0.467, 0.0, 0.0],
-            [0.343, 0.380, 0.010],
-            [0.233, 0.404, 0.0],
-            [-0.037, 0.105, 0.004],
-        ]
-    ),
-    np.array(
-        [
-            [0.0, 0.0, 0.0],
-            [0.057, -0.061, -0.019],
-            [0.339, 0.0, 0.0],
-            [0.362, 0.077, 0.003],
-            [0.170, 0.293, 0.0],
-            [0.089, 0.276, -0.006],
-        ]
-    ),
-    np.array([0.3457, 0.3438, 0.3466, 0.3439, 0.3431, 0.3438]),
-)
-
-
-@dataclass(frozen=True, eq=False)
-class HexapodSession:
-    """Exact measurements and the truth behind them."""
-
-    legs: FittedLegs
-    measurements: Measurements
-    outlines: Outlines
-    truth: KinematicParameters
-    T_camera_Rb: tuple[RigidTransform, ...]
-    T_Rb_Re: tuple[RigidTransform, ...]
-
-
-def irregular_hexapod(
-    n_poses_per_view: int = 15,
-    *,
-    camera: Camera = PINHOLE,
-    legs_seen: int = 4,
-    sigma_px: float = 0.1,
-    shared_poses: bool = False,
-    n_views: int = 3,
-    repeats: int = 1,
-) -> HexapodSession:
-    """Return a session of a non-coplanar hexapod: views around it, every image its own pose.
-
-    The platform comes to each place so many times in succession, with a pose of its own each time.
-    """
-    rng = np.random.default_rng(0)
-    T_cameras = tuple(_camera_around(angle) for angle in 0.4 + 2.1 * np.arange(n_views))
-    n_rows = n_views * n_poses_per_view
-    view = np.repeat(np.arange(n_views), n_poses_per_view)
-    pose = np.tile(np.arange(n_poses_per_view), n_views) if shared_poses else np.arange(n_rows)
-    poses = [_pose(rng) for _ in range(int(pose.max()) + 1)]
-    poses = [poses[k - k % repeats] for k in range(len(poses))]
-    A, B = TRUTH.base_joints, TRUTH.platform_joints
-    lengths = np.array([np.linalg.norm(T.apply(B) - A, axis=1) for T in poses])
-    names = tuple(f"leg{i + 1}" for i in range(6))
-    measurements = Measurements(
-        tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
-        tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
-        view,
-        pose,
-        (lengths - TRUTH.offsets)[pose],
-        2e-6,
-    )
-    # Images show the legs whose base joints are nearest to the camera.
-    depth = np.array([T.apply(A)[:, 2] for T in T_cameras])
-    nearest = [np.sort(np.argsort(depth[v])[:legs_seen]).tolist() for v in view]
-    scene = plain_scene(
-        np.broadcast_to(A, (*lengths.shape, 3)),
-        np.array([T.apply(B) for T in poses]),
-        [Viewpoint(f"c{v + 1}", camera, T.inv()) for v, T in enumerate(T_cameras)],
-        view,
-        pose,
-        {(j, "rod"): RADIUS for j in range(6)},
-        nearest,
-        span=(0.08, 0.92),
-    )
-    white = np.tile(sigma_px**2 * np.eye(2), (2 * legs_seen * n_rows, 1, 1))
-    outlines = replace(outlines_of(scene), covariance=white)
-    radii = {(i, "rod"): RADIUS for i in range(6)}
-    legs = FittedLegs(names, point_like_legs(TRUTH), FRAME_LEGS, radii)
-    return HexapodSession(legs, measurements, outlines, TRUTH, T_cameras, tuple(poses))
-
-
-def noisy_outlines(session: HexapodSession, rng: np.random.Generator) -> Outlines:
-    """Return outlines with Gaussian errors of their claimed covariances."""
-    return observe.noisy_outlines(session.outlines, session.measurements.views[0].camera, rng)
-
-
-def noisy_readings(session: HexapodSession, rng: np.random.Generator) -> Measurements:
-    """Return measurements with Gaussian errors in the readings, equal within a pose."""
-    m = session.measurements
-    error = m.sigma_q * rng.standard_normal((m.n_poses, m.q.shape[1]))
-    return replace(m, q=m.q + error[m.pose])
-
-
-def disturbed_start(
-    session: HexapodSession,
-    *,
-    joints: float = 0.002,
-    camera: float = 0.005,
-    angle: float = 0.01,
-    seed: int = 1,
-) -> Start:
-    """Return a start whose every coordinate, camera and pose is wrong by that much [m, rad]."""
-    rng = np.random.default_rng(seed)
-    xi = to_vector(session.truth, FRAME_LEGS)
-    xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
-    return Start(
-        point_like_legs(from_vector(xi, 6, FRAME_LEGS)),
-        tuple(_shaken(T, camera, angle, rng) for T in session.T_camera_Rb),
-        tuple(_shaken(T, camera, angle, rng) for T in session.T_Rb_Re),
-        "nominal",
-    )
-
-
-def joint_errors(parameters: KinematicParameters) -> Array:
-    """Return the errors of the free parameters [m]."""
-    return to_vector(parameters, FRAME_LEGS) - to_vector(TRUTH, FRAME_LEGS)
-
-
-def _camera_around(angle: float) -> RigidTransform:
-    """Return T_camera_Rb of a camera 0.9 m away that looks at the middle of the machine."""
-    middle = np.array([0.23, 0.15, 0.17])
-    centre = middle + np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.1])
-    return look_at(centre, middle).inv()
-
-
-def _pose(rng: np.random.Generator) -> RigidTransform:
-    home = Rotation.from_rotvec([0.0, 0.0, 0.6])
-    tilt = Rotation.from_rotvec(rng.uniform(-0.18, 0.18, 3))
-    translation = np.array([0.14, -0.05, 0.34]) + rng.uniform(-0.03, 0.03, 3)
-    return RigidTransform.from_components(translation, tilt * home)
 
 
 # A calibration board on the base of a machine
@@ -437,21 +347,19 @@ def place_of_board(session: MachineSession) -> RigidTransform:
     return RigidTransform.from_components(middle, turn)
 
 
-def corners_of(
-    session: MachineSession, board: Board = BOARD, *, seed: int | None = None
-) -> Corners:
+def corners_of(session: MachineSession, *, seed: int | None = None) -> Corners:
     """Return the corners in every image, exact or with the errors that they claim."""
     T_Rb_board = place_of_board(session)
     seen, views = [], session.measurements.view
     for row, v in enumerate(views.tolist()):
         camera = session.measurements.views[v].camera
-        in_camera = (session.truth.T_camera_Rb[v] * T_Rb_board).apply(board.points)
+        in_camera = (session.truth.T_camera_Rb[v] * T_Rb_board).apply(BOARD.points)
         seen.append((np.full(len(in_camera), row), camera.project(in_camera)))
     of_row = np.concatenate([r for r, _ in seen])
     px: Array = np.concatenate([p for _, p in seen])
     if seed is not None:
         px = px + SIGMA_PX * np.random.default_rng(seed).standard_normal(px.shape)
-    corner = np.tile(np.arange(board.n_corners), len(views))
+    corner = np.tile(np.arange(BOARD.n_corners), len(views))
     return found_corners(of_row, corner, px, np.full(len(px), SIGMA_PX))
 
 
@@ -495,7 +403,7 @@ def with_boards(
     return BoardCorners((FixedBoard(BOARD, "base"), fixed), on_base.join([corners])), start
 
 
-# Axes of the hexapod of section 4.3
+# The same pixels otherwise, and edges of bodies
 
 
 def with_camera(

@@ -12,12 +12,7 @@ from pydantic_core import core_schema
 from legcal.calibration.camera_calibration.document import CameraDocument
 from legcal.calibration.camera_calibration.projection import CameraComparisonDocument
 from legcal.calibration.detection import ExaminationDocument
-from legcal.calibration.documents import (
-    CheckDocument,
-    DiagnosisBlock,
-    EvaluationDocument,
-    Result,
-)
+from legcal.calibration.documents import CheckDocument, DiagnosisBlock, EvaluationDocument, Result
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.location.document import LocationFile
 from legcal.data.dataset_file import DatasetEntry

@@ -94,7 +94,9 @@ class _Joint:
 
 
 @dataclass
-class _Text:
+class Text:
+    """Links and joints of a URDF."""
+
     links: list[str] = field(default_factory=list)
     joints: list[str] = field(default_factory=list)
 
@@ -108,6 +110,11 @@ class _Text:
             f'  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
             f"{origin(T)}{moving}</joint>"
         )
+
+    def robot(self, name: str) -> str:
+        """Return the file."""
+        lines = ['<?xml version="1.0"?>', f'<robot name="{name}">', *self.links, *self.joints]
+        return "\n".join([*lines, "</robot>", ""])
 
     def any_joint(self, leg: str) -> str:
         """Return the slider of a leg, or a revolute of a rod that was not cut away."""
@@ -125,11 +132,9 @@ def origin(T: RigidTransform) -> str:
     return f'<origin xyz="{numbers(T.translation)}" rpy="{numbers(rpy)}"/>'
 
 
-def write_machine(
-    folder: Path, description: MachineSpec, layout: Layout, name: str = "machine"
-) -> Path:
+def write_machine(folder: Path, description: MachineSpec, layout: Layout) -> Path:
     """Write a machine in a layout and return its YAML."""
-    text = _Text()
+    text = Text()
     text.link("base")
     text.link("platform")
     carried = any(layout.of(j).cut in ("carry", "bear") for j in range(len(description.legs)))
@@ -169,9 +174,8 @@ def write_machine(
         "legcal": block,
     }  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    lines = ['<?xml version="1.0"?>', f'<robot name="{name}">', *text.links, *text.joints]
-    (folder / f"{name}.urdf").write_text("\n".join([*lines, "</robot>", ""]))
-    path = folder / f"{name}.yaml"
+    (folder / "machine.urdf").write_text(text.robot("machine"))
+    path = folder / "machine.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
     return path
 
@@ -191,7 +195,7 @@ class _Leg:
     """One leg on its way into the text."""
 
     def __init__(
-        self, text: _Text, name: str, leg: LegSpec, layout: LegLayout, home: RigidTransform
+        self, text: Text, name: str, leg: LegSpec, layout: LegLayout, home: RigidTransform
     ) -> None:
         self.text, self.name, self.leg, self.layout = text, name, leg, layout
         self.rng = np.random.default_rng(1000 + layout.seed)

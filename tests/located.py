@@ -9,14 +9,11 @@ import numpy as np
 from csv_rows import write_rows
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import ToolPoses
+from legcal import Machine, ToolPoses, inverse_kinematics, load_mechanism, random_configurations
 from legcal.calibration.location.frames import PosePairs, predicted, transforms
 from legcal.geometry.rotations import rotation_matrices
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations, random_configurations
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
+from legcal.machine.configurations import Configurations
 
 SIGMA_POSITION = 0.02e-3
 SIGMA_ANGLE = float(np.radians(0.01))
@@ -89,9 +86,9 @@ def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> 
     return np.array([T.as_matrix()[:3] for T in (T_world_base, T_platform_tool)])
 
 
-def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8, seed: int = 0) -> PosePairs:
+def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8) -> PosePairs:
     """Return exact tool poses of a platform that goes anywhere within 0.1 m and 30 degrees."""
-    chance = np.random.default_rng(seed)
+    chance = np.random.default_rng(0)
     R = rotation_matrices(chance.uniform(-0.5, 0.5, (n, 3)))
     t = chance.uniform(-0.1, 0.1, (n, 3)) + np.array([0.0, 0.0, 0.4])
     blank = PosePairs(R, t, np.tile(np.eye(3), (n, 1, 1)), t, np.ones(n, dtype=np.bool_), 0.1)
@@ -122,7 +119,7 @@ def motion_error(T: RigidTransform, true: RigidTransform) -> Array:
 
 
 def write_poses(
-    path: Path, machine: Located, poses: ToolPoses | None = None, *, quaternions: bool = True
+    path: Path, machine: Located, poses: ToolPoses | None = None
 ) -> list[dict[str, str]]:
     """Write the table of measured poses and return its rows."""
     poses = machine.poses if poses is None else poses
@@ -131,9 +128,8 @@ def write_poses(
     for q, p, M in zip(poses.q, poses.position, poses.rotation, strict=True):
         numbers = dict(zip(joints, q[list(machine.machine.motors)], strict=True))
         numbers |= dict(zip("xyz", p, strict=True))
-        if quaternions:
-            quaternion = Rotation.from_matrix(M).as_quat()
-            numbers |= dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
+        quaternion = Rotation.from_matrix(M).as_quat()
+        numbers |= dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
         rows.append({name: repr(float(x)) for name, x in numbers.items()})
     write_rows(path, rows)
     return rows

@@ -13,9 +13,8 @@ import legcal
 from legcal.descriptions.new_model import Created, Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, LegKind, main_cylinders
+from legcal.machine.leg import LegKind, main_cylinders
 from legcal.machine.model import Machine
-from legcal.machine.parameters import free_coordinates
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -144,9 +143,9 @@ def write_table(folder: Path, **changes: Any) -> Path:
     return path
 
 
-def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Any:
+def read_table(path: Path) -> Any:
     """Return what a table describes."""
-    return description_of(path, Dimensions(unit=unit, name=name))
+    return description_of(path, Dimensions())
 
 
 def regular(legs: str, platform_radius: float = 150.0) -> Any:
@@ -180,12 +179,12 @@ def created_hexapod(folder: Path) -> Created:
     )
 
 
-def with_round_arms(name: str, radius: float = 8.0) -> Any:
-    """Return a shipped machine with arms that are cylinders [mm]."""
-    table = yaml.safe_load((ROOT / "models" / "tables" / f"{name}.yaml").read_text())
+def delta_with_round_arms(radius: float = 8.0) -> Any:
+    """Return the shipped Delta with arms that are cylinders [mm]."""
+    table = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
     for motor in table["actuators"].values():
         motor["arm_radius"] = radius
-    return described_machine(table, Path(name))
+    return described_machine(table, Path("delta"))
 
 
 def made(folder: Path, **changes: Any) -> Machine:
@@ -276,11 +275,3 @@ def four_upu() -> MachineSpec:
         for a, b, axis, kind in zip(A, B, axes, ["actuated"] * 3 + ["passive"], strict=True)
     )
     return MachineSpec(legs, RigidTransform.from_translation([0.0, 0.0, 0.4]))
-
-
-def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> KinematicParameters:
-    """Return the parameters of a vector in the order of :func:`to_vector`."""
-    free = free_coordinates(n_legs, frame_legs)
-    base, platform = np.zeros((n_legs, 3)), np.zeros((n_legs, 3))
-    base[free], platform[free], offsets = np.split(vector, [free.sum(), 2 * free.sum()])
-    return KinematicParameters(base, platform, offsets.copy())

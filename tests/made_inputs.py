@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-from command_outcomes import run
+from command_line import run
 from dataset_folder import small_folder
 from located import located, write_poses
 from model_formats import write_format
@@ -90,8 +90,8 @@ def _tool_poses(folder: Path) -> None:
 def _result(folder: Path) -> None:
     """Calibrate a 3-RPR, and take new images of the same machine for a check."""
     shutil.copytree(made_input("3-rpr-outlines"), folder / "set")
-    words = ["calibrate", str(folder / "set"), "-o", str(folder / "result"), "--no-report"]
-    assert run(words).code == 0
+    words = ("calibrate", folder / "set", "-o", folder / "result", "--no-report")
+    assert run(*words).code == 0
 
 
 def _written(style: str) -> Callable[[Path], None]:
@@ -110,5 +110,5 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "tables": _tables,
     "tool-poses": _tool_poses,
     "result": _result,
-    **{style: _written(style) for style in ("mjcf bodies", "loop_joint", "gepetto")},
+    **{style: _written(style) for style in ("mjcf", "loop_joint", "gepetto")},
 }

@@ -13,9 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.machine.model import Machine
 
 FORMATS = (
-    "mjcf bodies",
-    "mjcf sites",
-    "mjcf defaults",
+    "mjcf",
     "loop_joint",
     "isaac",
     "gepetto",
@@ -25,9 +23,9 @@ FORMATS = (
 def write_format(machine: Machine, name: str, folder: Path) -> Path:
     """Write a machine in a format and return the path that means it."""
     folder.mkdir(parents=True, exist_ok=True)
-    if name.startswith("mjcf"):
+    if name == "mjcf":
         path = folder / "machine.xml"
-        path.write_text(mjcf(machine, name.removeprefix("mjcf ")))
+        path.write_text(mjcf(machine))
         return path
     if name == "gepetto":
         return _gepetto(machine, folder / "machine")
@@ -57,17 +55,10 @@ def _cylinders(machine: Machine) -> dict[str, list[tuple[RigidTransform, str, st
     return found
 
 
-def mjcf(machine: Machine, style: str) -> str:
-    """Return a machine as MJCF, in its closed home configuration.
-
-    ``bodies`` closes it between bodies, ``sites`` between sites; ``defaults`` writes angles in
-    radians and takes what it can from default classes.
-    """
+def mjcf(machine: Machine) -> str:
+    """Return a machine as MJCF, closed between bodies, in its home configuration."""
     chain, configuration = machine.chain, machine.home_configuration
     urdf, cylinders = machine.urdf, _cylinders(machine)
-    sites = style == "sites"
-    frames = {f for c in chain.closures for f in (c.frame_1, c.frame_2)}
-    unit = 1.0 if style == "defaults" else 180.0 / np.pi
 
     def joint(entry: Any) -> str:
         if entry.type in ("floating", "planar"):
@@ -76,19 +67,16 @@ def mjcf(machine: Machine, style: str) -> str:
         axis = f'axis="{numbers(entry.axis)}"'
         if entry.type == "prismatic":
             limits = f'range="{numbers(np.array(entry.limits))}"'
-            kind = 'class="slider"' if style == "defaults" else f'type="slide" {axis}'
-            return f'<joint name="{entry.name}" {kind} ref="{value!r}" {limits}/>'
-        return f'<joint name="{entry.name}" type="hinge" {axis} ref="{unit * value!r}"/>'
+            return f'<joint name="{entry.name}" type="slide" {axis} ref="{value!r}" {limits}/>'
+        degrees = float(np.degrees(value))
+        return f'<joint name="{entry.name}" type="hinge" {axis} ref="{degrees!r}"/>'
 
     def geoms(link: str) -> str:
         text = ""
         for T, radius, length in cylinders.get(link, []):
             half = 0.5 * float(length)
-            if style == "bodies":
-                ends = numbers([T.apply([0, 0, -half]), T.apply([0, 0, half])])
-                text += f'<geom type="capsule" size="{radius}" fromto="{ends}"/>'
-            else:
-                text += f'<geom type="cylinder" size="{radius} {half!r}" {_pose(T)}/>'
+            ends = numbers([T.apply([0, 0, -half]), T.apply([0, 0, half])])
+            text += f'<geom type="capsule" size="{radius}" fromto="{ends}"/>'
         return text
 
     def body(link: str, parent: str | None) -> str:
@@ -98,8 +86,6 @@ def mjcf(machine: Machine, style: str) -> str:
             T = chain.pose(configuration, parent, link)
             entry = next(j for j in urdf.joints.values() if j.child == link)
             above = joint(entry) if entry.moves else ""
-        if sites and link in frames:
-            return f'<site name="{link}" {_pose(T)}/>'
         children = [j for j in urdf.joints.values() if j.parent == link]
         held = [j.child for j in children if j.type not in ("floating", "planar")]
         free = [j.child for j in children if j.type in ("floating", "planar")]
@@ -110,21 +96,12 @@ def mjcf(machine: Machine, style: str) -> str:
     equalities = ""
     for closure in chain.closures:
         tag = "connect" if closure.kind == "3d" else "weld"
-        if sites:
-            ends = f'site1="{closure.frame_1}" site2="{closure.frame_2}"'
-        else:
-            ends = f'body1="{closure.frame_1}" body2="{closure.frame_2}"'
-            ends += ' anchor="0 0 0"' * (tag == "connect")
+        ends = f'body1="{closure.frame_1}" body2="{closure.frame_2}"'
+        ends += ' anchor="0 0 0"' * (tag == "connect")
         equalities += f"<{tag} {ends}/>\n"
     motors = "".join(f'<position joint="{machine.legs[j].prismatic}"/>' for j in machine.motors)
-    head = ""
-    if style == "defaults":
-        head = (
-            '<compiler angle="radian"/><default><default class="slider">'
-            '<joint type="slide" axis="0 0 1"/></default></default>'
-        )
     return (
-        f'<mujoco model="machine">{head}\n<worldbody>{body(urdf.root, None)}</worldbody>\n'
+        f'<mujoco model="machine">\n<worldbody>{body(urdf.root, None)}</worldbody>\n'
         f"<equality>{equalities}</equality>\n<actuator>{motors}</actuator></mujoco>\n"
     )
 

@@ -71,7 +71,6 @@ def outlines_of(
     seed: int,
     rows: Sequence[int] = (0, 1, 2, 3),
     *,
-    source: str = "detected",
     legs: Sequence[int] = (0, 1, 2),
     rejected: float = 0.3,
 ) -> Outlines:
@@ -91,8 +90,6 @@ def outlines_of(
     lost = ~used & (rng.uniform(size=len(places)) < 0.5)
     quality = rng.uniform(0.0, [100.0, 500.0, 1.0], size=(len(places), 3))
     encoding = np.stack([np.full(len(places), 2.2), *rng.normal(size=(2, len(places)))], axis=1)
-    if source == "edited":
-        quality[:] = encoding[:] = np.nan
     for numbers in (h, ends, covariance, quality, encoding):
         numbers[lost] = np.nan
     return Outlines(
@@ -107,7 +104,7 @@ def outlines_of(
         reason=tuple(
             USED if ok else Rejection(Reason.OTHER, 'hidden, by "another" leg') for ok in used
         ),
-        source=(source,) * len(places),
+        source=("detected",) * len(places),
         contrast=quality[:, 0],
         length=quality[:, 1],
         residual=quality[:, 2],

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import yaml
 from clicked_joints import camera_beside, seen_from, write_clicks
-from command_outcomes import run, words_of
+from command_line import run, words_of
 from dataset_folder import JOINTS, SERVOS, dataset_of_readings
 from machines import TRIPOD
 from made_inputs import ROOT, copy_of
@@ -68,7 +68,7 @@ class Refusal:
             edit(spoiled)
         before = _files(folder)
         places: dict[str, Path | str] = {"in": spoiled, "out": folder / "out", "here": folder}
-        outcome = run([*words_of(self.command, places), "--json"], inside=folder)
+        outcome = run(*words_of(self.command, places), "--json", inside=folder)
         assert outcome.code != 0, f"{self.name} was not refused: {outcome.out[:200]}"
         after = _files(folder)
         error = outcome.document["error"]
@@ -218,12 +218,6 @@ def picture(name: str, width: int, height: int) -> Edit:
     return edit
 
 
-def floating(name: str) -> Edit:
-    """Write a grey TIFF of floating-point pixels."""
-    image = np.full((48, 64), 90.0, dtype=np.float32)
-    return text(name, cv2.imencode(".tiff", image)[1].tobytes())
-
-
 def cut(name: str, by: int) -> Edit:
     """Cut off the end of a file."""
 
@@ -258,19 +252,11 @@ def _use() -> Iterable[Refusal]:
         ("no-output", "calibrate nowhere", ("--output",)),
         ("no-reference", "evaluate hexapod nowhere.urdf", ("nowhere.urdf",)),
         ("unknown-model", "inspect octopod", ("octopod", "hexapod", "tricept")),
-        ("long-name", "inspect " + 300 * "a", ("aaa",)),
         ("folder", "inspect {in}", ("{in}", "robot.yaml")),
-        ("empty-output", "simulate hexapod -o ''", ("-o",)),
         ("empty-value", "simulate hexapod -o {out} --poses=", ("--poses",)),
-        ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
-        ("identify-nothing", "identify", ("MODEL|DATASET",)),
         ("option", "doctor x --nonsense", ("--nonsense", "legcal doctor --help lists")),
-        ("study", "study nonsense", ("'nonsense'", "legcal study --help lists")),
         ("fix", "calibrate x --fix leg1.offset", ("--fix of", "--set NAME=VALUE")),
-        ("free", "calibrate x --free c1.fx", ("--free of", "--set NAME=free")),
-        ("prior", "calibrate x --prior a=1+-1", ("--prior of", "--set NAME=VALUE±SIGMA")),
         ("no-workers", "detect x -o y --workers 0", ("found 0, needed 1 to 256 processes",)),
-        ("workers", "study paper -o y --workers 257", ("found 257, needed 1 to 256 processes",)),
         ("two-datasets", "calibrate a b -o out", ("Expected one dataset", "docs/python.md")),
     ]
     yield from _worded("use", "", rows)
@@ -296,7 +282,6 @@ def _options() -> Iterable[Refusal]:
         ("many-images", "--images 2001", ("2001", "2000")),
         ("many-views", "--view leg1 " * 51, ("51", "50")),
         ("hand-held", "--view leg1,leg2,leg3 --hand-held", ("--board",)),
-        ("hand-held-alone", "--board --hand-held", ("--view",)),
     ]
     yield from _worded("identify", "identify hexapod", identify)
     yield Refusal("identify-dataset-view", "identify {in} --view leg1", ("--view",), "plain")
@@ -304,17 +289,12 @@ def _options() -> Iterable[Refusal]:
     checks: Words = [
         ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
-        ("fraction", "-o {out} --holdout 1.5", ("1.5", "0", "1")),
     ]
     yield from _worded("check", "calibrate {in}/set", checks, "result")
 
     simulate: Words = [
-        ("poses", "--poses 0", ("0",)),
         ("poses-file", "--poses none.csv", ("none.csv",)),
-        ("seed", "--seed -1", ("-1",)),
         ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
-        ("error-unit", "--error joints=0.1deg", ("joints", "mm", "um")),
-        ("error-kind", "--error joint=2mm", ("joint", "'joints'")),
         ("error-no-kind", "--error 2mm", ("2mm", "KIND=SIZE")),
         ("error-no-size", "--error joints", ("'joints'", "KIND=SIZE")),
         ("error-size", "--error joints=2m", ("--error joints", "'2m'", "0 to 1 m")),
@@ -340,11 +320,7 @@ def _options() -> Iterable[Refusal]:
 
     camera: Words = [
         ("kind", "chessbord:9x6", ("chessbord", "chessboard:9x6:25mm")),
-        ("few", "chessboard:3x6", ("3 x 6",)),
-        ("metres", "chessboard:9x6:25m", ("25 m",)),
         ("dictionary", "charuco:7x5:40mm:29mm", ("charuco:7x5:40mm:29mm:DICT_4X4_50",)),
-        ("unknown", "charuco:7x5:40mm:29mm:DICT_4X4_51", ("DICT_4X4_51",)),
-        ("exchanged", "charuco:7x5:29mm:40mm:DICT_4X4_50", ("marker", "square")),
         ("legacy", "charuco:7x5:40mm:29mm:DICT_4X4_50:old", ("old", "legacy")),
         ("gap", "aprilgrid:6x6:88mm:wide", ("wide",)),
         ("gap-size", "aprilgrid:6x6:88mm:9", ("9", "0.05", "2")),
@@ -356,7 +332,6 @@ def _options() -> Iterable[Refusal]:
     yield Refusal("camera-none", f"camera {{in}}/images {spec} -o {{out}}", ("4",), "plain")
     yield Refusal("camera-missing", f"camera no*.png {spec} -o {{out}}", ("no*.png",))
     yield Refusal("camera-no-board", "camera {in}/images -o {out}", ("--board",), "plain")
-    yield Refusal("camera-place", f"camera {{in}}/images {spec} -o no/c.yaml", ("no",), "plain")
     yield Refusal(
         "camera-other", f"camera {{in}}/images {spec} -o {{in}}/camera_info.yaml",
         ("camera_info.yaml",), "plain",
@@ -376,13 +351,10 @@ def _datasets() -> Iterable[Refusal]:
     def entry(**values: Any) -> Edit:
         return keyed("dataset.yaml", **values)
 
-    quaternion = [0.0, 0.0, 0.0, 1.0]
     rows: Rows = [
         ("version", entry(legcal_dataset=2), ("legcal_dataset", "2", "1")),
-        ("no-version", entry(legcal_dataset=GONE), ("legcal_dataset",)),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
         ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
-        ("no-views", entry(views={}), ("views",)),
         ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
         ("key", entry(measurement="x"), ("measurement", "'measurements'")),
         ("tolerance", entry(tolerance={"joints": "1 deg"}),
@@ -390,20 +362,10 @@ def _datasets() -> Iterable[Refusal]:
         ("tolerance-0", entry(tolerance={"joints": -1.0}), ("tolerance.joints", "above zero")),
         ("travel", entry(tolerance={"travel": "0.1 mm"}),
          ("tolerance.travel", "part of the travel")),
-        ("travel-2", entry(tolerance={"travel": 0.02}), ("tolerance.travel", "per cent")),
-        ("machine-kind", entry(machine_kind="wooden"), ("machine_kind", "printed")),
         ("both-kinds", entry(tolerance={"joints": 1e-3}, machine_kind="bought"),
          ("needed one of them",)),
         ("outside", entry(measurements="../m.csv"), ("measurements", "../m.csv")),
-        ("gamma-large", entry(views__c1__gamma=100), ("views.c1.gamma", "100", "5")),
-        ("pose-list", entry(views__c1__T_base_camera=[1, 2, 3]), ("views.c1.T_base_camera",)),
-        (
-            "pose-xyz",
-            entry(views__c1__T_base_camera={"xyz": [1, 2], "quat_xyzw": quaternion}),
-            ("views.c1.T_base_camera.xyz", "2"),
-        ),
         ("norm", entry(views__c1__T_base_camera__quat_xyzw=[0, 0, 0, 1.002]), ("1.002",)),
-        ("no-legs", entry(views__c1__legs=[]), ("views.c1.legs",)),
         ("legs-twice", entry(views__c1__legs=["leg1", "leg1"]), ("c1", "leg1")),
         ("leg", entry(views__c1__legs=["leg1", "leg7"]), ("c1", "'leg7'")),
         (
@@ -414,10 +376,7 @@ def _datasets() -> Iterable[Refusal]:
         ("yaml", text("dataset.yaml", "legcal_dataset: 1\nviews: {c1: [}\n"), ("line 2",)),
         ("repeated", swap("dataset.yaml", "  c2:", "  c1:"), ("'c1'",)),
         ("gone", remove("dataset.yaml"), ("dataset.yaml",)),
-        ("control", entry(**{"views__\x1b[31m": {"camera": "camera_info.yaml"}}),
-         ("needed printable characters",)),
-        *((f"tag-{k}", text("dataset.yaml", f"a: 1\nb: {value}\n"), ("line 2, column 4",))
-          for k, value in enumerate(("!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"))),
+        ("no-date", text("dataset.yaml", "a: 1\nb: 2001-99-99\n"), ("line 2, column 4",)),
     ]  # fmt: skip
     yield from _spoiled("dataset", "calibrate {in} -o {out}", "plain", rows)
 
@@ -448,7 +407,6 @@ def _datasets() -> Iterable[Refusal]:
         ("dictionary", {**char, "dictionary": "4X4"}, ("board.dictionary", "'4X4'")),
         ("markers", {**char, "squares_x": 20, "squares_y": 20}, ("200", "50")),
         ("few-squares", {**char, "squares_x": 2, "squares_y": 3}, ("2 x 3",)),
-        ("spacing", {**april, "tag_spacing": 0.026}, ("0.026", "0.05")),
         ("tags", {**april, "tags_x": 60, "tags_y": 60}, ("60 x 60", "587")),
     ]
     of_boards = [(name, entry(board=board), named) for name, board, named in boards]
@@ -485,7 +443,6 @@ def _in_hand() -> Iterable[Refusal]:
         ("corners-alone", corners(("c1,images/c1_1.png", 6)), ("corners.csv", "no board")),
         ("no-legs", entry(views__c1__legs=[], views__c2__legs=[]),
          ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
-        ("word", (held, entry(board="charuco")), ("dataset.yaml", "board", "'charuco'", "mapping")),
     ]  # fmt: skip
     yield from _spoiled("in-hand", "calibrate {in} -o {out}", "plain", rows)
 
@@ -501,22 +458,16 @@ def _measurements() -> Iterable[Refusal]:
         return cell(table, 3, image=value)
 
     rows: Rows = [
-        ("column", header(table, joint, "leg7_prismatic"), ("'leg7_prismatic'", f"'{joint}'")),
         ("no-column", header(table, "leg6_prismatic", None), ("'leg6_prismatic'",)),
         ("column-twice", header(table, "leg2_prismatic", joint), (f"'{joint}'", "2 times")),
         ("semicolons", swap(table, ",", ";", -1), ("commas",)),
-        ("nothing", text(table, ""), ("no row",)),
         ("short", swap(table, "c1,images/c1_2.png", "images/c1_2.png"), ("row 2", "7", "8")),
         ("long", swap(table, "c1,images/c1_2.png", "c1,,images/c1_2.png"), ("row 2", "9", "8")),
         ("underscore", readings(3, "1_0"), ("row 3 (line 4)", joint, "'1_0'")),
-        ("travel", readings(2, "0.15288"), (joint, "0.15288 m", "row 2", "-0.004", "0.144")),
         ("millimetres", readings(None, "70"), (joint, "millimetres")),
         ("same-path", image("../in/images/c1_1.png"), ("row 3", "row 1")),
         ("no-path", image("images/a\0b.png"), ("row 3", "a path that cannot")),
-        ("outside", image("../other.png"), ("row 3", "../other.png")),
         ("windows", image("C:\\other.png"), ("row 3", "C:\\other.png")),
-        ("no-image", image("images/none.png"), ("row 3", "none.png")),
-        ("no-name", image(""), ("row 3", "observations.csv")),
         ("bytes", text(table, b"view,image\n\xff\xfe"), ("0xff",)),
         (
             "all-at-once",
@@ -528,13 +479,6 @@ def _measurements() -> Iterable[Refusal]:
             (header(table, "leg6_prismatic", "leg6_prismatic"),
              swap(table, "view,image", "pose,view,image"), swap(table, "\nc", "\np,c", -1)),
             ("row 1 (line 2)", "pose p", joint),
-        ),
-        ("gif", text("images/c1_1.png", b"GIF89a"), ("row 1", "c1_1.png", "PNG")),
-        ("empty-image", text("images/c1_1.png", b""), ("row 1", "c1_1.png")),
-        (
-            "float-image",
-            (floating("images/c1_2.png"), remove("images/c1_1.png")),
-            ("row 1", "row 2", "c1_2.png", "8 or 16"),
         ),
         (
             "images-at-once",
@@ -578,11 +522,7 @@ def _cameras() -> Iterable[Refusal]:
         ("sigma-name", block(sigma={"f": 1.0}), ("legcal_camera", "found f,", "fx, fy, cx")),
         ("sigma-negative", block(sigma={"fx": -1.0}), ("legcal_camera.sigma.fx",)),
         ("sigma-other", block(sigma={"fx": 2.1}), ("deviation 2 of fx", "2.1 in sigma")),
-        ("names", block(names=["fx", "f"]), ("legcal_camera", "found f,")),
-        ("name-twice", block(names=["fx", "fx"]), ("distinct names",)),
         ("no-names", block(names=None), ("no names",)),
-        ("no-covariance", block(covariance=None), ("no covariance",)),
-        ("one-row", block(covariance=[[4.0, 0.0]]), ("1 rows that are not 2 of 2",)),
         ("asymmetric", block(covariance=[[4.0, 0.1], [0.2, 1.0]]), ("not symmetric",)),
         ("indefinite", block(covariance=[[4.0, 3.0], [3.0, 1.0]]), ("not positive semidefinite",)),
         ("variance", block(covariance=[[4.0, 0.0], [0.0, -1.0]]), ("the variance -1 of cx",)),
@@ -601,10 +541,8 @@ def _cameras() -> Iterable[Refusal]:
         ("centre-negative", matrix((2, -1.0)), ("cx = -1", "64 x 48")),
         ("kalibr-none", kalibr(distortion_model="none", distortion_coeffs=[0.1, 0.0, 0.0, 0.0]),
          ("4", "0 for none")),
-        ("kalibr-centre", kalibr(intrinsics=[80.0, 80.0, 200.0, 23.5]), ("cx = 200", "64 x 48")),
         ("kalibr-two", (kalibr(), _two_cameras), ("2 cameras", "cam0, cam1")),
         ("storage-xml", text(file, "<?xml version='1.0'?><opencv_storage><a>"), ("OpenCV",)),
-        ("storage-no-matrix", text(file, "%YAML:1.0\n---\nimage_width: 5\n"), ("camera_matrix",)),
         ("bytes", text(file, b"a: \xff\xfe\xfd"), ("UTF-8",)),
     ]  # fmt: skip
     yield from _spoiled("lens", "calibrate {in} -o {out}", "plain", rows)
@@ -614,7 +552,7 @@ def _units() -> Iterable[Refusal]:
     """Readings of servos in a unit that is not the stated one."""
     angles = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
     both_ways = np.concatenate([angles, -angles])
-    pulses, late = (1500.0 + 11.1 * np.degrees(x) for x in (angles, angles + 0.4))
+    pulses = 1500.0 + 11.1 * np.degrees(angles)
     sigma = {"encoder_sigma": dict.fromkeys(SERVOS, 1e-4)}
     degrees = {"readings": "deg", "encoder_sigma": dict.fromkeys(SERVOS, 0.1)}
     servo = {"unit": "us", "centre_us": 1500, "us_per_deg": 11.1}
@@ -626,7 +564,6 @@ def _units() -> Iterable[Refusal]:
         ("pulses", pulses, sigma, ("look like pulses", "centre_us: 1500")),
         ("pulses-as-deg", pulses, degrees, ("look like pulses", "centre_us: 1500")),
         ("no-pulses", angles, in_us, ("found 0 us", "1000.5 to 1999.5 us", "look like radians")),
-        ("out-of-travel", late, in_us, ("us in row",)),
         ("no-centre", pulses, sigma | {"readings": "us"},
          ("readings.servo1", "neither centre nor us")),
         ("mm", angles, sigma | {"readings": "mm"}, ("found mm and no motor that slides",)),
@@ -639,7 +576,6 @@ def _units() -> Iterable[Refusal]:
          ("encoder_sigma is incomplete", "servo1, servo2")),
         ("large-sigma", angles, {"encoder_sigma": dict.fromkeys(SERVOS, 0.5)},
          ("28.6 deg", "0.5deg")),
-        ("sigma-unit", angles, {"encoder_sigma": dict.fromkeys(SERVOS, "2um")}, ("'2um'", "rad")),
         ("sigma-number", angles, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
     ]  # fmt: skip
     for hidden, said in (
@@ -684,9 +620,7 @@ def _tables() -> Iterable[Refusal]:
             cell(o, 1, s00="1", s01="0", s11="18446744073709551616"),
             ("columns s00, s01, s11", "4.29e+09 px", "1e-05 to 100 px"),
         ),
-        ("residual", cell(o, 1, residual="-1"), ("column residual", "'-1'")),
         ("by-gamma", cell(o, 1, by_gamma="nan"), ("column by_gamma", "'nan'")),
-        ("rejected", cell(o, 1, verdict="rejected", a="left"), ("column a", "'left'")),
         ("far", cell(o, 1, u0="-400", v0="-300"), ("px", "(a, b, c)")),
         ("one-gamma", cell(o, 2, gamma="2.2"), ("row 2", "gamma", "by_gamma")),
         ("no-table", text(o, ""), (o,)),
@@ -696,7 +630,6 @@ def _tables() -> Iterable[Refusal]:
             ("'up'", "'none'", "'0'", "'x'", "'y'", "row 1", "row 4"),
         ),
         ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
-        ("few", kept("measurements.csv", 2), ("6",)),
     ]
     yield from _spoiled("outlines", "calibrate {in} -o {out}", "3-rpr-outlines", outlines)
 
@@ -737,7 +670,6 @@ def _landmarks() -> Iterable[Refusal]:
     c = "landmarks.csv"
     rows: Rows = [
         ("outside", cell(c, 2, u="470"), ("row 2", "column u", "470 px", "63.5 px")),
-        ("sigma", cell(c, 2, sigma="0"), ("row 2", "column sigma", "0.01")),
         ("twice", doubled(c), ("row 13", "row 1", "the same image and joint")),
         ("few", kept(c, 3), ("view c1", "3 clicks", "4 or more, better 6")),
         ("wrong-joint", (clicks("leg4.platform"), cell(c, 1, joint="leg4.platform")),
@@ -757,17 +689,13 @@ def _landmarks() -> Iterable[Refusal]:
 def _overrides() -> Iterable[Refusal]:
     """Choices of parameters by options."""
     priors: Words = [
-        ("empty", "leg1.offset=", ("leg1.offset",)),
         ("sigma-0", "leg1.offset=0.35±0", ("sigma 0",)),
         ("one-unit", "leg1.offset=350mm±0.1", ("unit",)),
         ("unit", "leg1.offset=350±1furlong", ("'furlong'", "mm")),
         ("pixels", "leg1.offset=350±1px", ("px", "leg1.offset", "m")),
         ("metres", "leg1.offset=350±1", ("350 m", "leg1.offset")),
         ("name", "leg1.ofset=0.35±0.1", ("'leg1.offset'",)),
-        ("pattern", "*.ofset=0.35±0.1", ("*.ofset",)),
         ("frame", "leg1.base.x=0±0.1", ("leg1.base.x", "R_b")),
-        ("length", "leg1.length=0.3±0.1", ("leg1.length", "leg1.offset")),
-        ("two", "leg1.offset=0.35±0.1' --set 'leg1.offset=0.36±0.1", ("leg1.offset",)),
         ("fixed", "leg1.offset=0.35±0.1' --set '*.offset", ("leg1.offset",)),
         ("camera", "c1.fx=79±3' --set 'c2.fx=78±3", ("c1.fx", "c2.fx")),
     ]
@@ -777,9 +705,6 @@ def _overrides() -> Iterable[Refusal]:
     others: Words = [
         ("freed", "--set leg1.offset --set leg1.offset=free", ("leg1.offset",)),
         ("values", "--set leg1.offset=0.35 --set leg1.offset=0.36", ("leg1.offset",)),
-        ("unit", "--set leg1.offset=350foot", ("leg1.offset", "foot")),
-        ("all-at-once", "--set leg9.offset --set leg1.base.x --set c9.fx=free",
-         ("leg9.offset", "leg1.base.x", "c9.fx")),
         ("everything", "--set '*.base.?' --set '*.platform.?' --set '*.offset'", ()),
     ]  # fmt: skip
     for name, words, named in others:
@@ -791,7 +716,7 @@ def _overrides() -> Iterable[Refusal]:
 def _models() -> Iterable[Refusal]:
     y, u = "models/hexapod.yaml", "urdf/hexapod.urdf"
     limit = '<limit lower="-0.004" upper="0.144" effort="1000" velocity="1"/>'
-    end, free = "</robot>", 'name="platform_free" type="floating">'
+    free = 'name="platform_free" type="floating">'
     seat = '<parent link="base"/><child link="leg1_seat"/>'
     b2_at = '<child link="leg3_b2_link"/><origin xyz="0.0 0.0 0.0"'
     b2 = b2_at + ' rpy="0.0 0.0 0.0"/><axis xyz="{}"/>'
@@ -804,23 +729,15 @@ def _models() -> Iterable[Refusal]:
         ("frame-twice", swap(y, "  - leg1_seat", "  - leg1_end"), ("'leg1_end'",)),
         ("frame-of-another", swap(y, "  - leg5_seat", "  - leg2_seat"),
          ("closed_loop.4", "'leg2_seat'", "closed_loop.1", "write 'leg5_seat'")),
-        ("three", swap(y, "  - leg1_seat\n", "  - leg1_seat\n  - base\n"), ("closed_loop.0",)),
         ("motor", swap(y, "- leg1_prismatic\n", "- leg9_prismatic\n"), ("name_mot.0",)),
         ("motor-twice", swap(y, "- leg1_prismatic\n", "- leg2_prismatic\n"),
          ("'leg2_prismatic'",)),
         ("types", swap(y, "- 3d\n", ""), ("6", "5", "closed_loop", "type")),
-        ("type", swap(y, "- 3d\n", "- 2d\n"), ("type.0", "'2d'", "'3d'")),
         ("both", swap(y, "platform: platform\n", "platform: base\n"), ("base", "platform")),
         ("frame-leg", swap(y, "  - leg1\n", "  - leg8\n"), ("legcal.base_frame", "'leg8'")),
         ("frame-legs", swap(y, "  - leg1\n", ""), ("2", "3")),
         ("home-far", swap(y, "0.38274", "0.9"), ("legcal.home",)),
-        ("key", swap(y, "  base: base\n", "  bse: base\n"), ("'base'",)),
-        ("urdf", swap(y, "../urdf/hexapod.urdf", "../urdf/none.urdf"), ("none.urdf",)),
         ("stand-in", swap(y, "joint_name: []", "joint_name: [leg1_b1]"), ("1", "0")),
-        ("all-at-once", (swap(y, "- - leg1_end", "- - nowhere"),
-                         swap(y, "base: base\n", "base: bass\n"),
-                         swap(y, "leg5: leg5_prismatic", "leg5: lost")),
-         ("'nowhere'", "'bass'", "'lost'")),
         ("list", text(y, "- 1\n"), (y,)),
         ("python", swap(y, "type:", "x: !!python/object/apply:os.system [touch trace]\ntype:"),
          ("python/object/apply",)),
@@ -830,7 +747,6 @@ def _models() -> Iterable[Refusal]:
         ("axis-2", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 2"'), ("length 2",)),
         ("radius", swap(u, 'radius="0.01"', 'radius="-0.01"'), ("-0.01",)),
         ("no-radius", swap(u, 'radius="0.01" ', ""), ("radius",)),
-        ("length", swap(u, 'length="0.3105"', 'length="long"'), ("'leg1_b2_link'", "long")),
         ("limits", swap(u, 'lower="-0.004"', 'lower="0.2"'), ("0.2", "0.144")),
         ("floating", swap(u, 'type="floating"', 'type="spherical"'), ("'spherical'",)),
         ("mimic", swap(u, limit, f'{limit}<mimic joint="leg2_prismatic"/>'), ("<mimic>",)),
@@ -838,8 +754,6 @@ def _models() -> Iterable[Refusal]:
         ("parent", swap(u, '<parent link="leg1_b2_link"/>', '<parent link="lost"/>'), ("'lost'",)),
         ("second-parent", swap(u, '<child link="leg1_seat"/>', '<child link="leg1_end"/>'),
          ("'leg1_end'",)),
-        ("same-link", swap(u, '<link name="leg1_seat"/>', '<link name="leg1_end"/>'),
-         ("leg1_end", "another link")),
         ("loose", swap(u, '<link name="base"/>', '<link name="base"/><link name="loose"/>'),
          ("loose",)),
         ("doctype", (swap(u, '<link name="base"/>', '<link name="base">&a;</link>'),
@@ -847,8 +761,6 @@ def _models() -> Iterable[Refusal]:
                           "><robot")), (u, "DOCTYPE")),
         ("cut", cut(u, 3000), ("line",)),
         ("no-robot", text(u, "<a/>"), (u,)),
-        ("no-name", swap(u, ' name="hexapod"', ""), ("<robot>",)),
-        ("moved-axis", swap(u, 'xyz="0.0 0.0 0.345"', 'xyz="0.0 0.002 0.345"'), ("leg1", "2 mm")),
         ("version-true", swap(y, "version: 1", "version: true"),
          ("legcal.version", "true", "needed 1")),
         ("no-leg-name", swap(y, "    leg6: leg6_prismatic\n", ""),
@@ -873,7 +785,6 @@ def _models() -> Iterable[Refusal]:
         ("two-parents", swap(u, limit, f'{limit}<parent link="base"/>'),
          ("line", "more than one <parent>")),
         ("link-without-name", swap(u, '<link name="leg1_seat"/>', "<link/>"), ("line", "no name")),
-        ("constraint", swap(u, end, f'<constraint name="l"/>{end}'), ("line", "<constraint>")),
         ("apart", swap(u, b2_at, b2_at.replace('0.0"', '0.002"')), ("leg3_b1", "leg3_b2", "2 mm")),
         ("parallel", swap(u, b2.format("0.0 1.0 0.0"),
                           b2.format("1.0 0.0 0.0").replace("0.0 0.0 0.0", "0.0 0.002 0.0", 1)),
@@ -912,13 +823,10 @@ def _models() -> Iterable[Refusal]:
         "model-written", "inspect {in}/models/hexapod.yaml --write {in}", ("hexapod.yaml",), "model"
     )
     for file, content, named in (
-        ("binary.xml", b"\x00\x01", "binary.xml"),
         ("other.xml", b"<a/>", "other.xml"),
-        ("bodies.xml", b"<mujoco><worldbody/></mujoco>", "bodies.xml"),
         ("entity.xml", b'<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "entity.xml"),
         ("gazebo.sdf", b'<?xml version="1.0"?>\n<sdf version="1.6"><model/></sdf>', "an SDF"),
         ("m.hal", b"# hexapod\nloadrt genhexkins\nsetp x 1\n", "m.hal -o DIR"),
-        ("printer.cfg", b"[printer]\nkinematics: delta\n", "legcal new"),
     ):
         yield Refusal(
             f"file-{file}", f"inspect {{in}}/{file}", (named,), "", (text(file, content),)
@@ -933,7 +841,7 @@ def _motors() -> Rows:
     """Return what files of motors that carry rods cannot be."""
     y, u = "delta.yaml", "delta.urdf"
     limits = 'lower="-0.5235987755982988" upper="1.2217304763960306"'
-    motors, a2 = "name_mot:\n- arm1\n", '"leg1_a2" type="revolute"'
+    motors = "name_mot:\n- arm1\n"
     home = re.findall(r"  home:\n(?:    .*\n)+", (ROOT / "models/delta.yaml").read_text())[0]
 
     def travel(low: str, high: str) -> Edit:
@@ -953,7 +861,6 @@ def _motors() -> Rows:
         ("two", swap(y, motors, f"{motors}- leg1_a2\n"), ("'leg1_a2'", "one motor for each leg")),
         ("none", swap(y, motors, "name_mot:\n"),
          ("'arm1'", "carries 2 rods", "a motor in name_mot")),
-        ("slider", swap(u, a2, '"leg1_a2" type="prismatic"'), ("slider 'leg1_a2'", "'arm1'")),
         ("continuous", swap(u, '"arm1" type="revolute"', '"arm1" type="continuous"'),
          ("'arm1'", "continuous", "<limit>")),
     ]  # fmt: skip
@@ -982,7 +889,6 @@ def _formats() -> Iterable[Refusal]:
 
     mjcf: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("include", added('<include file="x.xml"/>'), ("include could not be used",)),
-        ("body1", tied("1_end", "1_en"), ("'leg1_en' as body1", "mean 'leg1_end'?")),
         ("no-body1", tied('body1="leg1_end"', ""), ("no body1",)),
         ("no-anchor", tied('anchor="0 0 0"', ""), ("no anchor",)),
         ("anchor", tied("0 0 0", "0 0"), ("anchor='0 0'", "3 finite numbers")),
@@ -1005,19 +911,17 @@ def _formats() -> Iterable[Refusal]:
         ("range", ('range="-0.004 0.144"', 'range="1 -1"'),
          (", line 9: joint 'leg1_prismatic'", "1 to -1")),
         ("grad", (world, f'<compiler angle="grad"/>{world}'), ("angle='grad'", "degree")),
-        ("global", (world, f'<compiler coordinate="global"/>{world}'), ("coordinate='global'",)),
         ("eulerseq", (world, f'<compiler eulerseq="xyw"/>{world}'), ("eulerseq='xyw'",)),
         ("class", added('<body childclass="no"/>'), ("default class 'no'",)),
         ("no-class", (world, f"<default><default/></default>{world}"),
          ("default class without a",)),
         ("two-joints", (joint, joint + '<joint name="x"/>'), ("a body that has other joints",)),
         ("size", (size, size.replace("0.01", "0")), ("without a radius",)),
-        ("comment", ("<mujoco", "<sdf/><!--"), ("well-formed XML",)),
         ("bodies-6000", ("</worldbody>", "<body/>" * 6000 + "</worldbody>"), ("at most 5000",)),
         ("outside", tied("leg1_seat", "leg2_tube"),
          ("check <equality>", "--base LINK --platform LINK")),
     ]  # fmt: skip
-    yield from _of_file("mjcf", "machine.xml", "mjcf bodies", mjcf)
+    yield from _of_file("mjcf", "machine.xml", "mjcf", mjcf)
     rest: Rows = [
         ("all-at-once",
          (swap("machine.xml", motor, '<position joint="leg1"/>'),
@@ -1028,7 +932,7 @@ def _formats() -> Iterable[Refusal]:
         ("two-mechanisms", _second_mechanism,
          ("found 2 mechanisms, which have no moving body in common",)),
     ]  # fmt: skip
-    yield from _spoiled("mjcf", "inspect {in}/machine.xml", "mjcf bodies", rest)
+    yield from _spoiled("mjcf", "inspect {in}/machine.xml", "mjcf", rest)
     link1 = '<link1 link="leg1_tube"'
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
@@ -1055,7 +959,6 @@ def _formats() -> Iterable[Refusal]:
         ("twice", ("joint_name:\n- leg1_b1", "joint_name:\n- leg2_b1"), ("'leg2_b1' twice",)),
         ("motor", ("name_mot:\n- leg1_prismatic", "name_mot:\n- leg1_b1"),
          ("stands for UJOINT_XY",)),
-        ("outside", ("- leg1_seat\n", "- leg2_tube\n"), ("add a block legcal with",)),
     ]  # fmt: skip
     yield from _of_file("gepetto", "machine/robot.yaml", "gepetto", gepetto)
 
@@ -1091,36 +994,26 @@ def _new() -> Iterable[Refusal]:
         return keyed(file, **values)
 
     rows: Rows = [
-        ("no-unit", entry(unit=GONE), ("unit",)),
         ("no-type", entry(type=GONE), ("type", "types")),
-        ("types", entry(types=["RPS"] * 3), ("type", "types")),
         ("count", entry(type="6-RPS"), ("6-RPS", "3", "6")),
         ("class", entry(type="3-PPS"), ("'PPS'",)),
         ("joints-size", entry(base_joints=[[1e300, 2, 3]] * 3), ("base_joints.0", "base_joints.2")),
         ("offsets-two", entry(offsets=[380, 380]), ("offsets", "2", "3")),
         ("no-offsets", entry(offsets=GONE), ("leg1", "offset")),
-        ("no-travel", entry(travel=GONE), ("leg1", "travel")),
         ("travel", entry(travel=[150, 0]), ("travel", "150")),
         ("pipe", entry(radius={"pipe": 4}), ("radius", "pipe")),
-        ("kinds", entry(kinds="loose"), ("kinds", "'loose'")),
         ("constant", entry(kinds="constant"), ("leg1", "constant")),
         ("axes", entry(base_axes=[[0, 0, 0]] * 3), ("base_axes.0", "not all zero")),
-        ("axes-s", entry(platform_axes=[[1, 0, 0]] * 3), ("S",)),
         ("home", entry(home={"xyz": [0, 0, 440]}), ("home",)),
         ("legs", entry(legs=["a", "a", "b"]), ("legs", "'a'")),
         ("one-point", entry(base_joints=[[1, 2, 3]] * 3), ()),
-        ("metres", entry(unit="m"), ("leg1", "unit")),
         ("millimetres", entry(offsets=0.38, travel=[0, 0.15]), ("leg1", "unit")),
         ("thin", entry(radius=0.014), ("leg1", "radius")),
         ("across", entry(base_axes=[[0, 1, 0.1], None, None]), ("leg1", "90 deg")),
-        ("all-at-once", entry(unit="inch", offsets="long", radius=0),
-         ("unit", "offsets", "radius")),
     ]  # fmt: skip
     yield from _spoiled("table", f"new {{in}}/{file} -o {{out}}", "tables", rows)
     head, row = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
     lines: list[tuple[str, str, str, tuple[str, ...]]] = [
-        ("header", "type,base_x\n", "--unit mm", ("a header and no row",)),
-        ("column", f"{head},bse_z\n{row},0\n", "--unit mm", ("'bse_z'", "'base_z'")),
         ("no-column", "type,base_x\nRPS,1\n", "--unit mm", ("'base_y'",)),
         ("no-unit", f"{head}\n{row}\n", "", ("--unit", "mm")),
         ("points-column", "point,x,y,zz\nB1,1,2,3\nP1,4,5,6\n", "--unit mm", ("'zz'", "'z'")),
@@ -1133,7 +1026,6 @@ def _new() -> Iterable[Refusal]:
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
         ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
-        ("blank", f"{head}\n{row}\nRPS,,2,3,4\n", "--unit mm", ("line 3", "base_x")),
     ]
     for name, content, words, named in lines:
         yield Refusal(
@@ -1147,11 +1039,9 @@ def _new() -> Iterable[Refusal]:
         ("arm-length", "hexapod --arm-length 20", ("--arm-length", "--base-radius")),
         ("upx", "hexapod --type UPX", ("--type UPX", "with a slider")),
         ("min-length", "hexapod --min-length 600", ("--family hexapod", "min_length 600")),
-        ("name", "hexapod --name ../up", ("'../up'",)),
         ("rods", "delta --rod-length 100", ("rods of 100 mm", "--rod-length")),
         ("height", "delta --height 374", ("--height 374", "negative")),
         ("thick", "delta --leg-radius 40", ("60 mm apart", "80 mm thick", "--leg-radius")),
-        ("delta-type", "delta --type UPS", ("--type", "--arm-length")),
     ]
     for name, words, named in families:
         command = f"new --family {words} --unit mm -o {{out}}"
@@ -1185,7 +1075,6 @@ def _described() -> Iterable[Refusal]:
          ("version could not", "unknown key", "add 'legcal_table: 1'")),
         ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),
         ("one-leg", {"base_joints": [[1, 2, 3]]}, ("base_joints", "at least 2")),
-        ("joints-number", {"base_joints": 7}, ("base_joints", "found 7", "a list")),
         ("frame-twice", {"base_frame": ["leg1", "leg1", "leg2"]},
          ("base_frame", "'leg1' more than once")),
         ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),
@@ -1193,8 +1082,6 @@ def _described() -> Iterable[Refusal]:
         ("fixed-axis", {"type": "UP", "platform_axes": [[1, 0, 0]] * 3}, ("axis", "fixed")),
         ("two-points", pairs, ("'leg1' and 'leg2'", "same two points")),
         ("rod-length", rod | {"lengths": [None, 455, 455]}, ("lengths", "'leg2'")),
-        ("rod-offset", rod | {"offsets": [380, 380, 380]}, ("offsets", "'leg3'")),
-        ("rod-apart", rod | {"lengths": [None, None, 600]}, ("'leg3'", "456.", "600 mm")),
         # what does not fit together, once the machine is put together
         ("length-negative", {"offsets": -380}, ("length of -0.38 m", "offset")),
         ("no-home", {"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "middle")),
@@ -1229,14 +1116,12 @@ def _described() -> Iterable[Refusal]:
         ("hangs-on", {"hangs_on": ["arm1"] * 4 + ["arm3", "arm9"]},
          ("'leg6'", "'arm9'", "mean 'arm3'")),
         ("arm-alone", {"hangs_on": ["arm1"] * 4 + ["arm3"] * 2}, ("actuators.arm2", "no leg")),
-        ("no-motors", {"actuators": None, "hangs_on": None}, ("'leg1'", "no motor", "RSS")),
         ("no-length", {"lengths": None}, ("'leg1'", "no length")),
         ("point-on-axis", arm1(point=[320, 0, 0]),
          ("'leg1'", "on the axis of 'arm1'", "needed an arm")),
         ("home-below", {"home": below}, ("'leg5', 'leg6' 702.718 mm long", "400 mm there")),
         ("travel-at-home", arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
         ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
-        ("reading-of-none", {"home_readings_deg": {"arm9": 1}}, ("home_readings_deg.arm9",)),
         ("reading-of-arm", {"home_readings": {"arm1": 1}}, ("home_readings.arm1", "no such carri")),
     ]  # fmt: skip
     for name, changed, named in of_motors:
@@ -1253,9 +1138,7 @@ def _poses() -> Iterable[Refusal]:
     rows: Rows = [
         ("angle", header(p, "qx", "rx"), ("'rx'",)),
         ("column", swap(p, "leg1_prismatic,", "quality,leg1_prismatic,"), ("'quality'",)),
-        ("far", cell(p, 2, z="2e9"), ("2e9", "1e+06 m")),
         ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
-        ("twice", doubled(p), ("row 25", "row 1")),
         ("two-poses", kept(p, 2), ("2", "3")),
     ]
     yield from _spoiled("poses", "locate hexapod {in}/hexapod.csv -o {out}", "tool-poses", rows)
@@ -1271,7 +1154,6 @@ def _results() -> Iterable[Refusal]:
         ("gone", remove(r), ("result.json",)),
         ("broken", text(r, "{"), ("result.json",)),
         ("other", document(legcal_result=GONE), ("legcal_result",)),
-        ("version", document(legcal_result=2), ("legcal_result", "2")),
         ("covariance", document(covariance__0=[1.0]), ("covariance",)),
         ("asymmetric", document(covariance__0__1=1.0), ("covariance",)),
         ("kinematic", document(kinematic__covariance__0__1=1.0), ("kinematic",)),
@@ -1312,18 +1194,11 @@ def _exports() -> Iterable[Refusal]:
     """Formats that a class does not have, and places and options that cannot be used."""
     those = "this machine has table, csv, json, urdf"
     rows: Words = [
-        ("six-legs", "3-rps --to linuxcnc -o {out}", ("six legs", those)),
         ("rod", "hexapod-rod --to linuxcnc -o {out}", ("leg6", those)),
         ("model", "hexapod --to correction -o {out}", ("needed a result", those)),
-        ("rails", "hexaglide --to linuxcnc -o {out}", ("'rail1' moves joints at A", "or a Delta")),
         ("prs", "3-prs --to reprapfirmware -o {out}", ("found 3 rods on them, needed a Delta",)),
         ("arms", "delta --to marlin -o {out}", ("motors that turn", "three linear motors")),
-        ("rods", "hexaglide --to klipper -o {out}", ("6 motors that carry rods and 6 freedoms",)),
-        ("flypt", "delta --to flypt -o {out}", ("'arm1' moves joints at A", "LinearHexapod")),
-        ("format", "hexapod --to step -o {out}", ("mjcf",)),
         ("folder", "hexapod --to table -o {in}", ("a folder",)),
-        ("no-folder", "hexapod --to table -o no/a", ("no folder",)),
-        ("inertia", "hexapod --to csv --inertia -o {out}", ("--inertia",)),
         ("nodes", "hexapod --to urdf --nodes 3 -o {out}", ("correction",)),
         ("matlab", "hexapod --to matlab -o 1-a.m", ("m_1_a.m",)),
         ("no-result", "no/result.json --to csv -o {out}", ("result",)),

@@ -1,12 +1,12 @@
 """The same photographs of a machine of another size: all lengths of a dataset times a factor."""
 
-import csv
 import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import yaml
+from csv_rows import read_rows, write_rows
 
 
 def scaled_dataset(source: Path, folder: Path, factor: float) -> Path:
@@ -70,11 +70,8 @@ def _scale_pose(pose: dict[str, list[float]] | None, factor: float) -> None:
 
 
 def _scale_readings(path: Path, prismatic: set[str], factor: float) -> None:
-    with path.open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file)
-    columns = [k for k, name in enumerate(header) if name in prismatic]
+    rows = read_rows(path)
     for row in rows:
-        for k in columns:
-            row[k] = repr(factor * float(row[k])) if row[k] else ""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([header, *rows])
+        for name in prismatic.intersection(row):
+            row[name] = repr(factor * float(row[name])) if row[name] else ""
+    write_rows(path, rows)

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_sessions import MachineSession, body_edges, machine_session
+from machines import ROOT
 from simulated import PLACES, settings, small_camera
 
-from legcal import calibrate, load_dataset, load_mechanism
+from legcal import Viewpoint, calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor
@@ -24,11 +25,8 @@ from legcal.machine.shapes import PlacedOccluders
 from legcal.perception.body_edges import bodies_in_view, bodies_of, edges_of_body
 from legcal.perception.photographs import nominal_placement
 from legcal.simulation.cameras import mild_lens, read_lens
-from legcal.simulation.dataset import simulate
-from legcal.simulation.observe import Viewpoint
 from legcal.simulation.settings import Level
 
-ROOT = Path(__file__).parents[1]
 BODY = (
     '<visual><origin xyz="0.004 -0.003 -0.255" rpy="0 0 0"/>'
     '<geometry><box size="0.03 0.03 0.11"/></geometry></visual>'

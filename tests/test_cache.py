@@ -23,11 +23,7 @@ from legcal.data.cache import (
     store_outlines,
 )
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset, load_dataset
-from legcal.data.outlines import (
-    Outlines,
-    join_outlines,
-    write_observations,
-)
+from legcal.data.outlines import Outlines, join_outlines, write_observations
 from legcal.errors import DatasetError
 from legcal.geometry.types import BoolArray
 from legcal.perception.photographs import detection_settings

@@ -7,15 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from cad_exports import (
-    LENGTH,
-    RADIUS,
-    ROD,
-    SHAFT,
-    write_ankle,
-    write_head_mjcf,
-    write_head_urdf,
-)
+from cad_exports import LENGTH, RADIUS, ROD, SHAFT, write_ankle, write_head_mjcf, write_head_urdf
 
 from legcal import load_mechanism, plan
 from legcal.errors import ModelError

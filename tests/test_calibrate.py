@@ -19,19 +19,14 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
 from scipy.spatial.transform import RigidTransform
 from simulated import files_of, simulated
 
-from legcal import calibrate, evaluate, load_mechanism, load_result
+from legcal import Calibration, calibrate, evaluate, load_mechanism, load_result
 from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
-from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.verdict import judge
 from legcal.data.corners import found_corners
-from legcal.errors import (
-    DatasetError,
-    NotIdentifiable,
-    NotVisible,
-)
+from legcal.errors import DatasetError, NotIdentifiable, NotVisible
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
@@ -270,12 +265,12 @@ def test_corners_that_are_too_few_are_refused(tmp_path: Path) -> None:
         calibrate(folder)
 
 
-def _seen(n_views: int) -> BoardViews:
+def _seen() -> BoardViews:
     none = np.zeros(0)
     corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
     T_board_camera = RigidTransform.from_translation([0.0, 0.0, -1.0])
     boards = (FixedBoard(Board("chessboard", 7, 6, 0.03), "base"),)
-    return BoardViews(boards, corners, (T_board_camera,) * n_views, {}, (), 0.4)
+    return BoardViews(boards, corners, (T_board_camera,), {}, (), 0.4)
 
 
 def _with_board(T_base_board: RigidTransform | None) -> Any:
@@ -287,15 +282,15 @@ def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
     place = RigidTransform.from_translation([0.3, 0.0, 0.0])
     board = _with_board(place)
     cameras = RigidTransform.from_translation([0.3, 0.04, -1.0])
-    assert base_of_board(board, _seen(1), (None,)) is place
-    assert base_of_board(board, _seen(1), (cameras,)) is place
+    assert base_of_board(board, _seen(), (None,)) is place
+    assert base_of_board(board, _seen(), (cameras,)) is place
     with pytest.raises(DatasetError, match=r"T_base_board and the T_base_camera .* found the boa"):
-        base_of_board(board, _seen(1), (cameras * cameras,))
+        base_of_board(board, _seen(), (cameras * cameras,))
     board = _with_board(None)
-    found = base_of_board(board, _seen(1), (cameras,))
+    found = base_of_board(board, _seen(), (cameras,))
     assert found is not None
     np.testing.assert_allclose(found.translation, [0.3, 0.04, 0.0], atol=1e-12)
-    assert base_of_board(board, _seen(1), (None,)) is None
+    assert base_of_board(board, _seen(), (None,)) is None
 
 
 # The photographs of the example.

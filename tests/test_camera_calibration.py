@@ -521,16 +521,11 @@ def test_the_file_is_a_camera_info_with_the_whole_covariance(
     ],
 )
 def test_camera_files_are_compared_and_converted_by_the_command(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: str,
-    code: int,
-    said: str,
+    folder: Path, arguments: str, code: int, said: str
 ) -> None:
-    assert run(monkeypatch, "camera", *arguments.replace("{}", str(folder)).split()) == code
-    printed = capsys.readouterr()
-    assert said in " ".join((printed.out + printed.err).split())
+    outcome = run("camera", *arguments.replace("{}", str(folder)).split())
+    assert outcome.code == code
+    assert said in outcome.said
 
 
 @pytest.mark.usefixtures("found")

@@ -89,19 +89,3 @@ def test_what_stands_still_in_the_pictures_of_a_view_is_no_edge_of_a_leg() -> No
             assert max(*offsets(every, bar), *offsets(found, bar)) < 1.5
         assert min(offsets(found, still)) > 10.0
     assert still_picture(pictures[:3]) is None  # of which legs stand still in most
-
-
-def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_seen() -> None:
-    camera = _camera()
-    across = Bar(np.array([-0.3, 0.02, 0.6]), np.array([0.3, -0.02, 0.6]), 0.03, 90.0)
-    whole, crossed = (
-        find_segments(_picture(camera, bars), camera) for bars in (BARS[:1], [BARS[0], across])
-    )
-    for line in _lines(BARS[0]):
-        i, j = _nearest(whole, line), _nearest(crossed, line)
-        length = [
-            np.linalg.norm(f.ends[k, 1] - f.ends[k, 0]) for f, k in ((whole, i), (crossed, j))
-        ]
-        assert length[1] > 0.9 * length[0]
-        assert whole.covered[i] > 0.95
-        assert crossed.covered[j] < 0.9

@@ -11,7 +11,7 @@ import pytest
 from csv_rows import read_rows, write_rows
 from simulated import files_of, simulated
 
-from legcal import calibrate, check
+from legcal import Dataset, calibrate, check, load_dataset, load_mechanism
 from legcal.calibration.verification import (
     Change,
     Movement,
@@ -21,17 +21,11 @@ from legcal.calibration.verification import (
     noise_dof,
     possible_changes,
 )
-from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.errors import DatasetError, NotIdentifiable, UsageError
 from legcal.geometry.motions import frame_on_points
 from legcal.geometry.types import Array
-from legcal.machine.loader import load_mechanism
-from legcal.machine.parameters import (
-    geometries,
-    parametrization_of,
-    vector_of,
-)
+from legcal.machine.parameters import geometries, parametrization_of, vector_of
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -158,13 +152,14 @@ def _matrix(rng: np.random.Generator, scale: Array) -> Array:
     return np.asarray(root @ root.T / (2 * N) * np.outer(scale, scale))
 
 
-def _compare(seed: int, moved: Array, dof: int = 200, significance: float = 0.05) -> Movement:
+def _compare(seed: int, moved: Array, significance: float = 0.05) -> Movement:
     """Draw an earlier result and new images of a machine that has moved since; compare them."""
     matrices, rng = np.random.default_rng(5), np.random.default_rng(seed)
     old_covariance = _matrix(matrices, 2e-2 * PRIOR)
     information = np.linalg.inv(_matrix(matrices, 1e-2 * PRIOR))
     information[-1] *= LAST
     information[:, -1] *= LAST
+    dof = 200
     noise = np.sqrt(rng.chisquare(dof) / dof)  # as estimated, the truth is one
     truth = np.array([0.1, 0.2, -0.3, 0.4, 0.01, 0.02])
     old = truth + rng.multivariate_normal(np.zeros(N), old_covariance, method="eigh")

@@ -19,7 +19,6 @@ from legcal.calibration.joint_fit.parameter_choices import (
 from legcal.data.dataset_file import overrides_of_call
 from legcal.data.measurements import View
 from legcal.errors import UsageError
-from legcal.machine.parameters import parametrization_of
 from legcal.vision.camera import Camera
 
 __all__ = ["folder"]
@@ -49,15 +48,6 @@ def choose(
     parameters: KnownParameters = HEXAPOD,
 ) -> Choices:
     return resolve(overrides_of_call(priors, fixed, free), parameters)
-
-
-@pytest.mark.parametrize("model", ["hexapod-rod", "3-upu-tilted", "3-rpr", "tricept"])
-def test_every_parameter_of_a_machine_can_be_named(model: str) -> None:
-    parameters = known(model)
-    names = parametrization_of(load_mechanism(model), twists=True).names
-    assert tuple(parameters.by_name)[: len(names)] == names
-    assert choose(free=names, parameters=parameters).free == set(names)
-    assert parameters.by_name.keys().isdisjoint(parameters.others)
 
 
 @pytest.mark.parametrize(
@@ -102,16 +92,6 @@ def test_units_are_those_of_the_parameter() -> None:
     assert found.priors["leg1.base_axis.1"].mean == pytest.approx(np.radians(1.0))
     assert found.priors["c1.fx"] == Prior(1300.0, 3.0)
     assert found.priors["c1.k1"] == Prior(-0.1, 0.01)
-
-
-def test_a_parameter_can_be_fixed_away_from_nominal() -> None:
-    found = choose(fixed=["leg1.offset=351mm", "leg2.offset", "c2.cx=512.5"])
-    assert found.fixed == {"leg1.offset", "leg2.offset", "c1.cx"}
-    assert found.values == {"leg1.offset": 0.351, "c1.cx": 512.5}
-    assert found.holds("leg1.offset")
-    assert not found.holds("leg3.offset")
-    assert [found.holds(f"c1.{name}", by_default=True) for name in ("fx", "cx")] == [True, True]
-    assert not choose(free=["c1.fx"]).holds("c1.fx", by_default=True)
 
 
 def test_a_twist_is_an_angle_between_lines() -> None:

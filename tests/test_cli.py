@@ -1,6 +1,5 @@
 """The command line: exit codes, one sentence a problem, one JSON document."""
 
-import json
 import re
 import subprocess
 import sys
@@ -57,30 +56,26 @@ def test_commands_load_only_what_they_need(words: list[str], heavy: set[str], pr
 
 
 def test_calibrate_prints_all_parameters_with_verbose(
-    example_run: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("calibrate", example_run.folder, "-o", tmp_path / "out")
     computed = "legcal.calibration.pipeline.calibrate"
     monkeypatch.setattr(computed, lambda *_, **__: example_run.calibration)
-    assert run(monkeypatch, *words, "--verbose") == 0
-    captured = capsys.readouterr()
-    assert "Joints of the platform in the link platform [mm]" in captured.out
-    assert re.search(r"leg1 +x( +-168.8750){2} +[+]0.0000 +0.0000 +defines R_e", captured.out)
-    assert "leg4.offset" in captured.out
-    assert "four steps alone" in captured.out
-    assert "Calibrated:" in captured.out
+    outcome = run(*words, "--verbose")
+    assert outcome.code == 0
+    assert "Joints of the platform in the link platform [mm]" in outcome.out
+    assert re.search(r"leg1 +x( +-168.8750){2} +[+]0.0000 +0.0000 +defines R_e", outcome.out)
+    assert "leg4.offset" in outcome.out
+    assert "four steps alone" in outcome.out
+    assert "Calibrated:" in outcome.out
 
 
 @pytest.mark.usefixtures("without_steps")
-def test_a_model_that_was_right_already_is_not_called_an_improvement(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_that_was_right_already_is_not_called_an_improvement(tmp_path: Path) -> None:
     folder = simulated(tmp_path / "set", "3-rpr", errors=ParameterErrors()).folder
-    assert run(monkeypatch, "calibrate", folder, "-o", tmp_path / "out") == 1
-    assert "Do not load this into the controller" in " ".join(capsys.readouterr().out.split())
+    outcome = run("calibrate", folder, "-o", tmp_path / "out")
+    assert outcome.code == 1
+    assert "Do not load this into the controller" in outcome.said
 
 
 def _diagnosed() -> LegcalError:
@@ -113,33 +108,31 @@ def test_failures_have_their_exit_code_and_are_said_once(
     said: str,
     problems: list[str],
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def fail(model: str, **bodies: str | None) -> None:
         raise error
 
     monkeypatch.setattr("legcal.machine.loader.load_mechanism", fail)
-    assert run(monkeypatch, "inspect", "hexapod") == code
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert said in printed.err
-    assert run(monkeypatch, "inspect", "hexapod", "--json") == code
-    found = json.loads(capsys.readouterr().out)["error"]
+    outcome = run("inspect", "hexapod")
+    assert (outcome.code, outcome.out) == (code, "")
+    assert said in outcome.err
+    outcome = run("inspect", "hexapod", "--json")
+    found = outcome.document["error"]
+    assert outcome.code == code
     assert found["kind"] == kind
     assert said in found["message"]
     assert [problem["code"] for problem in found.get("problems", [])] == problems
 
 
-def test_json_has_the_facts_of_what_is_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_has_the_facts_of_what_is_wrong(tmp_path: Path) -> None:
     copy_of_the_example(tmp_path / "data")
     table = tmp_path / "data" / "measurements.csv"
     head, first, *rest = table.read_text("utf-8").splitlines()
     cells = first.split(",")[:-1]
     table.write_text("\n".join([head, ",".join([*cells, "far"]), *rest]), "utf-8")
-    assert run(monkeypatch, "doctor", str(tmp_path / "data"), "--json") == 2
-    error = json.loads(capsys.readouterr().out)["error"]
+    outcome = run("doctor", tmp_path / "data", "--json")
+    assert outcome.code == 2
+    error = outcome.document["error"]
     (problem,) = error["problems"]
     assert problem["code"] == "bad-cell"
     assert problem["file"] == str(table)
@@ -163,35 +156,28 @@ def test_of_many_problems_of_a_kind_a_few_are_spelt_out() -> None:
 
 
 @pytest.mark.parametrize(("words", "shown"), [((), "Results"), (("study",), "Commands")])
-def test_without_a_command_the_help_is_shown(
-    words: tuple[str, ...],
-    shown: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run(monkeypatch, *words) == 2
-    printed = capsys.readouterr()
-    assert shown in printed.err
-    assert printed.err.endswith("\nlegcal: No command given: choose one of those above.\n")
+def test_without_a_command_the_help_is_shown(words: tuple[str, ...], shown: str) -> None:
+    outcome = run(*words)
+    assert outcome.code == 2
+    assert shown in outcome.err
+    assert outcome.err.endswith("\nlegcal: No command given: choose one of those above.\n")
 
 
 @pytest.mark.parametrize("words", [("detect", "x", "-o", "y"), ("study", "paper", "-o", "y")])
 def test_a_number_of_processes_beside_a_cluster_is_refused(
-    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LEGCAL_CLUSTER", "tcp://127.0.0.1:1")
-    assert run(monkeypatch, *words, "--workers", "2") == 2
-    assert "found --workers beside a cluster" in capsys.readouterr().err
+    outcome = run(*words, "--workers", "2")
+    assert outcome.code == 2
+    assert "found --workers beside a cluster" in outcome.err
 
 
-def test_progress_is_shown_unless_somebody_wants_quiet(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_is_shown_unless_somebody_wants_quiet(tmp_path: Path) -> None:
     words = ["simulate", "3-rpr", "--level", "outlines", "--poses", "1"]
-    assert run(monkeypatch, *words, "-o", tmp_path / "shown") == 0
-    shown = capsys.readouterr()
-    assert run(monkeypatch, *words, "-o", tmp_path / "quiet", "--quiet") == 0
-    quiet = capsys.readouterr()
+    shown = run(*words, "-o", tmp_path / "shown")
+    quiet = run(*words, "-o", tmp_path / "quiet", "--quiet")
+    assert shown.code == quiet.code == 0
     assert shown.err
     assert not quiet.err
     assert quiet.out.count("\n") == shown.out.count("\n")

@@ -148,10 +148,10 @@ def test_a_calibration_on_a_cluster_is_that_of_this_process_byte_for_byte(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
     words = ("calibrate", "data", "--fresh", "--no-report")
-    code = run_command(monkeypatch, *words, "-o", "here", "--workers", "1")
+    code = run_command(*words, "-o", "here", "--workers", "1").code
     with local_cluster(tmp_path / "cluster", 2) as local:
         there = (*words, "--cluster", local.address, "-o", "there")
-        assert run_command(monkeypatch, *there) == code
+        assert run_command(*there).code == code
     assert files_of(Path("there")) == files_of(Path("here"))
     assert "result.json" in files_of(Path("there"))
 

@@ -10,14 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from dataset_folder import (
-    JOINTS,
-    ROOT,
-    SIZE,
-    Folder,
-    folder,
-    readings,
-)
+from dataset_folder import JOINTS, SIZE, Folder, folder, readings
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
@@ -25,12 +18,7 @@ from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError
 from legcal.geometry.types import Image
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import (
-    BadImage,
-    image_size,
-    inspect_image,
-    read_image,
-)
+from legcal.vision.image_file import BadImage, image_size, inspect_image, read_image
 
 __all__ = ["folder"]
 
@@ -44,22 +32,6 @@ def read(folder: Folder) -> Measurements:
 
 
 # --- dataset.yaml
-
-
-def test_example_is_read_as_it_is_written() -> None:
-    dataset = load_dataset(ROOT / "examples" / "hexapod")
-    measurements = dataset.measurements
-    assert (measurements.n_rows, measurements.n_poses, len(measurements.views)) == (45, 45, 3)
-    assert measurements.q.shape == (45, 6)
-    assert measurements.q[0, 4] == 0.1331597
-    assert measurements.sigma_q == 2e-6
-    assert measurements.image[16] == "images/c2_k02.jpg"
-    assert measurements.views[measurements.view[16]].name == "c2"
-    T = measurements.views[0].T_base_camera
-    assert T is not None
-    np.testing.assert_allclose(T.translation, [-0.2253, -0.9482, 0.2459])
-    assert dataset.notes == ()
-    assert dataset.image_reader([0])(0).shape == (768, 1024)
 
 
 def test_a_dataset_is_named_by_its_folder_or_its_file(

@@ -12,11 +12,7 @@ from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at, split_images
-from legcal.data.image_tables import (
-    Order,
-    canonical_order,
-    reorder_measurements,
-)
+from legcal.data.image_tables import Order, canonical_order, reorder_measurements
 from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable, UsageError
 

@@ -1,6 +1,5 @@
 """Geometry that is nearly or quite degenerate: the right answer, or what is missing, by name."""
 
-import csv
 import re
 import shutil
 from dataclasses import replace
@@ -9,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from csv_rows import read_rows, write_rows
 from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 import legcal
-from legcal import calibrate
-from legcal.calibration.result import Calibration
+from legcal import Calibration, Machine, calibrate
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.machine.model import Machine
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -50,10 +48,9 @@ def errors(calibration: Calibration, folder: Path, result: Path) -> tuple[float,
 
 def with_pose(folder: Path, machine: Machine, last: Any) -> Path:
     """Write ordinary readings of a 3-RPR, and another one."""
-    joints = [leg.prismatic for leg in machine.legs]
-    with (folder / "poses.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerows([joints, *READINGS.tolist(), list(last)])
+    joints = [str(leg.prismatic) for leg in machine.legs]
+    rows = [dict(zip(joints, q, strict=True)) for q in [*READINGS.tolist(), list(last)]]
+    write_rows(folder / "poses.csv", rows)
     return folder / "poses.csv"
 
 
@@ -132,12 +129,8 @@ def test_a_leg_that_no_view_shows_is_found_from_its_readings(
 ) -> None:
     """Legs 1 to 5 are named in the views, leg 6 in none: its encoder says where it is."""
     folder = Path(shutil.copytree(two_views, tmp_path / "set"))
-    observations = folder / "observations.csv"
-    with observations.open(newline="") as file:
-        header, *rows = csv.reader(file)
-    leg = header.index("leg")
-    with observations.open("w", newline="") as file:
-        csv.writer(file).writerows([header, *(row for row in rows if row[leg] != "leg6")])
+    rows = read_rows(folder / "observations.csv")
+    write_rows(folder / "observations.csv", [row for row in rows if row["leg"] != "leg6"])
     with pytest.raises(
         NotVisible, match=r"no image has a usable outline of leg6; .* list the visible legs of each"
     ):

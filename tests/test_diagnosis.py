@@ -11,18 +11,16 @@ from hexapod_example import spoiled
 from simulated import settings, simulated
 from thinned import thinned
 
-from legcal import calibrate, load_dataset
+from legcal import Dataset, calibrate, load_dataset, simulate
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
 from legcal.calibration.diagnosis.mistakes import Mistake, mistakes
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.data.dataset import Dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
-from legcal.simulation.dataset import simulate
 from legcal.workers import in_turn
 
 

@@ -1,6 +1,5 @@
 """``legcal doctor``: what can stand in the way is provoked, and named once with a remedy."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 from command_line import run
-from command_outcomes import fits_schema
 from csv_rows import read_rows, write_rows
 from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg, undecodable_png
@@ -117,7 +115,7 @@ def test_what_photographs_say_of_camera_and_compression_is_told(tmp_path: Path) 
 
 
 def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mistake = Diagnosis(
         "columns exchanged", "columns a and b look exchanged", (), "with them exchanged", 6, 1, 6,
@@ -129,9 +127,9 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     right, rough["xyz"] = rough["xyz"], [2.0, 2.0, 2.0]
     name = session.change("c1", 0, lambda picture: 0 * picture)
     folder = session.write()
-    assert run(monkeypatch, "doctor", folder, "--json") == 1
-    document = json.loads(capsys.readouterr().out)
-    fits_schema(["doctor"], document)
+    outcome = run("doctor", folder, "--json")
+    document = outcome.document
+    assert outcome.code == 1
     said = [one["what"] for one in document["findings"]]
     assert said[0] == mistake.sentence
     assert any(what.startswith("1 further problem may have the same cause") for what in said)
@@ -141,22 +139,21 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     assert document["usable"]
     rough["xyz"] = right
     (session.write() / name).unlink()
-    assert run(monkeypatch, "doctor", folder) == 2
-    shown = capsys.readouterr().out
-    assert shown.index("error:") < shown.index("Columns a and b look exchanged")
-    assert "errors to fix before calibrating" in shown
+    outcome = run("doctor", folder)
+    assert outcome.code == 2
+    assert outcome.out.index("error:") < outcome.out.index("Columns a and b look exchanged")
+    assert "errors to fix before calibrating" in outcome.out
 
 
-def test_datasets_without_photographs_are_judged_by_what_they_have(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_datasets_without_photographs_are_judged_by_what_they_have(tmp_path: Path) -> None:
     simulated(tmp_path / "outlines", "3-rpr", views=3, poses=6)
-    assert run(monkeypatch, "doctor", tmp_path / "outlines") == 0
-    shown = capsys.readouterr().out
-    assert "Ready to calibrate" in shown
-    assert "legcal calibrate" in shown
+    outcome = run("doctor", tmp_path / "outlines")
+    assert outcome.code == 0
+    assert "Ready to calibrate" in outcome.out
+    assert "legcal calibrate" in outcome.out
     simulated(tmp_path / "few", "3-rpr", views=1)
     assert [one.name for one in doctor(tmp_path / "few").checks][-1] == "mistakes"
     (tmp_path / "outlines" / "measurements.csv").unlink()
-    assert run(monkeypatch, "doctor", tmp_path / "outlines", "--json") == 2
-    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "DatasetError"
+    outcome = run("doctor", tmp_path / "outlines", "--json")
+    assert outcome.code == 2
+    assert outcome.document["error"]["kind"] == "DatasetError"

@@ -2,7 +2,6 @@
 
 import ast
 import io
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -22,6 +21,8 @@ from rich.console import Console
 from simulated import simulated
 
 from legcal import (
+    Calibration,
+    Machine,
     SimulationSettings,
     calibrate,
     load_dataset,
@@ -34,10 +35,8 @@ from legcal.calibration.documents import Doubt
 from legcal.calibration.doubts import model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
-from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
-from legcal.machine.model import Machine
 from legcal.machine.tolerance import TYPICAL, Tolerance
 from legcal.report.calibration import next_steps, summary
 from legcal.simulation.settings import Level
@@ -324,14 +323,13 @@ def test_exit_code_document_summary_and_page_agree(
     calibrated: Callable[[Spoil], Calibration],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     calibration, out = calibrated(spoil), tmp_path / "result"
     folder = calibration.dataset.folder
     again = Run(folder, out, calibration, ()).written_again
     monkeypatch.setattr("legcal.calibration.pipeline.calibrate", again)
-    code = run(monkeypatch, "calibrate", folder, "-o", out, "--json")
-    printed = json.loads(capsys.readouterr().out)
+    outcome = run("calibrate", folder, "-o", out, "--json")
+    code, printed = outcome.code, outcome.document
     following = printed.pop("next")  # in what is printed alone
     written = load_result(out).result
     read = load_result(out).verdict

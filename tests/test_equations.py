@@ -16,11 +16,7 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations, pose_equations, pose_sensitivity
 from legcal.machine.leg import JointType, Leg, LegColumns, LegKind
-from legcal.machine.parameters import (
-    Parametrization,
-    parametrize,
-    vector_of,
-)
+from legcal.machine.parameters import Parametrization, parametrize, vector_of
 
 FAST = settings(deadline=None, max_examples=6)
 SEEDS = st.integers(0, 2**32 - 1)

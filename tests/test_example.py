@@ -16,12 +16,11 @@ from legcal.perception.recognition import place_views
 EXAMPLE = Path(__file__).parents[1] / "examples/hexapod"
 
 
-def test_the_example_is_copied_and_loads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_example_is_copied_and_loads(tmp_path: Path) -> None:
     copy = tmp_path / "here" / "example"
-    assert run(monkeypatch, "example", "-o", str(copy)) == 0
-    assert "Next:\n  legcal calibrate" in capsys.readouterr().out
+    outcome = run("example", "-o", copy)
+    assert outcome.code == 0
+    assert "Next:\n  legcal calibrate" in outcome.out
     copied = {path.relative_to(copy) for path in copy.rglob("*") if path.is_file()}
     own = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
     assert own - copied <= {Path("observations.csv"), Path(".legcal-cache.json")}
@@ -30,11 +29,12 @@ def test_the_example_is_copied_and_loads(
 
 
 def test_an_installation_without_the_example_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(new_dataset, "_EXAMPLE", "examples/none")
-    assert run(monkeypatch, "example", "-o", str(tmp_path / "copy")) == 1
-    assert "install it again" in capsys.readouterr().err
+    outcome = run("example", "-o", tmp_path / "copy")
+    assert outcome.code == 1
+    assert "install it again" in outcome.err
     assert not (tmp_path / "copy").exists()
 
 

@@ -26,16 +26,22 @@ from machines import planar
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
-from legcal import load_mechanism
+from legcal import (
+    ExportOptions,
+    Machine,
+    ParameterErrors,
+    Spread,
+    export,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+)
 from legcal.errors import OutOfClass, UsageError
-from legcal.exports.formats import export, formats_of
-from legcal.exports.subject import ExportOptions, Subject, identifiers, load_subject
+from legcal.exports.formats import formats_of
+from legcal.exports.subject import Subject, identifiers, load_subject
 from legcal.geometry.types import Array
 from legcal.machine.closing import COORDINATES, independent_coordinates
 from legcal.machine.configurations import random_poses
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.model import Machine
-from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.truth import write_true_model
 
 NAMES = ("hexapod", "3-rps", "3-upu", "tricept", "3-rpr")

@@ -9,12 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 from camera_sessions import CAMERAS, seen_corners
-from dense_fit import (
-    by_differences,
-    jacobian,
-    projected_move,
-    residuals,
-)
+from dense_fit import by_differences, jacobian, projected_move, residuals
 from fit_sessions import (
     BOARD,
     LENS,

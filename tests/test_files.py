@@ -189,12 +189,7 @@ def test_a_place_that_is_not_free_is_refused_and_stays(case: str, tmp_path: Path
     [(tempfile, "mkdtemp", errno.EROFS), (Path, "write_bytes", errno.ENOSPC)],
 )
 def test_places_that_take_no_files_are_refused_before_any_work(
-    module: Any,
-    name: str,
-    number: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    module: Any, name: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*_found: Any, **_more: Any) -> None:
         raise OSError(number, os.strerror(number))
@@ -208,10 +203,10 @@ def test_places_that_take_no_files_are_refused_before_any_work(
         ("example", "-o", out),
         ("import", film, "--model", "3-rpr", "--camera", "none.yaml", "-o", out),
     ):
-        assert run(monkeypatch, *words) == 2
-        said = capsys.readouterr().err
-        assert f"{tmp_path} takes no files ('{os.strerror(number)}'), needed" in said
-        assert said.count("\n") == 1
+        outcome = run(*words)
+        assert outcome.code == 2
+        assert f"{tmp_path} takes no files ('{os.strerror(number)}'), needed" in outcome.err
+        assert outcome.err.count("\n") == 1
         assert list(tmp_path.iterdir()) == []
 
 

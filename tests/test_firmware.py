@@ -9,18 +9,22 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.pipeline import calibrate
+from legcal import (
+    LegcalError,
+    Machine,
+    ParameterErrors,
+    SimulationSettings,
+    calibrate,
+    export,
+    inverse_kinematics,
+    simulate,
+)
 from legcal.descriptions.controllers import firmware_table, read_delta
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
-from legcal.errors import LegcalError
-from legcal.exports.formats import export
 from legcal.geometry.types import Array
 from legcal.machine.configurations import random_poses
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.model import Machine
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, ParameterErrors, SimulationSettings
+from legcal.simulation.settings import Level
 
 KLIPPER = """
 [stepper_a]

@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
-from legcal.geometry.lines import (
-    distance_to_line,
-    moment,
-    nearest_point_to_origin,
-    normal_basis,
-)
+from legcal.geometry.lines import distance_to_line, moment, nearest_point_to_origin, normal_basis
 from legcal.geometry.motions import frame_on_points, motion_of, product
 from legcal.geometry.rotations import nearest_rotation, roll_pitch_yaw
 from legcal.geometry.types import Array

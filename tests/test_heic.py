@@ -41,7 +41,7 @@ def _heic(grey: np.ndarray[Any, Any] = GREY) -> bytes:
 
 
 def test_without_the_package_heic_is_named_with_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     assert ".heic" not in image_suffixes()
@@ -50,8 +50,9 @@ def test_without_the_package_heic_is_named_with_what_to_do(
     with pytest.raises(DatasetError, match=r"HEIC file.*legcal\[heic\].*magick"):
         decode_image(path, CAMERA)
     table(own_folder(tmp_path, ("IMG_1.HEIC",)), n=1)
-    assert init(monkeypatch, tmp_path) == 2
-    assert "pip install 'legcal[heic]'" in " ".join(capsys.readouterr().err.split())
+    outcome = init(tmp_path)
+    assert outcome.code == 2
+    assert "pip install 'legcal[heic]'" in outcome.said
 
 
 def test_with_the_package_heic_is_a_photograph_like_others(
@@ -61,7 +62,7 @@ def test_with_the_package_heic_is_a_photograph_like_others(
     table(own_folder(tmp_path, ("IMG_1.HEIC", "IMG_2.HEIC")), n=2)
     for k in (1, 2):
         (tmp_path / f"photos/IMG_{k}.HEIC").write_bytes(_heic(GREY + np.uint8(k)))
-    assert init(monkeypatch, tmp_path) == 0
+    assert init(tmp_path).code == 0
     dataset = load_dataset(tmp_path / "dataset")
     for k in range(2):
         path = dataset.image_path(k)

@@ -4,14 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from fit_sessions import (
-    PINHOLE,
-    HexapodSession,
-    disturbed_start,
-    irregular_hexapod,
-    noisy_outlines,
-    noisy_readings,
-)
+from fit_sessions import PINHOLE, MachineSession, irregular_hexapod
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import Holdout
@@ -41,19 +34,19 @@ class HeldOut:
 
 
 def _of_rows(
-    session: HexapodSession, measurements: Measurements, outlines: Outlines, rows: IntArray
+    session: MachineSession, measurements: Measurements, outlines: Outlines, rows: IntArray
 ) -> tuple[Measurements, Outlines, tuple[RigidTransform, ...]]:
     """Return some of the images, each of a pose of its own, with the start of their poses."""
     m = measurements
     images = tuple(m.image[i] for i in rows.tolist())
     some = replace(m, image=images, view=m.view[rows], pose=np.arange(len(rows)), q=m.q[rows])
-    poses = disturbed_start(session).T_Rb_Re
+    poses = session.start.T_Rb_Re
     return some, outlines.at(rows), tuple(poses[k] for k in m.pose[rows].tolist())
 
 
-def _held_out(session: HexapodSession, seed: int) -> HeldOut:
+def _held_out(session: MachineSession, seed: int) -> HeldOut:
     rng = np.random.default_rng(seed)
-    outlines, measurements = noisy_outlines(session, rng), noisy_readings(session, rng)
+    measurements, outlines = session.noisy(rng)
     edge = np.stack([measurements.view[outlines.row], outlines.leg, outlines.edge - 1])
     errors = SHARED * rng.standard_normal((3, 6, 2))
     outlines = moved_outlines(outlines, PINHOLE, np.repeat(errors[tuple(edge)][:, None], 2, axis=1))
@@ -62,7 +55,7 @@ def _held_out(session: HexapodSession, seed: int) -> HeldOut:
         _of_rows(session, measurements, outlines, rows)
         for rows in (np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out))
     )
-    begin = replace(disturbed_start(session), T_Rb_Re=start)
+    begin = replace(session.start, T_Rb_Re=start)
     solution = refine(session.legs, fitted, shown, begin)
     assert max(map(abs, solution.posterior.biases.values()), default=0.0) > 0.02  # [px]
     poses = start_from(solution.legs, held_out, session.legs, (), near, "").T_Rb_Re

@@ -12,19 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from actuated_sessions import session
 from command_line import run
+from fit_sessions import machine_session
 from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import with_round_arms
+from machines import delta_with_round_arms
 from random_legs import closed_leg
 from rich.console import Console
-from staged_sessions import exact_session, planned
 from uncertainty import compared
 
 import legcal
-from legcal import identifiability
+from legcal import Dataset, Machine, identifiability, load_dataset
 from legcal.calibration.identify.identifiability import (
     Analysis,
     check_identifiable,
@@ -35,15 +34,14 @@ from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import Session, planned_session, recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.data.corners import found_corners
-from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
 from legcal.errors import NotIdentifiable
 from legcal.geometry.motions import motion_of
-from legcal.machine.leg import Cylinder, Leg, LegKind
-from legcal.machine.model import Machine
+from legcal.machine.leg import Leg, LegKind
 from legcal.machine.parameters import parametrization_of, parametrize
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
+from legcal.paper.four_steps import run_steps
 from legcal.report.machine import identify_table
 from legcal.vision.board import Board, FixedBoard
 
@@ -126,7 +124,7 @@ def test_counts_equal_the_equations_written_out(data: st.DataObject, spatial: bo
 
 
 def test_two_directions_fail_for_a_leg_that_never_turns() -> None:
-    session = exact_session(n_poses=3)
+    session = machine_session("hexapod", n_poses=3)
     axes, m = session.axes, session.measurements
     view = m.view[axes.row]
     assert two_directions(view, axes.leg, axes.u, 6).ok
@@ -249,7 +247,7 @@ def test_remedies_were_tried_and_are_true() -> None:
 
 
 def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
-    machine = create_model(with_round_arms("delta"), tmp_path).machine
+    machine = create_model(delta_with_round_arms(), tmp_path).machine
     with_arms, without = (
         Analysis(planned_session(m, [range(6)] * 2, 15)) for m in (machine, model("delta"))
     )
@@ -301,14 +299,16 @@ def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
 # Joints at A that actuators move
 
 
-RANKS = {"hexaglide": 42, "6-rss": 54, "linear-delta": 36, "delta": 42, "3-prs": 21}
-TURNING = ("6-rss", "delta")
+@cache
+def session(name: str) -> Session:
+    """Return what three views of all legs of a shipped machine show."""
+    return planned_session(model(name), [range(model(name).n_legs)] * 3, 8)
 
 
 def test_steps_of_machines_whose_joints_at_A_move_are_left_out() -> None:
-    observed = planned(session("delta", images=6))
+    delta = machine_session("delta")
     with pytest.raises(NotIdentifiable, match="joints at the base that motors move, needed joints"):
-        observed.run()
+        run_steps(delta.nominal, delta.axes, delta.measurements)
 
 
 def test_counts_by_analogy_are_those_written_out() -> None:
@@ -324,44 +324,38 @@ def test_counts_by_analogy_are_those_written_out() -> None:
     assert (eq12.equations, eq12.unknowns) == (6 + 2 * 3 + 1, 3 + 9 + 3 * 2)
 
 
-@pytest.mark.parametrize("name", ["hexaglide", "delta"])
-def test_ranks_are_the_published_ones_and_radii_carry_the_scale_of_arms(name: str) -> None:
+@pytest.mark.parametrize(("name", "rank"), [("hexaglide", 42), ("delta", 42)])
+def test_ranks_are_the_published_ones_and_lengths_carry_the_scale_of_arms(
+    name: str, rank: int
+) -> None:
     analysis = Analysis(session(name))
-    assert (analysis.full.rank, analysis.full.of) == (RANKS[name], RANKS[name])
-    assert is_scale_open(analysis) == (name in TURNING)
-    if name in TURNING:
-        known = Choices(priors={"leg1.length": Prior(0.4, 5e-5)})
-        assert not is_scale_open(Analysis(session(name), known))
-        vague = Choices(priors={"leg1.length": Prior(0.4, 0.02)})  # radii would set the scale
-        assert is_scale_open(Analysis(session(name), vague))
-        rods = [
-            replace(leg, cylinders=(Cylinder("rod", 0.008, "base", 0.0, leg.q0),))
-            for leg in analysis.session.legs
-        ]
-        radius = Choices(priors={"leg1.radius.rod": Prior(0.008, 1e-5)})
-        assert not is_scale_open(Analysis(replace(session(name), legs=tuple(rods)), radius))
-
-
-def gained(name: str) -> Session:
-    found = session(name)
-    names = parametrize(found.leg_names, found.legs, found.frame_legs, twists=True)
-    return replace(found, parametrization=names)
+    assert (analysis.full.rank, analysis.full.of) == (rank, rank)
+    assert is_scale_open(analysis) == (name == "delta")
+    if name == "delta":
+        for sigma, is_open in ((5e-5, False), (0.02, True)):  # else radii would set the scale
+            known = Choices(priors={"leg1.length": Prior(0.4, sigma)})
+            assert is_scale_open(Analysis(session(name), known)) == is_open
+        (rod,) = model(name).legs[0].cylinders
+        radius = Choices(priors={f"leg1.radius.{rod.link}": Prior(rod.radius, 1e-5)})
+        assert not is_scale_open(Analysis(session(name), radius))
 
 
 def test_a_free_gain_of_every_carriage_loses_the_scale_too() -> None:
-    found = gained("hexaglide")
-    gains = frozenset(x for x in found.parametrization.names if x.endswith(".gain"))
+    found = session("hexaglide")
+    with_gains = parametrize(found.leg_names, found.legs, found.frame_legs, twists=True)
+    found = replace(found, parametrization=with_gains)
+    gains = frozenset(x for x in with_gains.names if x.endswith(".gain"))
     assert len(gains) == 6
     assert not is_scale_open(Analysis(found))
     assert is_scale_open(Analysis(found, Choices(free=gains)))
-    assert not is_scale_open(Analysis(found, Choices(free=gains - {"motor1.gain"})))
+    assert not is_scale_open(Analysis(found, Choices(free=gains - {"rail1.gain"})))
 
 
 def test_an_unknown_scale_is_refused_with_what_would_fix_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     name = "legcal.calibration.identify.identifiability.recorded_session"
-    monkeypatch.setattr(name, lambda dataset, twists: session("6-rss"))
+    monkeypatch.setattr(name, lambda dataset, twists: session("servo-hexapod"))
     known = SimpleNamespace(
         readings_carry_length=False,
         length_option="--length leg1.base:leg1.platform=MEASURED±SIGMAmm",
@@ -414,13 +408,12 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
 
 
 @pytest.mark.usefixtures("without_remedies")
-def test_the_document_is_that_of_the_report(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_document_is_that_of_the_report() -> None:
     found = report("hexapod", VIEWS[2], board=True)
     words = [word for view in found.views for word in ("--view", ",".join(view))]
-    assert run(monkeypatch, "identify", "hexapod", *words, "--board", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    outcome = run("identify", "hexapod", *words, "--board", "--json")
+    assert outcome.code == 0
+    document = outcome.document
     assert document == json.loads(json.dumps(found.document()))
     sizes = {"spatial": True, "n": 6, "n_d": 3, "r": 0, "n_ac": 6}
     assert {k: document[k] for k in sizes} == sizes

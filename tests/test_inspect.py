@@ -152,33 +152,29 @@ def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good
     assert not any("singular" in note for note in load_mechanism(made.yaml_path).diagnostics)
 
 
-def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_tells_travel_home_and_lengths_and_draws_the_machine(tmp_path: Path) -> None:
     svg = tmp_path / "machine.svg"
     created = created_hexapod(tmp_path)
     model, urdf = created.yaml_path, created.machine.urdf_path
     urdf.write_text(re.sub(r'radius="[^"]*"', 'radius="0.0123456"', urdf.read_text()))
-    assert run(monkeypatch, "inspect", model, "--picture", svg) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    outcome = run("inspect", model, "--picture", svg)
+    assert outcome.code == 0
     machine = load_mechanism(model)
     q = 1e3 * readings_at(machine, machine.home)[1]
-    assert f"leg2 0.00 to 170.00 250.00 to 420.00 {q:.2f} {q + 250.0:.2f}" in said
-    assert "platform at (0.00, 0.00, 300.00) mm in the base" in said
-    assert "12.35" in said
+    assert f"leg2 0.00 to 170.00 250.00 to 420.00 {q:.2f} {q + 250.0:.2f}" in outcome.said
+    assert "platform at (0.00, 0.00, 300.00) mm in the base" in outcome.said
+    assert "12.35" in outcome.said
     assert svg.read_bytes() == draw_machine(machine).markup().encode()
-    assert run(monkeypatch, "inspect", model, "--picture", svg) == 0
+    assert run("inspect", model, "--picture", svg).code == 0
     svg.write_text("mine")
     for place, word in ((svg, "another file"), (tmp_path / "machine.png", ".svg")):
-        capsys.readouterr()
-        assert run(monkeypatch, "inspect", model, "--picture", place) == 2
-        assert word in capsys.readouterr().err
+        outcome = run("inspect", model, "--picture", place)
+        assert outcome.code == 2
+        assert word in outcome.err
     assert svg.read_text() == "mine"
 
 
-def test_hostile_names_do_nothing_in_a_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_hostile_names_do_nothing_in_a_terminal(tmp_path: Path) -> None:
     """Escape sequences, changes of direction and markup in names of files and links."""
     odd = "\x1b]0;me\x07[red]\u202e"
     urdf = (ROOT / "urdf/3-rpr.urdf").read_text()
@@ -196,10 +192,8 @@ def test_hostile_names_do_nothing_in_a_terminal(
         ("new", "--template", "-o", folder, "--name", "mine"),
         ("new", "--family", "delta", "-o", folder),
     ):  # fmt: skip
-        code = run(monkeypatch, *words)
-        said = capsys.readouterr()
-        for text in (said.out, said.err):
-            assert not {"\x1b", "\x07", "\u202e"} & set(text), words
-        assert code == (2 if "none" in str(words[1]) else 0), said.err
+        outcome = run(*words)
+        assert not {"\x1b", "\x07", "\u202e"} & set(outcome.out + outcome.err), words
+        assert outcome.code == (2 if "none" in str(words[1]) else 0), outcome.err
     drawn = (folder / f"{odd}.svg").read_text()
     assert not {"\x1b", "\u202e"} & set(drawn)

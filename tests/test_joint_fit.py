@@ -14,16 +14,11 @@ from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
     BOARD_SCALE,
     PINHOLE,
-    TRUTH,
-    HexapodSession,
     MachineSession,
     corners_of,
     disturbed_start,
     irregular_hexapod,
-    joint_errors,
     machine_session,
-    noisy_outlines,
-    noisy_readings,
     place_of_board,
     shifted,
     with_board,
@@ -35,13 +30,7 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import (
-    FittedLegs,
-    RefinementSettings,
-    Start,
-    State,
-    start_from,
-)
+from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings, Start, State
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
@@ -49,20 +38,14 @@ from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array
-from legcal.machine.leg import ARMS, ParameterId, point_like_legs, radius_name
+from legcal.machine.leg import ARMS, ParameterId, radius_name
 from legcal.simulation.observe import moved_outlines
 
 
-def true_values(session: MachineSession) -> dict[str, float]:
-    """Return the true kinematic parameters, counted from the nominal legs, and radii."""
-    legs = session.legs
-    kinematic = legs.vector(session.truth.legs).tolist()
-    values = dict(zip(legs.parametrization.names, kinematic, strict=True))
-    return values | {radius_name(legs.names[j], part): r for (j, part), r in legs.radii.items()}
-
-
 def errors(session: MachineSession, found: Solution) -> dict[str, float]:
-    truth = true_values(session)
+    legs = session.legs
+    radii = {radius_name(legs.names[j], part): r for (j, part), r in legs.radii.items()}
+    truth = session.true_values | radii
     return {
         name: abs(found.estimates.values[name] - truth[name])
         for name in found.estimates.names
@@ -242,7 +225,7 @@ def test_the_covariance_is_the_inverse_of_the_fisher_matrix_by_differences(
 
 
 @pytest.fixture(scope="module")
-def small() -> HexapodSession:
+def small() -> MachineSession:
     return irregular_hexapod(6, legs_seen=5)
 
 
@@ -252,20 +235,17 @@ def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign()
     measurements = replace(session.measurements, q=sign * session.measurements.q)
     nominal = zip(session.legs.nominal, sign.tolist(), strict=True)
     legs = replace(session.legs, nominal=tuple(replace(leg, sign=s) for leg, s in nominal))
-    found = refine(legs, measurements, shown, disturbed_start(session))
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
-    assert (2, "rod") not in found.radii
+    found = refine(legs, measurements, shown, session.start)
+    assert np.abs(session.errors(found.legs)).max() < 1e-9
+    assert (2, "leg3_tube") not in found.radii
 
 
 def test_errors_agree_with_the_covariance() -> None:
     session, n = irregular_hexapod(6, legs_seen=5), 12
-    start = disturbed_start(session)
     normalised, z, scales, chi2 = [], [], [], []
     for seed in range(n):
-        rng = np.random.default_rng(seed)
-        measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-        found = refine(session.legs, measurements, outlines, start)
-        error = joint_errors(found.parameters)
+        found = refine(session.legs, *session.noisy(seed), session.start)
+        error = session.errors(found.legs)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         z.append(error / found.estimates.sigma[: len(error)])
         scales.append(found.quality.noise.scale)
@@ -279,33 +259,23 @@ def test_errors_agree_with_the_covariance() -> None:
 
 
 def test_the_result_is_reproduced_and_outlines_in_another_order_change_nothing(
-    small: HexapodSession,
+    small: MachineSession,
 ) -> None:
     rng = np.random.default_rng(5)
-    measurements, outlines = noisy_readings(small, rng), noisy_outlines(small, rng)
-    start = disturbed_start(small)
-    shuffled = outlines.at(np.arange(len(outlines)))
-    order = rng.permutation(len(outlines))
-    names = ("row", "leg", "edge", "h", "ends", "covariance", "used")
-    shuffled = replace(shuffled, **{name: getattr(outlines, name)[order] for name in names})
+    measurements, outlines = small.noisy(rng)
+    shuffled = outlines.choose(rng.permutation(len(outlines)))
     found, again, other = (
-        vector(refine(small.legs, measurements, o, start)) for o in (outlines, outlines, shuffled)
+        small.errors(refine(small.legs, measurements, o, small.start).legs)
+        for o in (outlines, outlines, shuffled)
     )
     np.testing.assert_array_equal(again, found)
     np.testing.assert_allclose(other, found, rtol=0, atol=1e-12)
 
 
-def vector(found: Solution) -> Array:
-    p = found.parameters
-    return np.concatenate([p.base_joints.ravel(), p.platform_joints.ravel(), p.offsets])
-
-
 def test_the_better_start_wins_and_between_equal_ones_the_first(
-    small: HexapodSession,
+    small: MachineSession,
 ) -> None:
-    rng = np.random.default_rng(5)
-    noisy = noisy_readings(small, rng), noisy_outlines(small, rng)
-    good = disturbed_start(small)
+    noisy, good = small.noisy(5), small.start
     bad = replace(disturbed_start(small, joints=0.1, camera=0.5, angle=2.0), label="staged")
     settings = RefinementSettings(max_iterations=40)
     for starts in ([good, bad], [bad, good]):
@@ -317,20 +287,19 @@ def test_the_better_start_wins_and_between_equal_ones_the_first(
     assert refine(small.legs, *noisy, [equal, good]).start == "staged"
 
 
-def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: HexapodSession) -> None:
+def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: MachineSession) -> None:
     o = small.outlines
     wrong = (o.leg == 0) & (small.measurements.view[o.row] == 1)
     away = np.random.default_rng(0).uniform(5.0, 20.0, small.measurements.n_rows)
     by = np.where(wrong, away[o.row], 0.0)[:, None] * np.ones(2)
-    found = refine(
-        small.legs, small.measurements, moved_outlines(o, PINHOLE, by), disturbed_start(small)
-    )
+    moved = moved_outlines(o, PINHOLE, by)
+    found = refine(small.legs, small.measurements, moved, small.start)
     assert any(f"of {wrong.sum()} of leg1 in view c2" in note for note in found.notes)
     assert not found.left_out  # other starts confirm it
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-4
+    assert np.abs(small.errors(found.legs)).max() < 1e-4
     one_image = by * (o.row == o.row[wrong].min())[:, None]
     once = moved_outlines(o, PINHOLE, one_image)
-    found = refine(small.legs, small.measurements, once, disturbed_start(small))
+    found = refine(small.legs, small.measurements, once, small.start)
     assert not found.outlines.used.all()
     assert not found.left_out
 
@@ -368,15 +337,8 @@ def test_a_fit_with_a_board_and_cameras_by_hand_is_exact_without_noise() -> None
 
 
 @pytest.fixture(scope="module")
-def session() -> HexapodSession:
+def session() -> MachineSession:
     return irregular_hexapod(6, legs_seen=5)
-
-
-def at_truth(session: HexapodSession) -> Start:
-    """Return a start at the truth, poses by the readings."""
-    legs, poses = point_like_legs(TRUTH), session.T_Rb_Re
-    m, cameras = session.measurements, session.T_camera_Rb
-    return start_from(legs, m, session.legs, cameras, poses, "nominal")
 
 
 Change = Callable[[Outlines], Outlines]
@@ -408,19 +370,19 @@ def measured_with_two_gammas(o: Outlines) -> Outlines:
         ),
         (scattered, DidNotConverge, r"outlines rejected and an error of \d+.\d px"),
         (with_covariance, DatasetError, r"leg\d in c1_000.png .* not positive definite"),
-        (lambda o: replace(o, part=("tube", *o.part[1:])), DatasetError, r"leg\d\.tube"),
+        (lambda o: replace(o, part=("pipe", *o.part[1:])), DatasetError, r"leg\d\.pipe"),
         (measured_with_two_gammas, DatasetError, r"view c1 could not be used.*1 and 2\.2"),
     ],
     ids=["none", "swapped edges", "scattered", "covariance", "part", "gammas"],
 )
 def test_outlines_that_cannot_be_fitted_are_refused(
-    session: HexapodSession, change: Change, error: type[LegcalError], found: str
+    session: MachineSession, change: Change, error: type[LegcalError], found: str
 ) -> None:
     m = session.measurements
     camera = replace(PINHOLE, gamma_is_given=False)
     m = replace(m, views=tuple(replace(view, camera=camera) for view in m.views))
     with pytest.raises(error, match=found):
-        refine(session.legs, m, change(session.outlines), disturbed_start(session))
+        refine(session.legs, m, change(session.outlines), session.start)
 
 
 @pytest.mark.parametrize(
@@ -435,17 +397,17 @@ def test_outlines_that_cannot_be_fitted_are_refused(
     ids=["two images", "one leg"],
 )
 def test_images_that_do_not_determine_the_parameters_are_refused(
-    few: HexapodSession, found: str
+    few: MachineSession, found: str
 ) -> None:
     shown = few.outlines
     if "prior" in found:
-        shown = noisy_outlines(few, np.random.default_rng(0))
+        shown = few.noisy(0)[1]
         shown = replace(shown, used=shown.leg == 0)
     with pytest.raises(NotIdentifiable, match=found):
-        refine(few.legs, few.measurements, shown, at_truth(few))
+        refine(few.legs, few.measurements, shown, few.truth)
 
 
-def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
+def test_a_start_far_away_is_refused(session: MachineSession) -> None:
     far = disturbed_start(session, joints=0.1, camera=0.5, angle=2.0)
     with pytest.raises(DidNotConverge, match=r"still falls by|outlines rejected"):
         refine(session.legs, session.measurements, session.outlines, far)
@@ -457,9 +419,9 @@ def test_a_start_far_away_is_refused(session: HexapodSession) -> None:
 
 
 def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
-    session: HexapodSession, monkeypatch: pytest.MonkeyPatch
+    session: MachineSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    starts = [replace(at_truth(session), label=label) for label in ("second", "first", "third")]
+    starts = [replace(session.truth, label=label) for label in ("second", "first", "third")]
     costs = {"first": 1.0, "second": 2.0, "third": 3.0}
     unwatched = fit._first_minimum
 

@@ -9,29 +9,25 @@ import numpy as np
 import pytest
 import yaml
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
-from machines import (
-    MACHINES,
-    displaced,
-    of_types,
-    ring,
-    write_home,
-)
+from machines import MACHINES, displaced, of_types, ring, write_home
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal import (
+    Follower,
+    Machine,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+    random_configurations,
+    singularity,
+)
 from legcal.errors import DidNotConverge, ModelError, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.closing import singularity
-from legcal.machine.configurations import Configurations, random_configurations
+from legcal.machine.configurations import Configurations
 from legcal.machine.equations import pose_equations
-from legcal.machine.kinematics import (
-    Follower,
-    forward_kinematics,
-    forward_kinematics_many,
-    inverse_kinematics,
-)
+from legcal.machine.kinematics import forward_kinematics_many
 from legcal.machine.leg import LegKind
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, platform_pose, readings_at, slider_columns, vectors_A_to_B
+from legcal.machine.model import platform_pose, readings_at, slider_columns, vectors_A_to_B
 
 machine_of = cache(load_mechanism)
 DRAWN = 5

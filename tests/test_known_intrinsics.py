@@ -13,13 +13,12 @@ from fit_sessions import LENS, MachineSession, machine_session, with_camera
 from simulated import simulated
 from thinned import thinned
 
-from legcal import calibrate, check
+from legcal import calibrate, check, load_dataset
 from legcal.calibration.documents import Result
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.sensitivity import INTRINSICS
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.data.dataset import load_dataset
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 

@@ -7,24 +7,21 @@ import numpy as np
 import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from dataset_folder import dataset_of_readings
+from machines import ROOT
 from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 
-from legcal import calibrate
+from legcal import Calibration, calibrate, load_dataset, load_mechanism
 from legcal.calibration.doubts import click_notes
-from legcal.calibration.result import Calibration, Verdict
+from legcal.calibration.result import Verdict
 from legcal.calibration.verdict import judge
-from legcal.data.dataset import load_dataset
 from legcal.data.landmarks import Landmarks, joint_name
 from legcal.geometry.motions import components, pose_distance
-from legcal.machine.loader import load_mechanism
 from legcal.machine.model import readings_at
 from legcal.machine.rods import ends_at_poses
 
 pytestmark = pytest.mark.usefixtures("without_steps")
-
-ROOT = Path(__file__).parents[1]
 
 
 def without_motors(text: str) -> str:

@@ -4,40 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hexapod_sessions import PaperSession, disturbed_hexapod, paper_session
+from fit_sessions import PINHOLE, irregular_hexapod, machine_session
 from scipy.spatial.transform import Rotation
 
-from legcal.data.outlines import (
-    LegAxes,
-    Outlines,
-    axes_from_outlines,
-    axes_of_table,
-)
+from legcal.data.outlines import LegAxes, axes_of_table
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
-from legcal.simulation.observe import (
-    OutlineNoise,
-    TableNoise,
-    shifted_outlines,
-    table_of,
-    table_of_lines,
-)
+from legcal.simulation.observe import TableNoise, table_of, table_of_lines
 from legcal.vision.camera import Camera, sample_camera
-from legcal.vision.cylinder import (
-    direction_of_angles,
-)
+from legcal.vision.cylinder import direction_of_angles
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
-
-
-def _session(camera: Camera, n_poses: int = 2) -> PaperSession:
-    machine = disturbed_hexapod(3)
-    return paper_session(machine, OutlineNoise(), seed=3, camera=camera, n_poses=n_poses)
-
-
-def _axes(session: PaperSession, outlines: Outlines) -> LegAxes:
-    return axes_from_outlines(outlines, session.measurements, session.radii)
 
 
 def _coordinates(axes: LegAxes, reference: LegAxes) -> Array:
@@ -49,37 +27,29 @@ def _coordinates(axes: LegAxes, reference: LegAxes) -> Array:
     return np.concatenate([alpha, beta], axis=1)
 
 
-@pytest.mark.parametrize("camera", [sample_camera(), LENS])
+@pytest.mark.parametrize("camera", [PINHOLE, LENS])
 def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> None:
-    session = _session(camera)
-    axes = _axes(session, session.outlines)
-    for i in range(len(axes)):
-        row = int(axes.row[i])
-        T_camera_Rb = session.T_camera_Rb[session.measurements.view[row]]
-        pose = session.T_Rb_Re[session.measurements.pose[row]]
-        A = T_camera_Rb.apply(session.machine.parameters.base_joints[axes.leg[i]])
-        B_Rb = pose.apply(session.machine.parameters.platform_joints[axes.leg[i]])
-        B = T_camera_Rb.apply(B_Rb)
-        assert distance_to_line(A, axes.u[i], axes.M[i]) < 1e-9
-        assert distance_to_line(B, axes.u[i], axes.M[i]) < 1e-9
-        assert axes.u[i] @ (B - A) > 0.0
+    session = machine_session("hexapod", n_poses=2, camera=camera)
+    axes, m, truth = session.axes, session.measurements, session.truth
+    for row, j, u, M in zip(axes.row.tolist(), axes.leg.tolist(), axes.u, axes.M, strict=True):
+        T_camera_Rb = truth.T_camera_Rb[m.view[row]]
+        A = T_camera_Rb.apply(truth.legs[j].A)
+        B = T_camera_Rb.apply(truth.T_Rb_Re[m.pose[row]].apply(truth.legs[j].B))
+        assert distance_to_line(A, u, M) < 1e-9
+        assert distance_to_line(B, u, M) < 1e-9
+        assert u @ (B - A) > 0.0
         # M is in the middle of the piece that is seen.
-        assert abs(axes.u[i] @ (axes.M[i] - 0.5 * (A + B))) < 0.1 * np.linalg.norm(B - A)
+        assert abs(u @ (M - 0.5 * (A + B))) < 0.1 * np.linalg.norm(B - A)
 
 
 def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
-    session = _session(LENS)
-    outlines = session.outlines
-    exact = _axes(session, outlines)
-    rng = np.random.default_rng(0)
+    session = machine_session("hexapod", n_poses=2, camera=LENS)
+    exact = session.axes
     root = np.linalg.cholesky(exact.covariance)
     normalised = []
-    for _ in range(150):
-        offsets = rng.multivariate_normal(
-            np.zeros(2), OutlineNoise().covariance(0.0), len(outlines)
-        )
-        h, ends = shifted_outlines(LENS, outlines.h, outlines.ends, offsets)
-        axes = _axes(session, replace(outlines, h=h, ends=ends))
+    for seed in range(150):
+        _, outlines = session.noisy(seed)
+        axes = replace(session, outlines=outlines).axes
         normalised.append(np.linalg.solve(root, _coordinates(axes, exact)[..., None])[..., 0])
     samples = np.concatenate(normalised)
     assert np.allclose(samples.mean(axis=0), 0.0, atol=0.08)
@@ -87,15 +57,16 @@ def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
 
 
 def test_legs_with_one_used_outline_are_passed_over_and_none_with_two_is_refused() -> None:
-    session = _session(sample_camera())
+    session = irregular_hexapod(2)  # whose legs have one part each
     outlines = session.outlines
     used = outlines.used.copy()
     used[0] = False
-    axes = _axes(session, replace(outlines, used=used))
+    axes = replace(session, outlines=replace(outlines, used=used)).axes
     assert len(axes) == len(session.axes) - 1
     assert (int(axes.row[0]), int(axes.leg[0])) == (0, int(outlines.leg[2]))
+    one_edge = replace(session, outlines=replace(outlines, used=outlines.edge == 1))
     with pytest.raises(NotVisible, match="no leg has both outlines in any image"):
-        _axes(session, replace(outlines, used=outlines.edge == 1))
+        _ = one_edge.axes
 
 
 # Axes with the noise of Table 1
@@ -108,15 +79,6 @@ def _indices(n: int) -> tuple[IntArray, IntArray]:
 def _observed(u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | None) -> LegAxes:
     """Return axes with the noise of Table 1 as the method takes them from the table."""
     return axes_of_table(*table_of(*_indices(len(u)), u, A, noise, rng))
-
-
-def _random_lines(n: int, seed: int = 0) -> tuple[Array, Array]:
-    """Return n directions well away from the plane y = 0, and points before the camera."""
-    rng = np.random.default_rng(seed)
-    u = rng.normal(size=(n, 3))
-    u[:, 1] = np.copysign(0.3 + np.abs(u[:, 1]), u[:, 1])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], (n, 3))
 
 
 def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z() -> None:
@@ -146,7 +108,9 @@ def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
 
 
 def test_the_table_of_a_line_leads_back_to_it() -> None:
-    u, A = _random_lines(200, seed=3)
+    rng = np.random.default_rng(3)
+    u, A = rng.normal(size=(200, 3)), rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], (200, 3))
+    u[:, 1] = np.copysign(0.3 + np.abs(u[:, 1]), u[:, 1])  # away from the plane y = 0
     u[:4] = [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1e-9, -1.0, 0.0], [1e-5, 1e-4, 1.0]]
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     found = table_of_lines(u, A)

@@ -8,13 +8,12 @@ import pytest
 from hexapod_example import Run
 
 import legcal
+from legcal import Machine, load_mechanism
 from legcal.calibration.documents import Kinematic, ParameterRow
 from legcal.calibration.result import joints_in_links
 from legcal.calibration.verification import possible_changes
 from legcal.geometry.types import Array
 from legcal.machine.leg import LINKS
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import (
     geometries,

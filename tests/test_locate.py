@@ -1,6 +1,5 @@
 """``legcal locate``: what poses of real machines determine, outliers, the table, files, the fit."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -31,12 +30,7 @@ from located import (
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal import (
-    Location,
-    ToolPoses,
-    load_mechanism,
-    locate,
-)
+from legcal import Location, ToolPoses, load_mechanism, locate
 from legcal.calibration.location.document import write_located_model
 from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (
@@ -63,18 +57,18 @@ from legcal.machine.model import platform_pose
 KNOWN: dict[str, Any] = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
 
 
-def near_home(name: str, n: int, size: float, turn: tuple[float, float, float]) -> Located:
-    """Return a machine measured at poses displaced and turned a little from home."""
-    chance, home = np.random.default_rng(2), shipped(name).home
-    moves = chance.uniform(-size, size, (n, 3))
-    turns = chance.uniform(-0.2, 0.2, (n, 3)) * np.array(turn)
+def _turned_about_z() -> Located:
+    """Return a hexapod measured at poses displaced from home and turned about one axis."""
+    chance, home = np.random.default_rng(2), shipped("hexapod").home
+    moves = chance.uniform(-0.02, 0.02, (10, 3))
+    turns = chance.uniform(-0.2, 0.2, (10, 3)) * [0.0, 0.0, 1.0]
     poses = [
         RigidTransform.from_components(
             home.translation + x, Rotation.from_rotvec(w) * home.rotation
         )
         for x, w in zip(moves, turns, strict=True)
     ]
-    return located(name, platform=poses)
+    return located("hexapod", platform=poses)
 
 
 @cache
@@ -232,10 +226,8 @@ def _unreachable() -> Located:
 @pytest.mark.parametrize(
     ("spoiled", "options", "kind", "named"),
     [
-        (lambda: near_home("hexapod", 10, 0.02, (0, 0, 1)), {}, NotIdentifiable,
+        (_turned_about_z, {}, NotIdentifiable,
          ("tool in the platform along (0, 0, 1)", "another axis")),
-        (lambda: near_home("hexapod", 10, 0.0, (0, 0, 1)), {}, NotIdentifiable,
-         ("these 10 poses",)),
         (_along_a_line, {}, NotIdentifiable, ("displaced in another direction",)),
         (lambda: _rows([0]), {}, NotIdentifiable, ("1 pose", "3 poses")),
         (lambda: _rows([0, 1, 2], oriented=False), {}, NotIdentifiable, ("4 poses", "positions")),
@@ -300,23 +292,24 @@ def in_part() -> Location:
     return locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
 
 
-def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(tmp_path: Path) -> None:
     hexapod = made("hexapod", 5)
     position = hexapod.poses.position.copy()
     position[4] += 0.05
     write_poses(tmp_path / "poses.csv", hexapod, replace(hexapod.poses, position=position))
-    words: list[str | Path] = ["hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml"]
-    assert run(monkeypatch, "locate", *words, "--urdf", tmp_path / "out", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    words = ("locate", "hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml")
+    outcome = run(*words, "--urdf", tmp_path / "out", "--json")
+    assert outcome.code == 0
+    document = outcome.document
     names = [Path(p).relative_to(tmp_path).as_posix() for p in document.pop("written")]
     assert names == ["out/models/hexapod.yaml", "out/urdf/hexapod.urdf", "a.yaml"]
     assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == document
-    assert run(monkeypatch, "locate", *words, "--tool-position", "0,0,5mm") == 0
-    assert "Row 5 was left out: 8" in " ".join(capsys.readouterr().out.split())
-    assert run(monkeypatch, "locate", *words, "--position-sigma", "0.001mm") == 1
-    assert "Doubtful" in capsys.readouterr().out
+    outcome = run(*words, "--tool-position", "0,0,5mm")
+    assert outcome.code == 0
+    assert "Row 5 was left out: 8" in outcome.said
+    outcome = run(*words, "--position-sigma", "0.001mm")
+    assert outcome.code == 1
+    assert "Doubtful" in outcome.out
     assert yaml.safe_load((tmp_path / "a.yaml").read_text())["status"] == "doubtful"
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
+from command_line import Outcome, run
 
 from legcal import load_mechanism
 from legcal.calibration.location.tool_poses import read_tool_poses
@@ -56,9 +56,9 @@ B_AND_P = points(POINTS, "B{}", "P{}")
 SIX = "{0} X [mm];{0} Y [mm];{0} Z [mm];{1} X [mm];{1} Y [mm];{1} Z [mm]"
 
 
-def one_row(base: str, platform: str) -> str:
-    points = {f"{base}{j + 1}": A for j, A in enumerate(BASE)}
-    points |= {f"{platform}{j + 1}": B for j, B in enumerate(PLATFORM)}
+def one_row() -> str:
+    points = {f"B{j + 1}": A for j, A in enumerate(BASE)}
+    points |= {f"P{j + 1}": B for j, B in enumerate(PLATFORM)}
     header = ",".join(f"{name}{axis}" for name in points for axis in "xyz")
     return header + "\n" + ",".join(f"{x:g},{y:g},0" for x, y in points.values()) + "\n"
 
@@ -134,7 +134,7 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
         wide("Jambe,X base,Y base,Z base,X plate-forme,Y plate-forme,Z plate-forme", leg="J{}"),
         ()),
     "letters": (wide("bx,by,bz,px,py,pz"), ()),
-    "one row": (one_row("B", "P"), ()),
+    "one row": (one_row(), ()),
     "platform first": ("\n".join([POINTS, *B_AND_P.splitlines()[:0:-1]]), ()),
     "points by side": (points(POINTS, "Base joint {}", "Platform joint {}"), ()),
 }  # fmt: skip
@@ -281,51 +281,48 @@ ENDS = ("--min-length", "380", "--max-length", "500")
 OPTIONS = ("--type", "UPS", *ENDS, "--leg-radius", "10", "--height", "400")
 
 
-def new(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, text: str, *words: str, name: str = "own.csv"
-) -> int:
-    (folder / name).write_text(text)
-    return run(monkeypatch, "new", folder / name, "-o", folder / "made", *words)
+def new(folder: Path, text: str, *words: str) -> Outcome:
+    (folder / "own.csv").write_text(text)
+    return run("new", folder / "own.csv", "-o", folder / "made", *words)
 
 
 def made(folder: Path) -> Machine:
     return load_mechanism(folder / "made/models/own.yaml")
 
 
-def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_platform_joints_in_the_base_are_asked_about_and_taken_as_said(tmp_path: Path) -> None:
     text = wide("bx,by,bz,px,py,pz", at=395.5)
     words = ("--unit", "mm", "--type", "UPS", *ENDS)
     for more in ((), ("--height", "400")):
-        assert new(monkeypatch, tmp_path, text, *words, *more) == 2
-        said = capsys.readouterr().err
-        assert said.count("legcal: ") == said.count("\n") == 1
-        assert "look like coordinates of the base" in said
-        assert "platform_in: base" in said
+        outcome = new(tmp_path, text, *words, *more)
+        assert outcome.code == 2
+        assert outcome.err.count("legcal: ") == outcome.err.count("\n") == 1
+        assert "look like coordinates of the base" in outcome.err
+        assert "platform_in: base" in outcome.err
 
     def stating(side: str) -> str:
         head, *rows = text.splitlines()
         return "\n".join([f"{head},platform_in", *(f"{row},{side}" for row in rows)])
 
-    assert new(monkeypatch, tmp_path, stating("base"), *words) == 0
+    outcome = new(tmp_path, stating("base"), *words)
+    assert outcome.code == 0
     machine = made(tmp_path)
     np.testing.assert_allclose(machine.home.translation, [0, 0, 0.3955], atol=1e-12)
     np.testing.assert_allclose(machine.B_platform[0], [0.1061, 0.1061, 0], atol=1e-12)
-    assert "coordinates of the base at home" in " ".join(capsys.readouterr().out.split())
-    assert new(monkeypatch, tmp_path, stating("platform"), *words, "--force") == 0
+    assert "coordinates of the base at home" in outcome.said
+    assert new(tmp_path, stating("platform"), *words, "--force").code == 0
     np.testing.assert_allclose(made(tmp_path).B_platform[0], [0.1061, 0.1061, 0.3955], atol=1e-12)
 
 
 def test_a_platform_that_is_turned_in_its_link_is_level_and_turned_back_at_its_height(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     lines = wide("bx,by,bz,px,py,pz").splitlines()
     turned = [lines[0]]
     for line in lines[1:]:
         *base, x, y, z = line.split(",")
         turned.append(",".join([*base, y, str(-float(x)), z]))  # by -90 deg
-    assert new(monkeypatch, tmp_path, "\n".join(turned), "--unit", "mm", *OPTIONS) == 0
+    assert new(tmp_path, "\n".join(turned), "--unit", "mm", *OPTIONS).code == 0
     machine = made(tmp_path)
     assert machine.home.rotation.as_euler("xyz", degrees=True)[2] == pytest.approx(90.0)
     q = readings_at(machine, machine.home)
@@ -347,7 +344,7 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
     (points(POINTS, "{}", "{}"), OPTIONS, ("'1'", "B1 and P1")),
     (wide("bx,by,bz,px,py,pz").partition("\n")[2], OPTIONS, ("numbers in the first line",)),
     (wide("u,v,w,r,s,t"), OPTIONS, ("columns 'u', 'v', 'w', 'r', 's', 't'", "columns 'base_x'")),
-    (one_row("B", "P") * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
+    (one_row() * 2, ("--unit", "mm", *OPTIONS), ("3 rows", "one complete row")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", "--max-length", "500", "--type", "UPS"),
      ("max_length alone",)),
 ]  # fmt: skip
@@ -355,15 +352,11 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
 
 @pytest.mark.parametrize(("text", "words", "named"), REFUSED)
 def test_what_tables_lack_is_said_once(
-    text: str,
-    words: Sequence[str],
-    named: Sequence[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    text: str, words: Sequence[str], named: Sequence[str], tmp_path: Path
 ) -> None:
-    assert new(monkeypatch, tmp_path, text, *words) == 2
-    said = capsys.readouterr().err
+    outcome = new(tmp_path, text, *words)
+    assert outcome.code == 2
+    said = outcome.err
     assert all(word in said for word in named), said
     assert "leg2'" not in said or "'leg1'" in said.split("leg2'")[0]
     assert not (tmp_path / "made").exists()

@@ -14,13 +14,11 @@ from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
 from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
 
+from legcal import Machine, forward_kinematics, inverse_kinematics, load_mechanism
 from legcal.errors import OutOfClass, UsageError
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 
 LAYOUTS = {
     "hung from the base": Layout(),

@@ -11,14 +11,11 @@ from hypothesis import strategies as st
 from machines import ROOT, SHIPPED, check_same, made, read_table, write_table
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal import Machine, inverse_kinematics, load_mechanism, singularity
 from legcal.descriptions.new_model import Dimensions, create_model, description_of, write_template
 from legcal.errors import OutOfClass, UsageError
-from legcal.machine.closing import singularity
 from legcal.machine.files import shipped_names
-from legcal.machine.kinematics import inverse_kinematics
 from legcal.machine.leg import LegKind
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"

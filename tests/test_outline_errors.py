@@ -9,15 +9,11 @@ import pytest
 from dense_fit import jacobian, residuals
 from fit_sessions import (
     PINHOLE,
-    HexapodSession,
     MachineSession,
     corners_of,
     disturbed_start,
     irregular_hexapod,
-    joint_errors,
     machine_session,
-    noisy_outlines,
-    noisy_readings,
     shifted,
     with_board,
 )
@@ -38,9 +34,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     possible_biases,
 )
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import (
-    with_edge_biases,
-)
+from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.calibration.tuning import LIMB_GAMMA_SIGMA
@@ -60,19 +54,13 @@ LOG_GAMMA = 0.6
 
 
 @pytest.fixture(scope="module")
-def session() -> HexapodSession:
+def session() -> MachineSession:
     return irregular_hexapod(8, legs_seen=5, sigma_px=0.05)
 
 
 @cache
 def _session(name: str) -> MachineSession:
     return machine_session(name, n_poses=12)
-
-
-def _errors(session: MachineSession, found: Solution) -> Array:
-    """Return the errors of the kinematic parameters [m, rad]."""
-    legs = session.legs
-    return legs.vector(found.legs) - legs.vector(session.truth.legs)
 
 
 @cache
@@ -111,7 +99,8 @@ def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     assert (~found.outlines.used[~wrong]).sum() <= 2
     assert all("px" in str(found.outlines.reason[i].detail) for i in np.flatnonzero(wrong))
     of_clean, of_dirty = (
-        np.sqrt(np.mean((_errors(session, one)[free] / sigma[free]) ** 2)) for one in (clean, found)
+        np.sqrt(np.mean((session.errors(one.legs)[free] / sigma[free]) ** 2))
+        for one in (clean, found)
     )
     assert of_clean < 1.5
     assert of_dirty < 1.5 * of_clean
@@ -137,9 +126,9 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     o, names = session.outlines, session.legs.names
     one, two = np.unique(o.leg[o.row == 2])[:2].tolist()
     other = int(o.leg[o.row == 5][0])
-    swaps = {  # outlines that show another line, and what their reasons end with
-        find(o, 2, one, 1): (find(o, 2, two, 2), f" px, lies on edge 2 of {names[two]}.rod"),
-        find(o, 5, other, 1): (find(o, 5, other, 2), f" px, lies on edge 2 of {names[other]}.rod"),
+    swaps = {  # outlines that show another line, and the leg that their reasons name
+        find(o, 2, one, 1): (find(o, 2, two, 2), names[two]),
+        find(o, 5, other, 1): (find(o, 5, other, 2), names[other]),
     }
     shift = np.zeros((len(o), 2))
     shift[99] = 5.4
@@ -148,13 +137,14 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     for wrong, (right, _) in swaps.items():
         h[wrong], ends[wrong] = o.h[right], o.ends[right]
     outlines = replace(outlines, h=h, ends=ends)
-    found = refine(session.legs, session.measurements, outlines, disturbed_start(session))
+    found = refine(session.legs, session.measurements, outlines, session.start)
     assert set(np.flatnonzero(~found.outlines.used)) == {*swaps, 99}
     assert str(found.outlines.reason[99]) == "disagrees with the fit by 5.4 px"
-    for wrong, (_, reason) in swaps.items():
+    for wrong, (_, leg) in swaps.items():
         assert found.outlines.reason[wrong].reason is Reason.DISAGREES
-        assert str(found.outlines.reason[wrong].detail).endswith(reason)
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+        said = str(found.outlines.reason[wrong].detail)
+        assert said.endswith(f" px, lies on edge 2 of {leg}.{leg}_tube")
+    assert np.abs(session.errors(found.legs)).max() < 1e-9
 
 
 def test_errors_of_corners_are_found_in_their_residuals() -> None:
@@ -174,23 +164,23 @@ def test_errors_of_corners_are_found_in_their_residuals() -> None:
     np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
 
 
-def biases_of(session: HexapodSession) -> EdgeBiases:
+def biases_of(session: MachineSession) -> EdgeBiases:
     """Return all biases that the outlines of a session may share."""
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
     return possible_biases(observed, session.legs.names)
 
 
 def shared_errors(
-    session: HexapodSession, rng: np.random.Generator, level: float, slope: float, many: float = 0.0
+    session: MachineSession, rng: np.random.Generator, level: float, slope: float
 ) -> Outlines:
     """Return outlines whose edges err alike in all images of a view, and change with place."""
     possible = biases_of(session)
-    sigma = np.array([many, 0.0, level, level, slope, slope])
+    sigma = np.array([0.0, 0.0, level, level, slope, slope])
     values = sigma[possible.kind] * rng.standard_normal(len(possible))
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
     shift = np.zeros((len(observed), 2))
     shift[observed.index] = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
-    return moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
+    return moved_outlines(session.noisy(rng)[1], PINHOLE, shift)
 
 
 def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[Array, Array]:
@@ -199,10 +189,8 @@ def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[
     return scores_of_block(possible_problem, there, "biases")
 
 
-def test_scores_are_those_of_the_residuals_of_a_fit(session: HexapodSession) -> None:
-    rng = np.random.default_rng(4)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-    problem = build_fit(session.legs, measurements, outlines)
+def test_scores_are_those_of_the_residuals_of_a_fit(session: MachineSession) -> None:
+    problem = build_fit(session.legs, *session.noisy(4))
     state = problem.begin(disturbed_start(session, joints=1e-5, camera=1e-5, angle=1e-5))
     whitening = np.asarray(problem.factor("outlines").whitening)
     possible = biases_of(session)
@@ -228,15 +216,13 @@ def test_scores_are_those_of_the_residuals_of_a_fit(session: HexapodSession) -> 
         np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
-    start = disturbed_start(session)
+def test_shared_errors_are_found_and_weighed(session: MachineSession) -> None:
     normalised, sizes = [], []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        measurements = noisy_readings(session, rng)
         outlines = shared_errors(session, rng, 0.06, 0.03)
-        found = refine(session.legs, measurements, outlines, start)
-        error = joint_errors(found.parameters)
+        found = refine(session.legs, session.noisy(rng)[0], outlines, session.start)
+        error = session.errors(found.legs)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         sizes.append(found.quality.noise.scale)
         kinds = {name.rsplit(".", 1)[1] for name in found.posterior.biases}
@@ -248,7 +234,7 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
 @pytest.mark.system
 def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
     session, n, sigma = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4), 4, 0.08
-    start, normalised, found_px = disturbed_start(session), [], []
+    normalised, found_px = [], []
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
     edge = 2 * observed.radius + (observed.epsilon < 0.0)
     place = (observed.pose // n) * (int(edge.max()) + 1) + edge
@@ -256,9 +242,9 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
         rng = np.random.default_rng(seed)
         shift = np.zeros((len(observed), 2))
         shift[observed.index] = sigma * rng.standard_normal(int(place.max()) + 1)[place, None]
-        outlines = moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
-        found = refine(session.legs, noisy_readings(session, rng), outlines, start)
-        error = joint_errors(found.parameters)
+        outlines = moved_outlines(session.noisy(rng)[1], PINHOLE, shift)
+        found = refine(session.legs, session.noisy(rng)[0], outlines, session.start)
+        error = session.errors(found.legs)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         found_px.append(found.quality.shared_px[PLACES[0]])
     assert 0.7 < np.mean(normalised) < 1.2
@@ -268,51 +254,47 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
 @pytest.mark.system
 def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None:
     session = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4)
-    rng = np.random.default_rng(0)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    measurements, outlines = session.noisy(0)
     matte, polished = (
         refine(
             session.legs,
             measurements,
             replace(outlines, polish=np.full(len(outlines), polish)),
-            disturbed_start(session),
+            session.start,
         )
         for polish in (-3.0, 3.0)
     )
-    np.testing.assert_allclose(joint_errors(polished.parameters), joint_errors(matte.parameters))
+    np.testing.assert_allclose(session.errors(polished.legs), session.errors(matte.legs))
     assert polished.quality.shared_px[PLACES[0]] == pytest.approx(0.2, rel=0.05)
     sigma, less = (np.sqrt(np.diag(one.kinematic.covariance)) for one in (polished, matte))
     assert np.median(sigma / less) > 2.0
 
 
-def test_independent_errors_are_hardly_taken_for_shared_ones(session: HexapodSession) -> None:
-    start, shared = disturbed_start(session), []
+def test_independent_errors_are_hardly_taken_for_shared_ones(session: MachineSession) -> None:
+    shared = list[float]()
     for seed in range(3):
-        rng = np.random.default_rng(100 + seed)
-        measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-        found = refine(session.legs, measurements, outlines, start)
+        found = refine(session.legs, *session.noisy(100 + seed), session.start)
         shared.append(max(map(abs, found.posterior.biases.values()), default=0.0))
         assert found.quality.noise.bias_px == found.quality.noise.tilt_px == 0.0
     assert shared.count(0.0) >= 2  # one set in twenty seems to have some
     assert max(shared) < 0.02  # [px], where points of edges scatter by 0.05 px
 
 
-def _fit_in_rounds(session: HexapodSession, level: float, n_rounds: int) -> Solution:
+def _fit_in_rounds(session: MachineSession, n_rounds: int) -> Solution:
     """Return a fit to outlines whose errors are shared by parts in views, in some rounds."""
     rng = np.random.default_rng(3)
-    outlines = shared_errors(session, rng, level, 0.5 * level)
-    measurements, start = noisy_readings(session, rng), disturbed_start(session)
+    outlines = shared_errors(session, rng, 0.2, 0.1)
     settings = RefinementSettings(noise_rounds=n_rounds)
-    return refine(session.legs, measurements, outlines, start, settings)
+    return refine(session.legs, session.noisy(rng)[0], outlines, session.start, settings)
 
 
-def test_a_fit_that_still_changes_a_lot_is_refused(session: HexapodSession) -> None:
+def test_a_fit_that_still_changes_a_lot_is_refused(session: MachineSession) -> None:
     with pytest.raises(DidNotConverge, match=r"did not converge on the inliers and the noise"):
-        _fit_in_rounds(session, 0.2, 1)
+        _fit_in_rounds(session, 1)
 
 
-def test_a_fit_that_still_changes_a_little_says_so(session: HexapodSession) -> None:
-    (note,) = _fit_in_rounds(session, 0.2, 4).notes or ("",)
+def test_a_fit_that_still_changes_a_little_says_so(session: MachineSession) -> None:
+    (note,) = _fit_in_rounds(session, 4).notes or ("",)
     assert "has not converged" in note
     assert " px to 0." in note
 
@@ -324,10 +306,10 @@ def without_gamma(measurements: Measurements) -> Measurements:
     return replace(measurements, views=views)
 
 
-def encoded(session: HexapodSession, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Outlines:
+def encoded(session: MachineSession, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Outlines:
     """Return noisy outlines that were measured with a gamma of one, of a camera with another."""
     rng = np.random.default_rng(seed)
-    outlines = noisy_outlines(session, rng)
+    outlines = session.noisy(rng)[1]
     by_gamma = rng.normal(0.0, 0.2, len(outlines))
     inward = -by_gamma * log_gamma * EPSILON[outlines.edge - 1]
     # Normals of moved_outlines point to one side of the leg: to the inside of one of both edges.
@@ -338,11 +320,10 @@ def encoded(session: HexapodSession, log_gamma: float = LOG_GAMMA, seed: int = 3
     return replace(moved, gamma=np.ones(len(moved)), by_gamma=by_gamma)
 
 
-def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> None:
+def test_gamma_of_a_camera_is_found_by_its_outlines(session: MachineSession) -> None:
     measurements = without_gamma(session.measurements)
     outlines = encoded(session)
-    start = disturbed_start(session)
-    found = refine(session.legs, measurements, outlines, start)
+    found = refine(session.legs, measurements, outlines, session.start)
     (gamma,) = found.gammas
     assert gamma.views == ("c1", "c2", "c3")
     assert gamma.measured_with == 1.0
@@ -351,8 +332,8 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
     assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_GAMMA_SIGMA**2))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not given" in n for n in found.notes)
-    as_linear = refine(session.legs, session.measurements, outlines, start)
-    right, wrong = (np.sqrt(np.mean(joint_errors(s.parameters) ** 2)) for s in (found, as_linear))
+    as_linear = refine(session.legs, session.measurements, outlines, session.start)
+    right, wrong = (np.sqrt(np.mean(session.errors(s.legs) ** 2)) for s in (found, as_linear))
     assert right < wrong
     assert found.quality.rms_px is not None
     assert as_linear.quality.rms_px is not None

@@ -5,15 +5,8 @@ import pytest
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array
-from legcal.perception.blocks import (
-    BlockLine,
-    Blocks,
-)
-from legcal.perception.limb import (
-    MATTE_DIRECTIONS,
-    powers,
-    profile_functions,
-)
+from legcal.perception.blocks import BlockLine, Blocks
+from legcal.perception.limb import MATTE_DIRECTIONS, powers, profile_functions
 from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import (
     Edge,

@@ -14,11 +14,7 @@ from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
 from legcal.machine.shapes import Carrier, Occluder
-from legcal.perception.outline import (
-    LONE_SCORE,
-    _alone,
-    measure_outlines,
-)
+from legcal.perception.outline import LONE_SCORE, _alone, measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis

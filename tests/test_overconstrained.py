@@ -17,7 +17,7 @@ from layouts import Layout, LegLayout, MachineSpec, write_machine
 from machines import exechon, two_upr_two_sps
 from thinned import thinned
 
-from legcal import identifiability
+from legcal import Machine, ParameterErrors, Spread, identifiability, load_mechanism
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import start_from
 from legcal.errors import OutOfClass
@@ -27,11 +27,8 @@ from legcal.geometry.types import Array
 from legcal.machine.closing import solve_poses
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, moved_legs, parametrization_of
 from legcal.machine.ties import machine_ties, on_ties
-from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.truth import write_true_model
 
 KINDS: dict[str, tuple[Callable[[], MachineSpec], int, int]] = {  # mobility, parameters less ties

@@ -15,17 +15,8 @@ from legcal.errors import DidNotConverge
 from legcal.geometry.lines import normal_basis
 from legcal.machine.equations import leg_equations
 from legcal.machine.leg import EquationKind
-from legcal.paper.equations import (
-    axis_frames,
-    closure_of_leg,
-    end_of_leg,
-    leg_across_axis,
-)
-from legcal.paper.least_squares import (
-    LeastSquares,
-    Term,
-    solve_least_squares,
-)
+from legcal.paper.equations import axis_frames, closure_of_leg, end_of_leg, leg_across_axis
+from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 
 
 def _line(outlier: float) -> LeastSquares:

@@ -104,25 +104,16 @@ def _damaged_png() -> bytes:
     return bytes(content)
 
 
-def _cut(content: bytes) -> bytes:
-    return content[: 2 * len(content) // 3]
-
-
 SMALL = np.resize(PICTURE, (24, 32))
 REFUSED: tuple[tuple[bytes, list[str]], ...] = (
     (b"\xff\xd8\xff\xd9", ["a JPEG file of 4 bytes", "cut off", "copy it again"]),
-    (_cut(jpeg(PICTURE)), ["JPEG", "cut off"]),
-    (_cut(png(PICTURE)), ["PNG", "cut off"]),
-    (_cut(tiff(PICTURE)), ["TIFF", "cut off"]),
-    (b"II*\0\x08" + bytes(9), ["TIFF", "damaged"]),
+    (tiff(PICTURE)[:2000], ["TIFF", "cut off"]),
     (_damaged_png(), ["PNG", "damaged"]),
     (tiff(PICTURE.astype(np.float32)), ["a TIFF of 32 bit pixels", "8 or 16 bit"]),
     (b"\0\0\0\x18ftypheic" + bytes(200), ["HEIC", "magick", "JPEG"]),
-    (b"\0\0\0\x18ftypavif" + bytes(200), ["AVIF", "magick", "JPEG"]),
     (jpeg(PICTURE.reshape(SIZE)), ["48 x 64 px", "turned by a quarter turn", "64 x 48 px"]),
     (jpeg(PICTURE.reshape(SIZE), block=exif(orientation=6)), ["EXIF orientation 6"]),
     (jpeg(SMALL), ["32 x 24 px", "rescaled by 0.5"]),
-    (jpeg(np.resize(PICTURE, (96, 128))), ["128 x 96 px", "rescaled by 2"]),
     (jpeg(np.resize(PICTURE, (128, 96))), ["96 x 128 px", "turned and rescaled by 2"]),
     (jpeg(PICTURE[:40]), ["64 x 40 px", "cropped"]),
     (jpeg(SMALL, block=exif(width=64, height=48)), ["taken with 64 x 48 px"]),

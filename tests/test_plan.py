@@ -19,16 +19,18 @@ from csv_rows import read_rows
 from scipy.spatial.transform import RigidTransform
 
 import legcal
-from legcal.calibration.joint_fit.predicted import (
-    WHITE,
+from legcal import (
+    Machine,
+    SimulationSettings,
+    inverse_kinematics,
+    load_dataset,
+    load_mechanism,
+    simulate,
 )
-from legcal.data.dataset import load_dataset
+from legcal.calibration.joint_fit.predicted import WHITE
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.motions import look_at
 from legcal.machine.configurations import Configurations
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
 from legcal.planning.exchange import choose
@@ -36,8 +38,7 @@ from legcal.planning.places import Place, Setting, default_setting, parse_bounds
 from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
 from legcal.planning.session import Plan, write_session
-from legcal.simulation.dataset import simulate
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.settings import Level
 from legcal.vision.camera import sample_camera
 from legcal.vision.camera_file import camera_info
 
@@ -158,17 +159,16 @@ def test_the_command_writes_what_python_plans(
     planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With the same seed it is the same, to the last bit, wherever work is done."""
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
     session, lens = tmp_path / "session", tmp_path / "lens.yaml"
     lens.write_text(f"# calibrated\n{camera_info(planned.camera, 'lens')}")
-    assert run(monkeypatch, *WORDS, "--camera", lens, "--json", "-o", session) == 0
+    outcome = run(*WORDS, "--camera", lens, "--json", "-o", session)
+    assert outcome.code == 0
     assert (session / "camera_info.yaml").read_bytes() == lens.read_bytes()
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == planned.document() == json.loads((session / "plan.json").read_text())
+    assert outcome.document == planned.document() == json.loads((session / "plan.json").read_text())
     header = (session / "dataset.yaml").read_text().partition("\n")[0]
     assert (session / header.rpartition("=")[2]).name == "dataset.json"
     assert (session / header.rpartition("=")[2]).is_file()
@@ -190,7 +190,6 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     planned: Plan,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
 
     def stopped(*found: Any, **more: Any) -> Any:
@@ -203,10 +202,10 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
     monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
     monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
-    assert run(monkeypatch, *WORDS, "--json", "-o", tmp_path / "session") == 130
-    printed = capsys.readouterr()
-    assert json.loads(printed.out)["error"]["kind"] == "Interrupted"
-    assert f"written to {tmp_path / 'session'}, with the best plan" in printed.err
+    outcome = run(*WORDS, "--json", "-o", tmp_path / "session")
+    assert outcome.code == 130
+    assert outcome.document["error"]["kind"] == "Interrupted"
+    assert f"written to {tmp_path / 'session'}, with the best plan" in outcome.err
     document = json.loads((tmp_path / "session" / "plan.json").read_text())
     assert document["images"] == 6
     assert planned.value < document["value"] < planned.growth[1, 1]
@@ -266,7 +265,6 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
 
 FAR: dict[str, Any] = {"images": 4, "setting": FEW}
 REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
-    ({"images": 0}, UsageError, "--images 0"),
     ({"images": 401}, UsageError, "1 to 400"),
     ({"images": 9, "images_per_view": 3}, UsageError, "--images-per-view"),
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
@@ -279,12 +277,10 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"board": "chessboard:7x5:25mm"}, DatasetError, "after half a turn"),
     ({"board": "chessbord:9x6"}, UsageError, "chessbord"),
     ({"given": "nowhere"}, DatasetError, "nowhere"),
-    ({"noise": "nowhere"}, UsageError, "--noise"),
     ({"noise": __file__}, UsageError, "found no JSON"),
     ({"encoder_sigma": "0.5deg"}, UsageError, "encoder sigma"),
     ({"encoder_sigma": "2"}, UsageError, "without a unit"),
     ({"setting": Setting(0.05, 2e-3, draws=0)}, UsageError, "0 draws"),
-    ({"setting": Setting(50.0, 2e-3)}, UsageError, "off by 50 m"),
     ({"setting": Setting(0.05, 3.0)}, UsageError, "a model error of 3 m"),
     (
         {"setting": Setting(0.05, 0.5, draws=3), "images": 4},

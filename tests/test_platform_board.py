@@ -11,21 +11,15 @@ import numpy as np
 import pytest
 import yaml
 from dataset_folder import Folder, folder
-from fit_sessions import (
-    T_RE_BOARD,
-    MachineSession,
-    machine_session,
-    with_boards,
-)
+from fit_sessions import T_RE_BOARD, MachineSession, machine_session, with_boards
 from simulated import settings
 
-from legcal import calibrate, evaluate, identifiability, load_dataset, simulate
+from legcal import calibrate, evaluate, identifiability, load_dataset, load_mechanism, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.joint_fit.fit import refine
 from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
-from legcal.machine.loader import load_mechanism
 from legcal.simulation.dataset import SimulatedDataset
 from legcal.simulation.settings import Level
 from legcal.vision.board import parse_boards

@@ -1,26 +1,45 @@
 """What errors of parameters do to the platform is what written models do there, of every class."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from parameter_steps import random_covariance, written_with
 
-from legcal import evaluate
+from legcal import Machine, evaluate, load_mechanism, random_configurations
 from legcal.calibration.joint_fit.platform import (
     expected_error,
     platform_accuracy,
     platform_by_parameters,
 )
-from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_configurations
 from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
-from legcal.machine.leg import LegKind
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
-from legcal.machine.parameters import geometries, parametrization_of, parametrize
+from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
+from legcal.machine.parameters import (
+    Parametrization,
+    geometries,
+    moved_legs,
+    parametrization_of,
+    reframed,
+)
+
+
+def random_covariance(
+    parametrization: Parametrization, rng: np.random.Generator, rank: int, sigma: float
+) -> Array:
+    """Return the root (p, rank) of a covariance, parameters known to about sigma [m, rad]."""
+    return np.asarray(sigma * rng.normal(size=(len(parametrization), rank)) / np.sqrt(rank))
+
+
+def written_with(
+    nominal: Machine, parametrization: Parametrization, step: Array, folder: Path
+) -> Machine:
+    """Return a mechanism with changed parameters, as loaded from the files written of it."""
+    folder.mkdir(exist_ok=True)
+    origin = np.asarray(nominal.T_platform_Re.inv().translation)
+    moved = moved_legs(geometries(nominal), parametrization.place, step)
+    write_urdf(nominal, reframed(moved, nominal.frame_legs, origin), folder / "other.urdf")
+    write_calibrated_yaml(nominal, folder / "other.yaml", "other.urdf")
+    return load_mechanism(folder / "other.yaml")
 
 
 def _motions(nominal: Machine, other: Machine, q: Array) -> Array:
@@ -53,17 +72,6 @@ def test_predicted_errors_are_those_of_written_models_in_pinocchio(
     np.testing.assert_allclose(predicted.displacement, np.sqrt(squares[:, 3:].sum(1)), rtol=3e-3)
     np.testing.assert_allclose(predicted.rotation, np.sqrt(squares[:, :3].sum(1)), rtol=3e-3)
     assert predicted.displacement.min() > 1e-6
-
-
-def test_a_pose_that_readings_do_not_determine_is_refused() -> None:
-    nominal = load_mechanism("hexapod")
-    legs = geometries(nominal)
-    passive = [*legs[:5], replace(legs[5], kind=LegKind.PASSIVE, q0=np.nan)]
-    parametrization = parametrize(nominal.leg_names, passive, nominal.frame_legs)
-    with pytest.raises(NotIdentifiable, match="the 5 readings do not determine platform pose 1"):
-        platform_by_parameters(
-            passive, parametrization, nominal.frame_legs, [platform_in_base(nominal, nominal.home)]
-        )
 
 
 # Of a calibration: what it changed, how well that is known, and what wrong assumptions do

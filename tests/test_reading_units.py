@@ -7,17 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import run
+from command_line import Outcome, run
 from csv_rows import read_rows
 from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
 from test_init import own_folder
 
-from legcal.data.dataset import load_dataset
+from legcal import LegcalError, load_dataset, load_mechanism
 from legcal.data.reading_units import sigmas_of
 from legcal.descriptions.new_model import create_model
-from legcal.errors import LegcalError, ModelError, UsageError
-from legcal.machine.loader import load_mechanism
+from legcal.errors import ModelError, UsageError
 from legcal.machine.model_writer import write_model
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
@@ -118,14 +117,13 @@ def test_init_takes_angles_and_pulses(
     words: tuple[str, ...],
     sigma_deg: float,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     own_folder(tmp_path, PHOTOGRAPHS)
     given = {"rad": ANGLES, "deg": np.degrees(ANGLES), "us": pulses(ANGLES)}[scale]
     model = "servo-hexapod"
     if scale == "us":
         model = str(create_model(read_table(servo_table(tmp_path)), tmp_path).yaml_path)
-    assert init(tmp_path, given, headings, words, monkeypatch, model) == 0
+    assert init(tmp_path, given, headings, words, model).code == 0
     rows = read_rows(tmp_path / "dataset/measurements.csv")
     found = [[float(row[name]) for name in SERVOS] for row in rows]
     np.testing.assert_allclose(found, ANGLES, atol=1e-4)
@@ -139,15 +137,14 @@ def init(
     given: np.ndarray,
     headings: str,
     words: tuple[str, ...],
-    monkeypatch: pytest.MonkeyPatch,
     model: str = "servo-hexapod",
-) -> int:
+) -> Outcome:
     """Return what legcal init says of a table of readings."""
     table = [",".join(headings.format(name) for name in SERVOS)]
     table += [",".join(f"{x:.4f}" for x in row) for row in given]
     (folder / "own.csv").write_text("\n".join(table) + "\n")
     return run(
-        monkeypatch, "init", folder / "photos", "--readings", folder / "own.csv", "--model",
+        "init", folder / "photos", "--readings", folder / "own.csv", "--model",
         model, "-o", folder / "dataset", *words,
     )  # fmt: skip
 
@@ -171,12 +168,11 @@ def test_what_init_cannot_make_of_angles(
     words: tuple[str, ...],
     named: tuple[str, ...],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     own_folder(tmp_path, PHOTOGRAPHS)
-    assert init(tmp_path, given, headings, words, monkeypatch) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    outcome = init(tmp_path, given, headings, words)
+    assert outcome.code == 2
+    said = outcome.said
     assert said.count("legcal: ") == 1
     assert all(word in said for word in named), said
     assert not (tmp_path / "dataset").exists()

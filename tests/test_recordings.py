@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from command_line import run
+from command_line import Outcome, run
 
 from legcal import load_dataset, load_mechanism
 from legcal.data.measurements import reading_columns
@@ -77,10 +77,9 @@ def _camera_file(folder: Path) -> Path:
     return path
 
 
-def _table(motion: Motion, path: Path, times: Array, unit: str = "mm") -> Path:
+def _table(motion: Motion, path: Path, times: Array) -> Path:
     joints = [column.name for column in reading_columns(load_mechanism(MODEL).legs)]
-    scale = {"mm": 1e3, "m": 1.0}[unit]
-    rows = [",".join([f"{t + 1.7e9:.4f}", *(f"{scale * x:.6f}" for x in q)])
+    rows = [",".join([f"{t + 1.7e9:.4f}", *(f"{1e3 * x:.6f}" for x in q)])
             for t, q in zip(times, motion.readings(times), strict=True)]  # fmt: skip
     path.write_text("\n".join([",".join(["time", *joints]), *rows]))
     return path
@@ -156,30 +155,23 @@ def _bag(motion: Motion, folder: Path, **extra: str) -> Path:
 
 
 @pytest.fixture
-def import_(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., tuple[int, Path]]]:
-    camera = _camera_file(tmp_path)
-
-    def imported(*words: object) -> tuple[int, Path]:
-        code = run(monkeypatch, "import", *map(str, words), "--model", MODEL, "--camera",
-                   str(camera), "-o", str(tmp_path / "dataset"))  # fmt: skip
-        return code, tmp_path / "dataset"
-
-    yield imported
+def import_(tmp_path: Path) -> Iterator[Callable[..., Outcome]]:
+    """Import into a folder ``dataset``."""
+    given = ("--model", MODEL, "--camera", _camera_file(tmp_path), "-o", tmp_path / "dataset")
+    yield lambda *words: run("import", *words, *given)
     left = [p.name for p in tmp_path.iterdir() if p.name.endswith(".legcal-part")]
     assert left == []
 
 
 @pytest.mark.parametrize("kind", ["video", "folder", pytest.param("bag", marks=pytest.mark.system)])
 def test_poses_that_were_held_become_rows(
-    motion: Motion, tmp_path: Path, import_: Callable[..., tuple[int, Path]], kind: str
+    motion: Motion, tmp_path: Path, import_: Callable[..., Outcome], kind: str
 ) -> None:
     source = {"video": _video, "folder": _folder, "bag": _bag}[kind](motion, tmp_path)
     times = np.arange(0.0, motion.times[-1], 0.02)
     words = [] if kind == "bag" else ["--readings", _table(motion, tmp_path / "q.csv", times)]
-    code, folder = import_(source, *words)
-    assert code == 0
+    assert import_(source, *words).code == 0
+    folder = tmp_path / "dataset"
     dataset = load_dataset(folder)
     found = dataset.measurements.q
     assert [view.name for view in dataset.measurements.views] == ["c1"]
@@ -193,30 +185,25 @@ def test_poses_that_were_held_become_rows(
 
 
 def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(
-    motion: Motion,
-    tmp_path: Path,
-    import_: Callable[..., tuple[int, Path]],
-    capsys: pytest.CaptureFixture[str],
+    motion: Motion, tmp_path: Path, import_: Callable[..., Outcome]
 ) -> None:
-    import json
-
     times = np.arange(0.0, motion.times[-1], 0.02)
     begin, end = motion.times[6], motion.times[7]  # of a rest without readings
     table = _table(motion, tmp_path / "q.csv", times[(times < begin - 0.1) | (times > end + 0.1)])
-    code, folder = import_(_folder(motion, tmp_path), "--readings", table, "--json")
-    found = json.loads(capsys.readouterr().out)["views"]["c1"]
-    assert code == 0
+    outcome = import_(_folder(motion, tmp_path), "--readings", table, "--json")
+    assert outcome.code == 0
+    found = outcome.document["views"]["c1"]
     assert abs(found["offset_s"] - AHEAD) < 0.05
     assert abs(found["offset_s"] - AHEAD) < 4.0 * found["offset_sigma_s"] + 1.0 / RATE
     assert [still["why_not"] for still in found["stills"]].count("no reading") == 1
     assert found["used"] == motion.rests - 1
-    assert load_dataset(folder).measurements.n_rows == motion.rests - 1
+    assert load_dataset(tmp_path / "dataset").measurements.n_rows == motion.rests - 1
 
 
 def test_a_damaged_video_is_told_in_one_sentence_and_times_may_have_a_unit(
     motion: Motion,
     tmp_path: Path,
-    import_: Callable[..., tuple[int, Path]],
+    import_: Callable[..., Outcome],
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     video, rng = _video(motion, tmp_path), np.random.default_rng(2)
@@ -229,12 +216,11 @@ def test_a_damaged_video_is_told_in_one_sentence_and_times_may_have_a_unit(
     rows = [line.split(",", 1) for line in table.read_text().splitlines()]
     ticks = [f"{1e3 * (float(time) - 1.7e9):.1f},{rest}" for time, rest in rows[1:]]
     table.write_text("\n".join([f"Time [ms],{rows[0][1]}", *ticks]))
-    code, folder = import_(video, "--readings", table, "--offset", "-0.5")
-    said = capfd.readouterr()
-    assert code == 0
-    assert "it is cut off or damaged there" in said.out + said.err
-    assert "@ 0x" not in said.err  # as the decoder writes
-    assert 3 <= len(load_dataset(folder).measurements.q) < motion.rests
+    outcome = import_(video, "--readings", table, "--offset", "-0.5")
+    assert outcome.code == 0
+    assert "it is cut off or damaged there" in outcome.said
+    assert "@ 0x" not in outcome.err + capfd.readouterr().err  # as the decoder writes
+    assert 3 <= len(load_dataset(tmp_path / "dataset").measurements.q) < motion.rests
 
 
 @pytest.mark.parametrize(
@@ -321,15 +307,15 @@ def _other(motion: Motion, folder: Path) -> Path:
 def test_what_cannot_be_imported_is_refused(
     motion: Motion,
     tmp_path: Path,
-    import_: Callable[..., tuple[int, Path]],
+    import_: Callable[..., Outcome],
     capfd: pytest.CaptureFixture[str],
     name: str,
 ) -> None:
     words, said = REFUSALS[name]
-    code, folder = import_(*words(motion, tmp_path))
-    assert code in (1, 2)
-    error = " ".join(capfd.readouterr().err.split())
-    assert said in error, error
+    outcome = import_(*words(motion, tmp_path))
+    assert outcome.code in (1, 2)
+    assert said in outcome.said
+    error = outcome.err + capfd.readouterr().err
     assert "Traceback" not in error
     assert "Unexpected element" not in error  # as readers of OpenCV write
-    assert not folder.exists()
+    assert not (tmp_path / "dataset").exists()

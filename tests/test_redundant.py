@@ -17,6 +17,15 @@ from scipy.spatial.transform import RigidTransform
 from simulated import settings
 
 import legcal
+from legcal import (
+    Follower,
+    Machine,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+    random_configurations,
+    simulate,
+)
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.session_changes import session_tests
 from legcal.data.image_choice import image_sequences
@@ -24,17 +33,9 @@ from legcal.data.measurements import row_names
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.closing import solve_poses
-from legcal.machine.configurations import random_configurations
-from legcal.machine.kinematics import (
-    Follower,
-    forward_kinematics,
-    inverse_kinematics,
-    platform_in_base,
-)
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, readings_at
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.model import readings_at
 from legcal.machine.parameters import geometries
-from legcal.simulation.dataset import simulate
 from legcal.simulation.session import given_poses
 
 

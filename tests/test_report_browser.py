@@ -41,19 +41,6 @@ def page(example_run: Run, browser: Any) -> Any:
     return browser
 
 
-def _is_drawn(browser: Any, scene: str) -> bool:
-    """Return whether a canvas has more colours than that of its paper."""
-    return bool(
-        browser.execute_script(
-            """const canvas = document.getElementById(arguments[0]);
-            const { width, height } = canvas;
-            const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
-            return new Set(new Uint32Array(data.buffer)).size > 20;""",
-            scene,
-        )
-    )
-
-
 def _moved(browser: Any, name: str, value: int) -> dict[str, Any]:
     """Set a control of the machine's scene; return its lines by the names of the legend."""
     layers = browser.execute_script(
@@ -69,7 +56,13 @@ def _moved(browser: Any, name: str, value: int) -> dict[str, Any]:
 
 
 def test_everything_is_drawn_without_an_error(page: Any) -> None:
-    assert _is_drawn(page, "machine-scene")
+    colours = page.execute_script(
+        """const canvas = document.getElementById("machine-scene");
+        const { width, height } = canvas;
+        const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+        return new Set(new Uint32Array(data.buffer)).size;"""
+    )
+    assert colours > 20  # more than that of the paper
     points = page.execute_script(
         "return [...document.querySelectorAll('.charts [data-points]')].map("
         "(path) => path.getBBox().width)"
@@ -127,6 +120,15 @@ def detection(examined: tuple[Path, Examination]) -> tuple[Path, Detection]:
     folder, found = examined
     assert found.detection is not None
     return folder, found.detection
+
+
+def _downloaded(path: Path) -> str:
+    """Wait for a file and return its text."""
+    end = time.monotonic() + PATIENCE
+    while not path.exists():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return path.read_text("utf-8")
 
 
 class Editor:
@@ -202,11 +204,7 @@ class Editor:
         path = self.downloads / "observations.csv"
         path.unlink(missing_ok=True)
         self.find("[data-download]").click()
-        end = time.monotonic() + PATIENCE
-        while not path.exists():
-            assert time.monotonic() < end
-            time.sleep(0.02)
-        return path.read_text("utf-8")
+        return _downloaded(path)
 
 
 def _rows(text: str) -> list[dict[str, str]]:
@@ -348,14 +346,6 @@ class Placer:
         return float(self.browser.execute_script(script))
 
 
-def _downloaded(path: Path) -> list[dict[str, str]]:
-    end = time.monotonic() + PATIENCE
-    while not path.exists():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return _rows(path.read_text("utf-8"))
-
-
 def test_a_photograph_fills_the_editor_on_a_telephone(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:
@@ -395,7 +385,7 @@ def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
         placer.click(seen[joint])
     placer.press_delete("leg6.platform")
     placer.find("[data-landmarks]").click()
-    table = _downloaded(tmp_path / "landmarks.csv")
+    table = _rows(_downloaded(tmp_path / "landmarks.csv"))
     clicked = {line["joint"]: np.array([float(line["u"]), float(line["v"])]) for line in table}
     assert list(clicked) == ["leg1.base", "leg2.base", "leg4.base", "leg1.platform",
                              "leg3.platform", "leg5.platform"]  # fmt: skip

@@ -178,13 +178,13 @@ def test_calibrate_writes_the_report_unless_it_should_not(
     out = tmp_path / "out"
     monkeypatch.setattr("legcal.calibration.pipeline.calibrate", example_run.written_again)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
+    assert run("calibrate", example_run.folder, "-o", out).code == 0
     page = (out / "report.html").read_bytes()
     assert b"legcal-page" in page[:1000]
     assert b"2026-09-21" in page
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out) == 0
+    assert run("calibrate", example_run.folder, "-o", out).code == 0
     assert (out / "report.html").read_bytes() == page  # the time is all that differs otherwise
-    assert run(monkeypatch, "calibrate", example_run.folder, "-o", out, "--no-report") == 0
+    assert run("calibrate", example_run.folder, "-o", out, "--no-report").code == 0
     assert not (out / "report.html").exists()
 
 
@@ -200,7 +200,6 @@ def test_a_page_that_fails_loses_nothing_else(
     example_run: Run,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
     error: Exception,
     said: str,
 ) -> None:
@@ -212,12 +211,12 @@ def test_a_page_that_fails_loses_nothing_else(
     words = ("calibrate", example_run.folder, "-o", out)
     monkeypatch.setattr("legcal.calibration.pipeline.calibrate", example_run.written_again)
     monkeypatch.setattr("legcal.report.calibration_page.verdict_of", fails)
-    assert run(monkeypatch, *words, "--json") == 0
-    printed = capsys.readouterr()
-    document = json.loads(printed.out)
+    outcome = run(*words, "--json")
+    assert outcome.code == 0
+    document = outcome.document
     assert document.pop("next")[0]["what"].startswith("Load calibrated.urdf")
     assert document == json.loads((out / "result.json").read_text())
-    assert f"legcal: The result was written without report.html: {said}" in printed.err
+    assert f"legcal: The result was written without report.html: {said}" in outcome.err
     assert not (out / "report.html").exists()
     assert (out / "calibrated.urdf").exists()
 
@@ -245,9 +244,9 @@ def test_the_truth_is_for_the_page_alone(
         "legcal.calibration.pipeline.calibrate", lambda *_, **__: pytest.fail("too late")
     )
     words = ("calibrate", example_run.folder, "-o", tmp_path / "new", "--truth")
-    assert run(monkeypatch, *words, "hexapod", "--no-report") == 2
-    assert run(monkeypatch, *words, "3-rpr") == 2
-    assert run(monkeypatch, *words, tmp_path / "none.yaml") == 2
+    assert run(*words, "hexapod", "--no-report").code == 2
+    assert run(*words, "3-rpr").code == 2
+    assert run(*words, tmp_path / "none.yaml").code == 2
     assert not (tmp_path / "new").exists()
 
 
@@ -302,13 +301,13 @@ def test_overlays_that_cannot_be_drawn_are_left_out_and_told(
 @pytest.mark.system
 @pytest.mark.usefixtures("page")  # which writes the report of the result
 def test_a_check_writes_a_page_and_never_over_that_of_a_result(
-    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    example_run: Run, tmp_path: Path
 ) -> None:
     few = spoiled(tmp_path / "few", 1).write()  # photographs, at half their size
     words = ("calibrate", few, "--check", example_run.output, "-o")
     before = (example_run.output / "report.html").read_bytes()
-    assert run(monkeypatch, *words, example_run.output) == 2
+    assert run(*words, example_run.output).code == 2
     assert (example_run.output / "report.html").read_bytes() == before
-    assert run(monkeypatch, *words, tmp_path / "check") == 0
+    assert run(*words, tmp_path / "check").code == 0
     found: Any = html.fromstring((tmp_path / "check" / "report.html").read_text("utf-8"))
     assert "No change was detected" in found.xpath("string(//section[@id='verdict'])")

@@ -67,12 +67,12 @@ def test_every_shipped_file_fits_the_schema_that_it_names() -> None:
 
 
 def test_what_is_written_names_a_schema_beside_it_that_it_fits(
-    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    example_run: Run, tmp_path: Path
 ) -> None:
     simulated(tmp_path / "set", "3-rpr", views=3, poses=6)
-    assert run(monkeypatch, "new", "--template", "-o", tmp_path) == 0
-    assert run(monkeypatch, "new", tmp_path / "my-hexapod.yaml", "-o", tmp_path) == 0
-    assert run(monkeypatch, "inspect", "3-rps", "--write", tmp_path) == 0
+    assert run("new", "--template", "-o", tmp_path).code == 0
+    assert run("new", tmp_path / "my-hexapod.yaml", "-o", tmp_path).code == 0
+    assert run("inspect", "3-rps", "--write", tmp_path).code == 0
     written = [path for path in tmp_path.rglob("*.yaml") if "truth" not in path.parts]
     written += sorted(example_run.output.glob("*.yaml"))
     assert len(written) >= 7
@@ -83,17 +83,13 @@ def test_what_is_written_names_a_schema_beside_it_that_it_fits(
     assert kinds == set(FILES)
 
 
-def test_printed_documents_fit_their_schemas(
-    example_run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Those of other commands are held against theirs in ``command_outcomes.py``."""
+def test_printed_documents_fit_their_schemas(example_run: Run) -> None:
+    """Those of other commands are held against theirs in ``command_line.py``."""
     _check("result", json.loads((example_run.output / "result.json").read_text()))
-    assert run(monkeypatch, "evaluate", "hexapod", "hexapod", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    document = run("evaluate", "hexapod", "hexapod", "--json").document
     _check("evaluate", document)
     assert not _validator("evaluate").is_valid({**document, "poses": "many"})
-    assert run(monkeypatch, "export", "hexapod", "--to", "gcode", "-o", "x", "--json") == 2
-    _check("error", json.loads(capsys.readouterr().out))
+    _check("error", run("export", "hexapod", "--to", "gcode", "-o", "x", "--json").document)
 
 
 def test_every_command_that_prints_a_document_has_a_schema() -> None:

@@ -5,15 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from fit_sessions import (
-    PINHOLE,
-    HexapodSession,
-    disturbed_start,
-    irregular_hexapod,
-    noisy_outlines,
-    noisy_readings,
-    with_camera,
-)
+from fit_sessions import PINHOLE, MachineSession, irregular_hexapod, with_camera
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices
@@ -23,21 +15,20 @@ from legcal.vision.camera import Camera, with_intrinsics
 
 
 def fitted(
-    session: HexapodSession,
+    session: MachineSession,
     seed: int,
     factor: float,
     free: frozenset[str] = frozenset(),
     **others: float,
 ) -> Solution:
     """Return the fit of noisy data with a wrong focal length, or with other wrong intrinsics."""
-    rng = np.random.default_rng(seed)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    measurements, outlines = session.noisy(seed)
     camera = session.measurements.views[0].camera
     scaled = {key: factor * camera.K[i, i] for i, key in enumerate(("fx", "fy"))}
     camera = with_intrinsics(camera, scaled | others)
     measurements, outlines = with_camera(measurements, outlines, camera)
     choices = Choices(frozenset(), free, {})
-    return refine(session.legs, measurements, outlines, disturbed_start(session), choices=choices)
+    return refine(session.legs, measurements, outlines, session.start, choices=choices)
 
 
 @cache
@@ -52,14 +43,13 @@ def notes_on_focal_lengths(solution: Solution) -> list[str]:
 def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:
     """Digital zoom: all distances from the principal point of its camera are longer."""
     session = irregular_hexapod(6)
-    rng = np.random.default_rng(0)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
+    measurements, outlines = session.noisy(0)
     camera = measurements.views[0].camera
     zoomed = measurements.view[outlines.row] == 1
     centre = camera.K[:2, 2]
     ends = np.where(zoomed[:, None, None], centre + 1.03 * (outlines.ends - centre), outlines.ends)
     data = with_camera(measurements, replace(outlines, ends=ends), camera)
-    solution = refine(session.legs, *data, disturbed_start(session))
+    solution = refine(session.legs, *data, session.start)
     (note,) = notes_on_focal_lengths(solution)
     assert note.startswith("The focal length of view c2 does not agree with the other views")
     found = float(note.partition("it differs by ")[2].partition(" +-")[0])

@@ -14,13 +14,11 @@ from csv_rows import read_rows, write_rows
 from scipy.spatial.transform import Rotation
 from simulated import settings, simulated, standing
 
-from legcal import calibrate, evaluate, load_dataset, load_mechanism
+from legcal import Calibration, Dataset, calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
-from legcal.calibration.result import Calibration
 from legcal.calibration.session_changes import Finding, session_tests
 from legcal.calibration.verdict import commanded
-from legcal.data.dataset import Dataset
 from legcal.data.image_choice import chosen_images, dataset_at, image_sequences, own_zeros
 from legcal.errors import UsageError
 from legcal.files.table import format_table

@@ -242,12 +242,7 @@ def test_the_page_shows_what_is_asked_and_takes_words(session: Path, tmp_path: P
         (["--watch", ".", "--target", "5"], "--target"),
     ],
 )
-def test_refusals(
-    words: list[str],
-    said: str,
-    session: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run_command(monkeypatch, "shoot", session, *words) == 2
-    assert said in capsys.readouterr().err
+def test_refusals(words: list[str], said: str, session: Path) -> None:
+    outcome = run_command("shoot", session, *words)
+    assert outcome.code == 2
+    assert said in outcome.err

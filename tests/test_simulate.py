@@ -15,25 +15,25 @@ from boards import CHARUCO
 from simulated import files_of, settings, simulated, small_camera
 
 import legcal
-from legcal.data.dataset import load_dataset
-from legcal.data.outlines import read_observations
-from legcal.errors import NotVisible, UsageError
-from legcal.files.motions import motion_from_xyz_quat
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine
-from legcal.perception.board_adjustment import camera_poses_by_board
-from legcal.perception.board_corners import find_corners
-from legcal.simulation.cameras import mild_lens, read_lens
-from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset, simulate
-from legcal.simulation.observe import OutlineNoise, Viewpoint
-from legcal.simulation.settings import (
-    Distribution,
-    Level,
+from legcal import (
+    Machine,
     ParameterErrors,
     SimulationSettings,
     Spread,
-    requested,
+    Viewpoint,
+    load_dataset,
+    load_mechanism,
+    simulate,
 )
+from legcal.data.outlines import read_observations
+from legcal.errors import NotVisible, UsageError
+from legcal.files.motions import motion_from_xyz_quat
+from legcal.perception.board_adjustment import camera_poses_by_board
+from legcal.perception.board_corners import find_corners
+from legcal.simulation.cameras import mild_lens
+from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset
+from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.settings import Distribution, Level, requested
 from legcal.vision.board import parse_board
 
 FEW = settings(poses=1, views=1)
@@ -160,12 +160,6 @@ def test_repeated_photographs_differ_by_the_noise_of_the_sensor(tmp_path: Path) 
     assert (view.camera.gamma, view.camera.gamma_is_given) == (1.8, True)
 
 
-def _from_the_side(name: str, camera: Path | None, x: float, *legs: str) -> Viewpoint:
-    """Return a camera that sees the hexapod from a side."""
-    T = motion_from_xyz_quat((x, 0.26, 0.19), (0.411, 0.574, -0.552, -0.443))
-    return Viewpoint(name, mild_lens() if camera is None else read_lens(camera), T, legs or None)
-
-
 def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:
     noise = OutlineNoise(sigma_px=0.2, n_points=50)
     rng = np.random.default_rng(0)
@@ -178,7 +172,8 @@ def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points()
 # --- settings
 
 
-VIEW = _from_the_side("side", None, 0.93)
+FROM_THE_SIDE = motion_from_xyz_quat((0.93, 0.26, 0.19), (0.411, 0.574, -0.552, -0.443))
+VIEW = Viewpoint("side", mild_lens(), FROM_THE_SIDE)  # of a hexapod
 
 
 def test_options_become_settings(tmp_path: Path) -> None:
@@ -295,10 +290,6 @@ def machine() -> Machine:
     return load_mechanism("3-rps")
 
 
-def _truth(folder: Path) -> dict[str, Any]:
-    return dict(json.loads((folder / "truth" / "truth.json").read_text()))
-
-
 def _with_board(factory: pytest.TempPathFactory, **settings: Any) -> Path:
     folder = factory.mktemp("board") / "session"
     simulate(machine(), folder, SimulationSettings(level=Level.OUTLINES, views=1, **settings))
@@ -322,7 +313,7 @@ def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
     assert corners is not None
     assert T_base_board is not None
     view = dataset.measurements.views[0]
-    truth = _truth(standing)["views"]["c1"]["T_base_camera"]
+    truth = truth_of(standing)["views"]["c1"]["T_base_camera"]
     T = motion_from_xyz_quat(**truth).inv() * T_base_board
     exact = view.camera.project(T.apply(board.points))[corners.corner]
     assert len(corners) >= 2 * 0.5 * board.n_corners
@@ -338,7 +329,7 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
     poses, _ = camera_poses_by_board(
         dataset.corners, dataset.boards[0].board, m, [view.name for view in m.views]
     )
-    truth = _truth(held)
+    truth = truth_of(held)
     T_base_board = parse_board(truth["board"], held).T_link_board
     assert T_base_board is not None
     places = []
@@ -360,7 +351,7 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     assert dataset.corners is None
     board = dataset.boards[0].board
     number, px, sigma = find_corners(board, dataset.image_reader([0])(0))
-    truth = _truth(tmp_path / "seen")
+    truth = truth_of(tmp_path / "seen")
     T_base_board = parse_board(truth["board"], tmp_path).T_link_board
     assert T_base_board is not None
     T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board

@@ -11,14 +11,13 @@ import pytest
 from machines import ROOT
 from scipy.spatial.transform import RigidTransform
 
+from legcal import Machine, forward_kinematics, inverse_kinematics, load_mechanism, singularity
 from legcal.errors import DatasetError, DidNotConverge, ModelError
 from legcal.geometry.types import Array
-from legcal.machine.closing import dimensionless, is_on_same_side, singularity
+from legcal.machine.closing import dimensionless, is_on_same_side
 from legcal.machine.configurations import JITTER, MIN_SINGULARITY, Configurations
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
-from legcal.machine.loader import load_mechanism
-from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.model import vectors_A_to_B
 from legcal.simulation import session as module
 from legcal.simulation.session import commanded_poses, draw_poses, given_poses
 from legcal.simulation.settings import DEFAULT_ERRORS, Sampling
@@ -27,8 +26,8 @@ from legcal.simulation.truth import write_true_model
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel
 
 
-def _drawn(machine: Machine, n: int, sampling: str = "extreme", seed: int = 0) -> Configurations:
-    return draw_poses(machine, n, np.random.default_rng(seed), sampling)
+def _drawn(machine: Machine, n: int) -> Configurations:
+    return draw_poses(machine, n, np.random.default_rng(0), "extreme")
 
 
 def _parts(machine: Machine, poses: Configurations) -> Array:
@@ -126,12 +125,12 @@ def test_a_joint_outside_its_limits_at_home_is_named(tmp_path: Path) -> None:
         _drawn(wrong, 2)
 
 
-def _along(machine: Machine, T: RigidTransform, j: int, n: int = 40) -> list[tuple[Array, float]]:
+def _along(machine: Machine, T: RigidTransform, j: int) -> list[tuple[Array, float]]:
     """Return points of the axes of a leg's cylinders, and their radii."""
     vector = vectors_A_to_B(machine, T)[j]
     length = float(np.linalg.norm(vector))
     return [
-        (machine.A_base[j] + np.linspace(*c.span(length), n)[:, None] * vector / length, c.radius)
+        (machine.A_base[j] + np.linspace(*c.span(length), 40)[:, None] * vector / length, c.radius)
         for c in machine.legs[j].cylinders
     ]
 
@@ -150,16 +149,14 @@ def _penetration(machine: Machine, T: RigidTransform) -> float:
     return max(_overlap(machine, T, i, j) for i, j in combinations(range(machine.n_legs), 2))
 
 
-def _with_radius(radius: float, folder: Path) -> Machine:
-    """Load a copy of the shipped hexapod with legs of another radius [m]."""
-    return _copy(
-        "hexapod", folder, lambda text: re.sub(r'radius="[^"]*"', f'radius="{radius}"', text)
-    )
+def _thick(folder: Path) -> Machine:
+    """Load a copy of the shipped hexapod with legs of 37 mm radius."""
+    return _copy("hexapod", folder, lambda text: re.sub(r'radius="[^"]*"', 'radius="0.037"', text))
 
 
-def _csv(folder: Path, machine: Machine, rows: Array, names: list[str] | None = None) -> Path:
+def _csv(folder: Path, machine: Machine, rows: Array) -> Path:
     """Write readings of all motors as a CSV."""
-    header = names or [str(machine.legs[j].prismatic) for j in machine.motors]
+    header = [str(machine.legs[j].prismatic) for j in machine.motors]
     path = folder / "poses.csv"
     lines = [",".join(header), *[",".join(repr(float(q)) for q in row) for row in rows]]
     path.write_text("\n".join([*lines, ""]))
@@ -181,7 +178,7 @@ def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) ->
 
 
 def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) -> None:
-    thick = _with_radius(0.037, tmp_path)
+    thick = _thick(tmp_path)
     poses = _drawn(load_mechanism("hexapod"), 12)
     overlaps = [_penetration(thick, T) for T in poses.poses]
     with pytest.raises(DatasetError, match="collide there, needed") as caught:

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from machines import ROOT
 from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
+from legcal import Machine, load_mechanism
 from legcal.errors import ModelError
-from legcal.machine.loader import load_mechanism
 from legcal.machine.meshes import ray_caster
-from legcal.machine.model import Machine
 from legcal.simulation.session import draw_poses
 from legcal.simulation.solids import (
     Box,
@@ -26,7 +26,6 @@ from legcal.simulation.solids import (
     solids_of,
 )
 
-ROOT = Path(__file__).resolve().parents[1]
 STL = b"""solid one
 facet normal 0 0 1
 outer loop
@@ -39,14 +38,13 @@ endsolid one
 """
 
 
-def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Machine:
-    """Return the hexapod with visuals on its platform and materials in its file."""
+def hexapod_showing(folder: Path, visuals: str) -> Machine:
+    """Return the hexapod with visuals on its platform."""
     (folder / "models").mkdir()
     (folder / "urdf").mkdir()
     (folder / "models" / "hexapod.yaml").write_text((ROOT / "models/hexapod.yaml").read_text())
     text = (ROOT / "urdf/hexapod.urdf").read_text()
     text = text.replace('<link name="platform"/>', f'<link name="platform">{visuals}</link>')
-    text = text.replace('<link name="base"/>', f'{materials}<link name="base"/>')
     (folder / "urdf" / "hexapod.urdf").write_text(text)
     return load_mechanism(folder / "models" / "hexapod.yaml")
 

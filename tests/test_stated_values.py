@@ -41,12 +41,6 @@ def fitted(session: MachineSession, choices: Choices = NO_CHOICES) -> Solution:
     )
 
 
-def true_values(session: MachineSession) -> dict[str, float]:
-    legs = session.legs
-    truth = legs.vector(session.truth.legs).tolist()
-    return dict(zip(legs.parametrization.names, truth, strict=True))
-
-
 def fixed_at(values: dict[str, float]) -> Choices:
     return Choices(fixed=frozenset(values), values=values)
 
@@ -66,7 +60,7 @@ def with_wrong_cameras(session: MachineSession, number: float, key: str) -> Mach
 def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSession) -> None:
     names = frozenset({"leg2.offset", "leg4.base.x", "leg1.radius.leg1_tube"})
     at_truth = replace(session, legs=replace(session.legs, nominal=session.truth.legs))
-    found, true = fitted(at_truth, Choices(fixed=names)), true_values(at_truth)
+    found, true = fitted(at_truth, Choices(fixed=names)), at_truth.true_values
     assert_exact(at_truth, found)
     for name in ("leg2.offset", "leg4.base.x"):
         assert found.estimates.values[name] == true[name]
@@ -77,7 +71,7 @@ def test_fixed_parameters_stay_at_nominal_or_at_their_values(session: MachineSes
     at = [parameters.index("leg2.offset"), parameters.index("leg4.base.x")]
     assert not found.kinematic.covariance[at].any()
     assert found.kinematic.covariance[parameters.index("leg1.offset")].any()
-    value = true_values(session)["leg3.offset"]
+    value = session.true_values["leg3.offset"]
     found = fitted(session, fixed_at({"leg3.offset": value}))
     assert found.estimates.values["leg3.offset"] == pytest.approx(value, abs=1e-15)
     assert_exact(session, found)
@@ -147,7 +141,7 @@ def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSe
 @pytest.mark.system
 def test_two_priors_that_contradict_each_other_are_refused() -> None:
     session = machine_session("3-upu", n_poses=4)
-    found = [true_values(session)[n] for n in ("leg2.base.x", "leg3.base.y")]
+    found = [session.true_values[n] for n in ("leg2.base.x", "leg3.base.y")]
     choices = Choices(
         priors={
             "leg2.base.x": Prior(found[0], 1e-5),
@@ -168,7 +162,7 @@ def test_two_priors_that_contradict_each_other_are_refused() -> None:
 def test_wrong_fixed_values_are_refused_with_those_of_the_measurements(
     noisy: MachineSession, values: dict[str, float], found: str
 ) -> None:
-    true = true_values(noisy)
+    true = noisy.true_values
     with pytest.raises(DidNotConverge) as refusal:
         fitted(noisy, fixed_at({name: true[name] + away for name, away in values.items()}))
     (problem,) = refusal.value.problems
@@ -183,7 +177,7 @@ def test_right_fixed_values_are_accepted_whatever_outlines_claim() -> None:
     claimed = replace(outlines, covariance=outlines.covariance / 4.0**2)
     session = replace(exact, measurements=measurements, outlines=claimed)
     radii = {f"{exact.legs.names[j]}.radius.{p}": r for (j, p), r in exact.legs.radii.items()}
-    values = {n: v for n, v in (true_values(exact) | radii).items() if ".platform" in n}
+    values = {n: v for n, v in (exact.true_values | radii).items() if ".platform" in n}
     found = fitted(session, fixed_at({n: v for n, v in values.items() if "axis" not in n}))
     assert found.notes == ()
 

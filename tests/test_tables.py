@@ -38,8 +38,8 @@ MEASUREMENTS = recorded(labels=["", "", "a", "b"])
 OPTIONAL = MEASURED
 
 
-def axes_of(seed: int = 0) -> LegAxes:
-    rng = np.random.default_rng(seed)
+def axes_of() -> LegAxes:
+    rng = np.random.default_rng(0)
     row, leg = np.divmod(np.arange(12, dtype=np.intp), 3)
     values = rng.uniform([-1.2, -1.2, -0.3, 0.6], [1.2, 1.2, 0.3, 1.2], (12, 4))
     return axes_of_table(row, leg, values, rng.uniform(1e-4, 1e-3, (12, 4)))

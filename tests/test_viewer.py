@@ -16,8 +16,7 @@ from hexapod_example import HEXAPOD, Run
 from layouts import Layout, write_machine
 from machines import of_types
 
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.loader import load_mechanism
+from legcal import inverse_kinematics, load_mechanism
 from legcal.viewer.server import Address
 from legcal.viewer.source import Photographs, Source, open_source
 from legcal.viewer.view_server import Motion, ViewServer
@@ -160,16 +159,12 @@ def _port_in_use() -> tuple[socket.socket, str]:
     ],
 )
 def test_what_cannot_be_shown_is_refused_in_a_sentence(
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    words: list[str], said: str, tmp_path: Path
 ) -> None:
     taken, port = _port_in_use()
     with taken:
         filled = [word.format(tmp=tmp_path, port=port) for word in words]
-        assert run(monkeypatch, "view", *filled) == 2
-    found = capsys.readouterr().err
-    assert said in found
-    assert found.count("\n") == 1
+        outcome = run("view", *filled)
+    assert outcome.code == 2
+    assert said in outcome.err
+    assert outcome.err.count("\n") == 1

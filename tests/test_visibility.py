@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import ROOT
 
 import legcal
 from legcal.errors import NotVisible
@@ -42,7 +42,7 @@ def posed_machine(name: str) -> Machine:
     return legcal.load_mechanism(name)
 
 
-def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[PosedMachine, ...]:
+def posed(name: str, n_poses: int, *more: Solid) -> tuple[PosedMachine, ...]:
     machine = posed_machine(name)
     if n_poses == 1:
         home = machine.home_configuration[None]
@@ -50,8 +50,7 @@ def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[Pos
     else:
         found = legcal.random_configurations(machine, n_poses, 0)
         poses = Configurations(found.configurations, found.readings, found.poses)
-    shown = solids_of(machine) if bare else dressed(machine)
-    return pose_machine(machine, [*shown, *more], poses)
+    return pose_machine(machine, [*solids_of(machine), *more], poses)
 
 
 def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
@@ -152,9 +151,6 @@ def test_what_sight_predicts_of_legs_is_what_rays_at_their_solids_meet(name: str
 # Solids that are not measured
 
 
-ROOT = Path(__file__).parents[1]
-
-
 def visual(shape: str, xyz: str, rpy: str = "0 0 0") -> str:
     return f'<visual><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{shape}</geometry></visual>'
 
@@ -198,10 +194,10 @@ def with_solids(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Mac
     return machine
 
 
-def with_hidden(machine: Machine, n: int) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
+def with_hidden(machine: Machine) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
     """Return a machine in poses: what of it is not measured as triangles, and as occluders."""
     solids = [solid for solid in solids_of(machine) if solid.leg is None]
-    found = random_configurations(machine, n, 0)
+    found = random_configurations(machine, 2, 0)
     poses = pose_machine(machine, solids, found)
     A, B = (np.array([getattr(here, name) for here in poses]) for name in ("A", "B"))
     return poses, PlacedOccluders.at(machine.occluders, A, B)
@@ -218,7 +214,7 @@ def test_hidden_is_what_rays_at_the_model_do_not_reach(
     machine = with_solids(name)
     size, rng = machine.size, np.random.default_rng(3)
     share, n_hidden = list[float](), 0
-    for here, placed in zip(*with_hidden(machine, 2), strict=True):
+    for here, placed in zip(*with_hidden(machine), strict=True):
         middle = 0.5 * (here.A.mean(axis=0) + here.B.mean(axis=0))
         direction = rng.normal(size=3)
         centre = middle + 4.0 * size * direction / np.linalg.norm(direction)

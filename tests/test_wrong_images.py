@@ -14,23 +14,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
-from legcal import calibrate, detect, load_dataset
+from legcal import Calibration, calibrate, detect, load_dataset
 from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
 from legcal.calibration.estimate import outlier_images
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
-from legcal.calibration.result import Calibration
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import BoolArray
-from legcal.perception.diagnostics import (
-    hint_notes,
-)
+from legcal.perception.diagnostics import hint_notes
 from legcal.perception.image_quality import measure_exposure
-from legcal.perception.photographs import (
-    MeasuredImages,
-    place_and_measure,
-)
+from legcal.perception.photographs import MeasuredImages, place_and_measure
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 

@@ -28,7 +28,7 @@ from unittest.mock import patch
 
 import numpy as np
 import yaml
-from command_outcomes import Outcome, run, words_of
+from command_line import Outcome, run, words_of
 from made_inputs import made_input
 
 from fuzzing.mutations import mutate
@@ -205,7 +205,7 @@ def _shipped() -> dict[Path, tuple[Source, Machine]]:
     for subject in one_of_each.values():
         with tempfile.TemporaryDirectory(prefix="legcal-fuzz-") as top:
             folder = made_input(subject.input)
-            run(words_of(subject.command, {"in": folder, "out": Path(top) / "out"}))
+            run(*words_of(subject.command, {"in": folder, "out": Path(top) / "out"}))
     sources = {path: read_source(path) for path in map(find_model, ("hexapod", "3-rpr"))}
     return {path: (source, loader._load(source)) for path, source in sources.items()}
 
@@ -275,7 +275,7 @@ def _run_one(case: Case, folder: Path) -> Ended:
     begin = time.process_time()
     signal.setitimer(signal.ITIMER_PROF, max_seconds())
     words = words_of(subject.command, {"in": folder / "in", "out": folder / "out"})
-    outcome = run([*words, "--json"], inside=folder)
+    outcome = run(*words, "--json", inside=folder)
     signal.setitimer(signal.ITIMER_PROF, 0.0)
     seconds = time.process_time() - begin
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0

@@ -44,7 +44,7 @@ SUBJECTS = (
     Subject("gepetto", "machine/robot.yaml", "inspect {in}/machine"),
     Subject("gepetto", "machine/robot.urdf", "inspect {in}/machine", share=0.5),
     Subject("loop_joint", "machine.urdf", "inspect {in}/machine.urdf", share=0.5),
-    Subject("mjcf bodies", "machine.xml", "inspect {in}/machine.xml"),
+    Subject("mjcf", "machine.xml", "inspect {in}/machine.xml"),
     Subject("tables", "tripod.csv", "new {in}/tripod.csv --unit mm -o {out}"),
     Subject("tables", "3-rpr.yaml", "new {in}/3-rpr.yaml -o {out}", share=0.5),
     Subject("small", "dataset.yaml", "detect {in} -o {out}"),

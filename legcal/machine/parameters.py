@@ -234,7 +234,7 @@ def in_joint_frames(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg
 
 
 def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
-    """Return parameters as one vector [m], passive or not, in the order of :func:`parametrize`."""
+    """Return parameters as one vector [m], in the order of :func:`parametrize`."""
     free = free_coordinates(len(parameters.offsets), frame_legs)
     return np.concatenate(
         [parameters.base_joints[free], parameters.platform_joints[free], parameters.offsets]
