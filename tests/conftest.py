@@ -100,7 +100,7 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
 
     from legcal.machine import configurations, loader
 
-    load = loader._load
+    load = loader.load_source
     machines: dict[tuple[str, ...], Machine] = {}
 
     def load_once(source: Source) -> Machine:
@@ -127,7 +127,7 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
         patch.setattr(configurations, "random_poses", draw_once)
-        patch.setattr(loader, "_load", load_once)
+        patch.setattr(loader, "load_source", load_once)
         yield
 
 

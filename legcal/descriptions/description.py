@@ -7,7 +7,6 @@ machine closes, and completes lengths and axes of all legs there.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -15,25 +14,22 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, Problems
 from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.lines import cross, distance_to_line
-from legcal.geometry.motions import frame_on_points, motion_of, pose_distance
+from legcal.geometry.lines import cross
+from legcal.geometry.motions import motion_of, pose_distance
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.equations import posture_constraints
 from legcal.machine.leg import (
-    MAX_LENGTH,
-    MAX_RADIUS,
-    MIN_LENGTH,
-    MIN_RADIUS,
     EquationKind,
     JointType,
     Leg,
     LegKind,
 )
-from legcal.machine.rods import actuators_of, joints_at, reading_of_rod
+from legcal.machine.parameters import n_frame_legs
+from legcal.machine.rods import actuators_of, both_readings, joints_at
 from legcal.machine.solver import postures_after, solve
+from legcal.machine.topology import widest
 
 MAX_NUMBER = 1e9  # largest number of a description, in any unit
 _TYPE = re.compile(r"([PR])([RUS])([RUS])|([RUS])(P?)([RUS]?)")
@@ -223,120 +219,48 @@ _MANY = 3  # legs that hardly all fit by chance
 ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if they coincide
 
 
-def wrong_sizes(described: Description) -> list[str]:
-    """Return the problems of radii, offsets and travels in themselves."""
-    problems = []
-    for leg in described.legs:
-        if leg.offset is None:
-            continue
-        ends = leg.travel or (0.0, 0.0)
-        for length in (leg.offset + ends[0], leg.offset + ends[1]):
-            problems += _out_of_proportion(described, leg.name, length)[:1]
-            if problems:
-                return problems
-    for side, joints in (
-        ("base", [leg.A_base for leg in described.legs]),
-        ("platform", [leg.B_platform for leg in described.legs]),
-    ):
-        reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        if reach > MAX_LENGTH:
-            problems.append(
-                f"{described.source}: the {side} joints could not be used: found them "
-                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
-                f"{MAX_LENGTH:g} m; {_about_the_unit(described.unit, too_long=True)}."
-            )
-    for leg in described.legs:
-        motor = leg.actuator
-        if motor is None or not motor.turns:
-            continue
-        if distance_to_line(leg.A_base, motor.axis, motor.point) < MIN_LENGTH:
-            problems.append(
-                f"{described.source}: leg '{leg.name}' could not be used: found its base joint on "
-                f"the axis of '{motor.joint}', which turns without moving it, needed an arm of "
-                f"{1e3 * MIN_LENGTH:g} mm at least between them; correct the joint, or point and "
-                "axis of the motor."
-            )
-    return problems
+def _check_travel(
+    described: Description,
+    lengths: Array,
+    actuators: Sequence[Actuator],
+    readings: Mapping[str, float],
+) -> None:
+    """Refuse leg lengths and readings of motors that carry joints outside their travel at home.
 
-
-def wrong_lengths(described: Description, lengths: Array) -> list[str]:
-    """Return the problems of leg lengths at home."""
-    problems = list[str]()
+    The sizes of legs and radii are checked when the model is loaded.
+    """
     outside = list[tuple[str, float, float, float]]()
-    for leg, length in zip(described.legs, lengths, strict=True):
-        disproportions = _out_of_proportion(described, leg.name, float(length))
-        if disproportions:
-            return disproportions
-        for radius in (leg.tube, leg.rod):
-            if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
-                return [
-                    f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
-                    f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
-                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
-                ]
+    for leg, length in zip(described.legs, lengths.tolist(), strict=True):
         if leg.kind is LegKind.CONSTANT or leg.travel is None:
             continue
-        q0 = leg.offset or 0.0
-        low, high = q0 + leg.travel[0], q0 + leg.travel[1]
+        low, high = ((leg.offset or 0.0) + end for end in leg.travel)
         if not low - _SLACK * length <= length <= high + _SLACK * length:
-            outside.append((leg.name, 1e3 * float(length), 1e3 * low, 1e3 * high))
+            outside.append((leg.name, 1e3 * length, 1e3 * low, 1e3 * high))
+    problems, start = Problems(described.source), "{} cannot close at home"
     if outside:
-        shortest, longest = (f(x[1] for x in outside) for f in (min, max))
+        names, lengths_there, lows, highs = zip(*outside, strict=True)
+        shortest, longest = min(lengths_there), max(lengths_there)
         there = f"{shortest:.6g} mm" + f" to {longest:.6g} mm" * (longest - shortest > 1e-6)
-        least, most = min(x[2] for x in outside), max(x[3] for x in outside)
-        problems.append(
-            f"{described.source}: {legs_in_words([name for name, *_ in outside])} cannot close at "
-            f"home: found the length {there} there, needed {least:.6g} to {most:.6g} mm (offset "
-            "plus travel); correct home, offsets or travel."
+        problems.add(
+            start.format(legs_in_words(names)),
+            f"the length {there} there",
+            f"{min(lows):.6g} to {max(highs):.6g} mm (offset plus travel)",
+            "correct home, offsets or travel, and their unit",
         )
-    return problems
-
-
-def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
-    """Return the problem of an implausible leg length, if any."""
-    if MIN_LENGTH <= length <= MAX_LENGTH:
-        return []
-    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
-    return [
-        f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
-        f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
-    ]
-
-
-def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
-    """Return the remedy for implausible sizes."""
-    if not positive:
-        return "correct its joints, offset or travel (length = offset + reading)"
-    if unit == "m" and too_long:
-        return "these look like mm values where m are stated: check the unit"
-    if unit == "mm" and not too_long:
-        return "these look like m values where mm are stated: check the unit"
-    return "check the numbers and the unit"
-
-
-def wrong_axes(
-    described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
-) -> list[str]:
-    """Return the problems of axes that do not fit their leg at home."""
-    problems = []
-    for side, joint, axis in (
-        ("base", entry.type.base, axes[0]),
-        ("platform", entry.type.platform, axes[1]),
-    ):
-        angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
-        if joint is JointType.REVOLUTE and 90.0 - angle > np.degrees(PERPENDICULAR):
-            problems.append(
-                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
-                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
-                f"correct {side}_axes or home."
+    for actuator in actuators:
+        q, stated = readings[actuator.joint], described.home_readings.get(actuator.joint)
+        scale, unit = SHOWN_IN[actuator.unit]
+        low, high = actuator.travel
+        is_other = stated is not None and abs(q - stated) > MAX_HOME_RESIDUAL * (high - low)
+        if is_other or max(low - q, q - high) * scale > 1e-6:
+            needed = f"one in its travel of {scale * low:.6g} to {scale * high:.6g} {unit}"
+            problems.add(
+                start.format(f"motor '{actuator.joint}'"),
+                f"the reading {scale * q:.6g} {unit} there",
+                f"that of home_readings, {scale * (stated or 0.0):.6g} {unit}" * is_other or needed,
+                "correct home or home_readings" if is_other else "correct home, lengths or travel",
             )
-        if joint is JointType.UNIVERSAL and angle < ALONG:
-            problems.append(
-                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
-                f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
-                f"needed it across the leg; correct {side}_axes or home."
-            )
-    return problems
+    problems.raise_if_any()
 
 
 TRIALS = 40
@@ -383,29 +307,42 @@ class Assembled(Description):
 
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
-    _refuse(wrong_sizes(described))
     home, notes = home_of_description(described)
     T = home.motion()
-    readings = _readings_at_home(described, T)
+    closure = _ClosingEquations(described, mid_travel=False)
+    readings = closure.readings_of_motors(T)
     A = np.array([_at(leg, readings) for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
-    _refuse(wrong_lengths(described, lengths))
+    _check_travel(described, lengths, closure.actuators, readings)
     u = (B - A) / lengths[:, None]
     tangents = np.array([across_leg(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
     if all_revolute(described):
         tangents[:] = [0.0, 0.0, 1.0]
-    legs, problems = [], []
+    legs, problems = [], Problems(described.source)
     for j, entry in enumerate(described.legs):
         q = 0.0 if entry.actuator is None else readings[entry.actuator.joint]
-        base_axis, platform_axis = axes = _axes(entry, tangents[j], T, q)
-        problems += wrong_axes(described, entry, u[j], axes)
+        axes = dict(zip(("base", "platform"), _axes(entry, tangents[j], T, q), strict=True))
+        for side, axis in axes.items():
+            angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u[j]), 0.0, 1.0))))
+            if getattr(entry.type, side) is JointType.UNIVERSAL and angle < ALONG:
+                problems.add(
+                    f"the {side} axis of leg '{entry.name}' could not be used",
+                    f"it along the leg at home ({angle:.3g} deg), where a U joint is singular",
+                    "it across the leg",
+                    f"correct {side}_axes or home",
+                )
         q0, travel = _law(entry, float(lengths[j]))
-        numbers = {"travel": travel, "base_axis": base_axis, "platform_axis": platform_axis}
+        numbers = {"travel": travel, **{f"{side}_axis": axis for side, axis in axes.items()}}
         legs.append(AssembledLeg(**(vars(entry) | numbers), u=u[j], q0=q0, q_home=q))
-    _refuse(problems)
+    problems.raise_if_any()
     planar = all_revolute(described) and is_planar(legs, T)
-    frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
+    frame = described.base_frame
+    if frame is None:
+        ends = np.array([(leg.A_base, leg.B_platform) for leg in legs])
+        motors = [leg.name if leg.actuator is None else leg.actuator.joint for leg in legs]
+        n_d = min(n_frame_legs(spatial=not _in_a_plane(legs)), len(legs))
+        frame = tuple(legs[j].name for j in widest(ends[:, 0], ends[:, 1], motors, n_d))
     at_home = {name: readings[name] for name in described.home_readings}
     numbers = {"legs": tuple(legs), "home": home, "base_frame": frame, "home_readings": at_home}
     numbers["notes"] = (*described.notes, *notes)
@@ -466,49 +403,6 @@ def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
     q0 = 0.0 if entry.offset is None else entry.offset
     free = (FREE_TRAVEL[0] * length - q0, FREE_TRAVEL[1] * length - q0)
     return q0, free if entry.travel is None else entry.travel
-
-
-def _base_frame(described: Description, count: int) -> tuple[str, ...]:
-    """Return the legs that define frames: as given, or 1, 3, 5 of six, or the first possible."""
-    legs = described.legs
-    if described.base_frame is not None:
-        names = [leg.name for leg in legs]
-        named = [names.index(name) for name in described.base_frame]
-        if len(named) != count or _degenerate(described, named):
-            raise ModelError(
-                f"{described.source}: base_frame could not be used: found "
-                f"{', '.join(described.base_frame)}, needed {count} legs whose joints on base and "
-                "platform are not in one point or on one line; choose others, or leave it out."
-            )
-        return described.base_frame
-    combos = list(combinations(range(len(legs)), count))
-    if len(legs) == 6 and count == 3:
-        combos.insert(0, (0, 2, 4))
-    motors = [j if leg.actuator is None else leg.actuator.joint for j, leg in enumerate(legs)]
-    combos.sort(key=lambda chosen: -len({motors[j] for j in chosen}))  # of different motors first
-    for chosen in combos:
-        if not _degenerate(described, chosen):
-            return tuple(legs[j].name for j in chosen)
-    raise ModelError(
-        f"{described.source}: the frames of base and platform could not be built: found the joints "
-        f"of the base or of the platform all in one point or on one line, needed {count} legs "
-        "whose joints span them; correct base_joints or platform_joints."
-    )
-
-
-def _degenerate(described: Description, chosen: Sequence[int]) -> bool:
-    """Return whether the joints of some legs define no frame."""
-    try:
-        for side in ("A_base", "B_platform"):
-            frame_on_points(np.array([getattr(described.legs[j], side) for j in chosen]))
-    except ValueError:
-        return True
-    return False
-
-
-def _refuse(problems: list[str]) -> None:
-    if problems:
-        raise ModelError(problems)
 
 
 def home_of_description(described: Description) -> tuple[Home, list[str]]:
@@ -587,15 +481,29 @@ class _ClosingEquations:
                 slopes.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
         return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
 
+    def readings_of_motors(self, T: RigidTransform) -> dict[str, float]:
+        """Return the readings of motors that carry joints at a pose, by their first rods.
+
+        Of the two readings at which a rod reaches the pose the one inside the travel is taken, or
+        the one nearer to the stated reading.
+        """
+        readings = dict[str, float]()
+        for leg in self.legs:
+            actuator = leg.actuator
+            if actuator is None or actuator.joint in readings:
+                continue
+            (low, high), near = actuator.travel, self.stated.get(actuator.joint)
+            readings[actuator.joint] = min(
+                both_readings(leg, T.apply(leg.B)),
+                key=lambda q: max(low - q, q - high, 0.0) if near is None else abs(q - near),
+            )
+        return readings
+
     def readings_at(self, T: RigidTransform) -> Array:
         """Return the readings (n,) at a pose: fixed ones, or those of the first rods."""
         if self.still is not None:
             return self.still
-        first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
-        candidates = [
-            _candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators
-        ]
-        return np.array([pair[0] for pair in candidates])
+        return np.array([*self.readings_of_motors(T).values()])
 
     def _point(self, T: RigidTransform) -> Array:
         """Return a pose with its readings, (1, 12 + n)."""
@@ -659,68 +567,12 @@ def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
     )
 
 
-def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> list[float]:
-    """Return the two readings at which a rod reaches a pose.
-
-    The first is the one inside the travel, or the one nearer to the stated reading.
-    """
-    B = np.asarray(T.apply(leg.B))[None]
-    low, high = leg.travel
-    readings = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
-    if stated is not None:
-        return sorted(readings, key=lambda q: abs(q - stated))
-    return sorted(readings, key=lambda q: max(low - q, q - high, 0.0))
-
-
 def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
     """Return the joint at A (3,) at readings of motors that carry joints."""
     if entry.actuator is None:
         return entry.A_base
     q = np.array([readings[entry.actuator.joint]])
     return np.asarray(entry.actuator.at(entry.A_base, q)[0])
-
-
-def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, float]:
-    """Return the readings at home of motors that carry joints.
-
-    Raises
-    ------
-    ModelError
-        If home is outside a travel, or both readings of a rod are inside it.
-    """
-    closure = _ClosingEquations(described, mid_travel=False)
-    readings, problems = dict[str, float](), list[str]()
-    for actuator in closure.actuators:
-        rods = [leg for leg in closure.legs if leg.actuator is actuator]
-        stated = described.home_readings.get(actuator.joint)
-        chosen, other = _candidates(rods[0], T, stated)
-        readings[actuator.joint] = chosen
-        scale, unit = SHOWN_IN[actuator.unit]
-        low, high = (scale * end for end in actuator.travel)
-        where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
-        needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"
-        outside = [max(low - scale * q, scale * q - high) > 1e-6 for q in (chosen, other)]
-        if outside[0]:
-            problems.append(
-                f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "
-                f"there, {needed}; correct home, lengths or travel."
-            )
-        elif stated is not None:
-            if abs(chosen - stated) > MAX_HOME_RESIDUAL * (actuator.travel[1] - actuator.travel[0]):
-                problems.append(
-                    f"{where} at the reading {scale * stated:.6g} {unit} of home_readings: found "
-                    f"{scale * chosen:.6g} and {scale * other:.6g} {unit} there, needed one within "
-                    f"{MAX_HOME_RESIDUAL:.0%} of its travel; correct home or home_readings."
-                )
-        elif not outside[1] and abs(other - chosen) > 1e-9:
-            problems.append(
-                f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the right one in home_readings, or limit "
-                "the travel to one side of the turning point of "
-                f"{legs_in_words([leg.name for leg in rods])}."
-            )
-    _refuse(problems)
-    return readings
 
 
 def _project(described: Description, home: Home) -> Home:

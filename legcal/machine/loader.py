@@ -57,7 +57,7 @@ from legcal.machine.leg import (
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
-from legcal.machine.rods import reading_of_rod, rod_mode
+from legcal.machine.rods import both_readings, rod_mode
 from legcal.machine.shapes import (
     at_visible_heights,
     occluders_of,
@@ -87,7 +87,6 @@ from legcal.machine.urdf import Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
-_METRES = "write all lengths in metres (are they millimetres?)"
 _NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 _DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
@@ -131,16 +130,17 @@ def load_mechanism(
     if without:
         left = [name for name in source.file.name_mot if name not in without]
         source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
-    return _load(replace(source, leg_radius=leg_radius))
+    return load_source(replace(source, leg_radius=leg_radius))
 
 
-def _load(source: Source) -> Machine:
+def load_source(source: Source) -> Machine:
+    """Return the mechanism of a file that has been read; see :func:`load_mechanism`."""
     file, urdf = source.file, source.urdf
     # Beyond, rounding would hide the relative position of joints.
     for joint in urdf.joints.values():
         words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        _check_length(away, words, MAX_ORIGIN, urdf.path)
+        _check_length(away, words, MAX_ORIGIN, urdf)
     _check_names(file, urdf, source.path)
     closures = sorted(  # in a fixed order, since sums depend on it
         source.closures, key=lambda closure: (closure.frame_1, closure.frame_2, closure.kind)
@@ -385,7 +385,7 @@ def _readings_at_home(
         if leg.actuator is None:
             continue
         joint = leg.actuator.joint
-        readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        readings = both_readings(leg, B[j])
         size, unit = SHOWN_IN[leg.reading_unit]
         choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
@@ -664,15 +664,15 @@ def _check_frames(machine: Machine) -> None:
     problems.raise_if_any()
 
 
-def _check_length(length: float, words: str, most: float, path: Path) -> None:
+def _check_length(length: float, words: str, most: float, urdf: Urdf) -> None:
     """Refuse a length [m] that is most likely in another unit, with *words* for it."""
     if length > most:
         raise ModelError(
             "the lengths could not be used",
             words.format(f"{length:.4g}"),
             f"at most {most:g} m",
-            _METRES,
-            path,
+            urdf.wording.correct_unit,
+            urdf.path,
         )
 
 
@@ -680,7 +680,7 @@ def _check_spread(machine: Machine) -> None:
     """Check that the joints are within metres of each other, before the search for home."""
     for side, joints in (("base", machine.A_base), ("platform", machine.B_platform)):
         size = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf_path)
+        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf)
 
 
 def _check_unit(machine: Machine) -> None:
@@ -694,7 +694,7 @@ def _check_unit(machine: Machine) -> None:
             "the lengths could not be used",
             f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
             "1 mm to 20 m",
-            _METRES,
+            machine.urdf.wording.correct_unit,
             path,
         )
     for leg in machine.legs:
@@ -704,7 +704,7 @@ def _check_unit(machine: Machine) -> None:
                 f"the travel of leg '{leg.name}' could not be used",
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
                 "at most 20 m",
-                "write the limits of its slider in metres (are they millimetres?)",
+                machine.urdf.wording.correct_unit,
                 path,
             )
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):

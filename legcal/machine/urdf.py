@@ -264,6 +264,7 @@ class Wording:
     state_readings: str = "write legcal.home_readings with the reading of each actuator at home"
     state_ends: str = "write legcal.base, legcal.platform and legcal.legs"
     correct_ends: str = "correct legcal.base or legcal.platform"
+    correct_unit: str = "write all lengths in metres (are they millimetres?)"
 
 
 BLOCK = Wording()
