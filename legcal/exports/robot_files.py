@@ -180,16 +180,13 @@ def mjcf_refusal(subject: Subject) -> str | None:
             "readings, as those of MuJoCo do"
         )
     urdf = subject.machine.urdf
-    above = {joint.child: joint for joint in urdf.joints.values()}
     for joint in urdf.joints.values():
-        link = joint.parent
-        while joint.type == "floating" and link in above:
-            if above[link].moves:
+        for above in urdf.joints_above(joint.parent):
+            if joint.type == "floating" and above.moves:
                 return (
-                    f"found the floating joint '{joint.name}' below '{above[link].name}', which "
+                    f"found the floating joint '{joint.name}' below '{above.name}', which "
                     "moves, needed it to hang from the world alone (MuJoCo)"
                 )
-            link = above[link].parent
     return None
 
 
@@ -211,9 +208,6 @@ class _Writer:
         urdf = machine.urdf
         robot = parse_robot(urdf.path, urdf.content)
         self._links = {str(e.get("name")): e for e in robot.iterfind("link")}
-        self._below: dict[str, list[UrdfJoint]] = {}
-        for joint in urdf.joints.values():
-            self._below.setdefault(joint.parent, []).append(joint)
         self._world = etree.Element("worldbody")
         self._name = {link: link for link in urdf.links}  # names of bodies; the root is the world
         if WORLD in self._name and urdf.root != WORLD:
@@ -235,7 +229,7 @@ class _Writer:
         pending = [machine.urdf.root]
         while pending:
             link = pending.pop(0)
-            for joint in self._below.get(link, []):
+            for joint in machine.urdf.below[link]:
                 self._add(joint)
                 pending.append(joint.child)
         equality = etree.SubElement(mujoco, "equality")

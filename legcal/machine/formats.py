@@ -27,7 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
-from legcal.machine.chain import ClosedChain, frame_link, rigid_bodies
+from legcal.machine.chain import ClosedChain, rigid_bodies
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,
@@ -47,7 +47,6 @@ from legcal.machine.spanning_tree import (
     moving_groups,
     origin_xml,
     read_loop_source,
-    reference_poses,
 )
 from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
@@ -119,7 +118,7 @@ def _of_stated(source: Source) -> Source:
     kept = [
         i
         for i, pair in enumerate(loops)
-        if any(frame_link(source.urdf, frame) in mine for frame in pair)
+        if any(source.urdf.link_of(frame) in mine for frame in pair)
     ]
     if not kept:
         return source
@@ -324,18 +323,12 @@ def with_held_joints(source: Source) -> Source:
 
 def open_joints(urdf: Urdf, closures: Iterable[Sequence[str]]) -> dict[str, UrdfJoint]:
     """Return the joints that can move and are in no loop, by name."""
-    above = {joint.child: joint for joint in urdf.joints.values()}
-
-    def to_root(link: str) -> set[str]:
-        names = set[str]()
-        while link in above:
-            names.add(above[link].name)
-            link = above[link].parent
-        return names
-
     in_loops = set[str]()
-    for first, second in closures:
-        in_loops |= to_root(frame_link(urdf, first)) ^ to_root(frame_link(urdf, second))
+    for pair in closures:
+        first, second = (
+            {joint.name for joint in urdf.joints_above(urdf.link_of(frame))} for frame in pair
+        )
+        in_loops |= first ^ second
     return {
         name: joint for name, joint in urdf.joints.items() if joint.moves and name not in in_loops
     }
@@ -354,16 +347,13 @@ def _refuse_open_leg(
     urdf: Urdf, held: Mapping[str, UrdfJoint], motors: Sequence[str], source: Source
 ) -> None:
     """Refuse a chain with a motor and a passive joint that ends without closing a loop."""
-    children: dict[str, list[UrdfJoint]] = {}
-    for joint in urdf.joints.values():
-        children.setdefault(joint.parent, []).append(joint)
 
     def beyond(joint: UrdfJoint) -> list[UrdfJoint]:
         """Return a joint and all joints that it carries."""
         carried, pending = list[UrdfJoint](), [joint]
         while pending:
             carried.append(pending.pop())
-            pending += children.get(carried[-1].child, [])
+            pending += urdf.below[carried[-1].child]
         return carried
 
     for joint in held.values():
@@ -557,7 +547,7 @@ def _solved(
 def is_drawn_closed(source: Source) -> bool:
     """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
     chain = _closed_chain(source)
-    poses = reference_poses(source.urdf).values()
+    poses = source.urdf.poses.values()
     size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
     return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
 

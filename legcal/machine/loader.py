@@ -67,7 +67,7 @@ from legcal.machine.shapes import (
     with_cylinders,
     with_mesh_cylinders,
 )
-from legcal.machine.spanning_tree import Source, reference_poses
+from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
@@ -512,7 +512,7 @@ def _check_neighbours(file: MechanismFile, urdf: Urdf, problems: Problems) -> No
     for i, pair in enumerate(file.closed_loop):
         for frame in set(pair):
             places.setdefault(frame, []).append(i)
-    above = {joint.child: joint for joint in urdf.joints.values()}
+    above = urdf.above
     parents = {joint.parent for joint in urdf.joints.values()}
     spare = {
         link: joint.parent
@@ -585,8 +585,7 @@ def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
     moving = [joint for joint in urdf.joints.values() if joint.moves and joint.type not in VIRTUAL]
     if len(moving) < 2 or any(joint.type == "prismatic" for joint in moving):
         return
-    poses = reference_poses(urdf)
-    axes = [poses[joint.child].rotation.apply(joint.axis) for joint in moving]
+    axes = [urdf.poses[joint.child].rotation.apply(joint.axis) for joint in moving]
     if all(parallel(axes[0], axis) for axis in axes):
         raise _plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path)
 

@@ -19,7 +19,7 @@ from legcal.errors import OutOfClass, Problem
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.chain import Bodies, Closure, Connection, frame_link, rigid_bodies
+from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
 from legcal.machine.classification import (
     classify_leg,
     is_actuator,
@@ -32,7 +32,7 @@ from legcal.machine.classification import (
 from legcal.machine.files import LegcalBlock
 from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
-from legcal.machine.spanning_tree import Source, reference_poses
+from legcal.machine.spanning_tree import Source
 from legcal.machine.urdf import Urdf
 
 Normals = tuple[Array, Array]
@@ -238,7 +238,7 @@ def _block_on(
 
 def _is_used(urdf: Urdf, closures: Sequence[Closure], link: str) -> bool:
     """Return whether a moving joint or a closure is on a link itself."""
-    ends = {frame_link(urdf, frame) for c in closures for frame in (c.frame_1, c.frame_2)}
+    ends = {urdf.link_of(frame) for c in closures for frame in (c.frame_1, c.frame_2)}
     return link in ends or any(
         j.moves and link in (j.parent, j.child) for j in urdf.joints.values()
     )
@@ -337,18 +337,15 @@ def normals_of_closures(
     """
     if in_link_frames is None:
         return [None] * len(closures)
-    poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
     virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
     floats = virtual is not None and virtual.type == "floating"
     normals: list[Array | None] = []
     for closure in closures:
-        link = above = frame_link(urdf, closure.frame_1)
-        while above in parents and parents[above] is not virtual:
-            above = parents[above].parent
+        link = urdf.link_of(closure.frame_1)
         root, normal = (block.base, in_link_frames[0])
-        if above in parents and floats:
+        if floats and virtual in urdf.joints_above(link):
             root, normal = (block.platform, in_link_frames[1])
-        turn = poses[link].rotation.inv() * poses[root].rotation
+        turn = urdf.poses[link].rotation.inv() * urdf.poses[root].rotation
         normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
     return [None, *normals[1:]] if floats else normals
 
@@ -652,8 +649,8 @@ def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: st
             uses[joint.parent] += 1
     for closure in closures:
         for frame in (closure.frame_1, closure.frame_2):
-            if frame_link(urdf, frame) in uses:
-                uses[frame_link(urdf, frame)] += 1
+            if urdf.link_of(frame) in uses:
+                uses[urdf.link_of(frame)] += 1
     return max(links, key=lambda link: uses[link])
 
 
