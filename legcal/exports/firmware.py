@@ -246,8 +246,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         np.array([row.sign for row in rows]),
         start,
     )
-    has_height = any(p.field == "height" for p in firmware.parameters)
-    return mounted.over_bed() if has_height or not firmware.turns else mounted
+    return mounted.over_bed()
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,13 +425,6 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
 # LinuxCNC
 
 
-def linuxcnc_refusal(subject: Subject) -> str | None:
-    """Return the reason for refusing a machine that no kinematics of LinuxCNC are like, or None."""
-    refusal = hexapod_refusal(subject)
-    of_deltas = firmware_refusal("linuxcnc", subject)
-    return None if of_deltas is None else refusal and f"{refusal}, or a Delta with three motors"
-
-
 def hexapod_refusal(subject: Subject) -> str | None:
     """Return the reason for refusing a machine unsupported by genhexkins, or None."""
     machine, legs = subject.machine, subject.machine.legs
@@ -453,8 +445,6 @@ def hexapod_refusal(subject: Subject) -> str | None:
 def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
-    if machine.actuators:
-        return firmware_files("linuxcnc", subject, options, path)
     home = readings_at(machine, machine.home)
     pose = [*(_MM * machine.home.translation), *machine.home.rotation.as_euler("xyz", degrees=True)]
     lines = [

@@ -16,8 +16,8 @@ from legcal.exports.firmware import (
     firmware_refusal,
     flypt_files,
     flypt_refusal,
+    hexapod_refusal,
     linuxcnc_files,
-    linuxcnc_refusal,
 )
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
 from legcal.exports.parameter_files import csv_files, json_files, table_files
@@ -48,9 +48,9 @@ FORMATS: dict[str, Format] = {
     "table": Format(table_files),
     "csv": Format(csv_files),
     "json": Format(json_files),
-    "urdf": Format(urdf_files, options=("inertia",)),
+    "urdf": Format(urdf_files),
     "mjcf": Format(mjcf_files, mjcf_refusal),
-    "linuxcnc": Format(linuxcnc_files, linuxcnc_refusal),
+    "linuxcnc": Format(linuxcnc_files, hexapod_refusal),
     **{
         name: Format(partial(firmware_files, name), partial(firmware_refusal, name))
         for name in ("klipper", "reprapfirmware", "marlin")
@@ -59,7 +59,7 @@ FORMATS: dict[str, Format] = {
     "python": Format(python_files, kinematics_refusal),
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),
-    "ros": Format(ros_files, is_folder=True, options=("inertia",)),
+    "ros": Format(ros_files, is_folder=True),
     "correction": Format(correction_files, correction_refusal, options=("nodes",)),
 }
 _FILE = OutputFile("the export", "export", "", "a new file or --force")

@@ -35,13 +35,13 @@ _SHAPES = ("visual", "collision")
 
 def urdf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the URDF file."""
-    content, notes = urdf_text(subject.machine, inertia=options.inertia)
+    content, notes = urdf_text(subject.machine)
     return Rendered((ExportedFile("", content),), notes)
 
 
 def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the URDF and the numbers of the calibration."""
-    content, notes = urdf_text(subject.machine, inertia=options.inertia)
+    content, notes = urdf_text(subject.machine)
     name = identifier(subject.name)
     document = {
         "legcal_calibration": 1,
@@ -55,15 +55,11 @@ def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     return Rendered(files, notes)
 
 
-def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...]]:
+def urdf_text(machine: Machine) -> tuple[bytes, tuple[str, ...]]:
     """Return a self-contained URDF, and the elements left out."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     robot = etree.fromstring(machine.urdf.content, parser)
     meshes = _without_meshes(robot)
-    if inertia:
-        for link in robot.iterfind("link"):
-            if link.find("inertial") is None:
-                link.append(_stub())
     joints = machine.urdf.joints
     for i, closure in enumerate(machine.chain.closures, start=1):
         kind = "spherical" if closure.kind == "3d" else "fixed"
@@ -106,17 +102,6 @@ def _without_meshes(robot: etree._Element) -> list[str]:
             removed.append(texture.get("filename", "a texture without a name"))
             parent.remove(texture)
     return removed
-
-
-def _stub() -> etree._Element:
-    """Return an inertia accepted by simulators."""
-    inertial = etree.Element("inertial")
-    etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
-    etree.SubElement(inertial, "mass", value=repr(STUB_MASS))
-    moments = {f"i{pair}": "0.0" for pair in ("xy", "xz", "yz")}
-    moments |= {f"i{pair}": repr(STUB_INERTIA) for pair in ("xx", "yy", "zz")}
-    etree.SubElement(inertial, "inertia", moments)
-    return inertial
 
 
 def _calibration(subject: Subject) -> dict[str, object]:

@@ -27,7 +27,6 @@ RESULT_NAME = "result.json"
 class ExportOptions:
     """Options of some formats."""
 
-    inertia: bool = False  # urdf, ros: stubs of inertia in links that have none
     nodes: int | None = None  # correction: nodes of the grid along each coordinate
 
 
