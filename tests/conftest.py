@@ -104,7 +104,7 @@ def _commands_and_models_are_read_once() -> Iterator[None]:
     machines: dict[tuple[str, ...], Machine] = {}
 
     def load_once(source: Source) -> Machine:
-        if source.file.legcal is None or source.notes or source.poses is not None:
+        if source.file.legcal is None or source.notes:
             return load(source)
         key = (source.path.name, source.urdf.path.name, repr(source.file), source.urdf.text)
         if key not in machines:

@@ -6,11 +6,11 @@ classified as legs, and a closed pose is found; every check below names the mist
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problems
@@ -54,7 +54,7 @@ from legcal.machine.leg import (
     LegChain,
     redirected,
 )
-from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
+from legcal.machine.model import B_at, Machine, joint_values, readings_at, vectors_A_to_B
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
 from legcal.machine.rods import both_readings, rod_mode
@@ -87,6 +87,10 @@ from legcal.machine.urdf import Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
+TRAVEL_OF_SIZE = 0.05  # assumed travel of sliders to either side, in mean leg lengths
+_ROUNDED = 1e-4  # gap of drawn loops, relative to the machine, that is rounding
+_OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
+_SHOWN = 6  # sliders named in a note
 _NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 _DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
@@ -150,8 +154,7 @@ def load_source(source: Source) -> Machine:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
     try:
         block = file.legcal or propose_block(source, file.name_mot)
-        if block.home is None and source.poses is not None:
-            T = source.poses[block.base].inv() * source.poses[block.platform]
+        if block.home is None and (T := _drawn_home(source, block)) is not None:
             drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
             block = block.model_copy(update={"home": drawn_home})
         machine = _assemble(source, block, closures)
@@ -170,21 +173,17 @@ def load_source(source: Source) -> Machine:
         machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
     # A closed home.
     given = machine.home if block.home is not None else None
-    if given is not None and source.is_drawn_open and not machine.actuators:
-        _check_spread(machine)
-        with suppress(DidNotConverge):  # travels are better evidence than the poses of open loops
-            given = home_at_mid_travel(machine)
-            machine = replace(machine, home=given)
-            block = block.model_copy(update={"home": None})
     if given is None:
         _check_spread(machine)  # before a search for home in kilometres
         if machine.actuators:
-            q = _stated_or_middle(machine, block.home_readings or {})
+            at_home = source.drawn if file.legcal is None else {}
+            q = _stated_or_middle(machine, block.home_readings or at_home)
             given = home_at_mid_travel(machine, q)
             machine = _in_modes(machine, given, q)
     else:
         if machine.actuators:
-            q = _readings_at_home(machine, block.home_readings or {}, source.drawn)
+            at_home = {} if file.legcal is not None and file.legcal.home else source.drawn
+            q = _readings_at_home(machine, block.home_readings or {}, at_home)
             machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
@@ -197,6 +196,7 @@ def load_source(source: Source) -> Machine:
             _check_dependence(machine, closes=False)
         raise
     machine = replace(machine, home=pose, home_configuration=configuration)
+    machine, assumed = _with_travel(machine)
     _check_unit(machine)
     # The geometry must agree with Pinocchio.
     _check_across(machine)
@@ -208,7 +208,61 @@ def load_source(source: Source) -> Machine:
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
     notes = mechanism_notes(machine, home_is_given=block.home is not None)
-    return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
+    return replace(machine, diagnostics=(*source.notes, *assumed, *proposed, *notes))
+
+
+def _drawn_home(source: Source, block: LegcalBlock) -> RigidTransform | None:
+    """Return the pose that a file draws, None if its loops are open there.
+
+    Without a block ``legcal`` they may be open by what a rough drawing leaves.
+    """
+    urdf = source.urdf
+    try:
+        chain = ClosedChain(urdf.text, source.closures)
+    except ModelError as error:
+        raise error.told(lambda problem: problem.in_file(urdf.path)) from error
+    drawn = chain.neutral()
+    for joint, value in source.values.items():
+        drawn[chain.q_index(joint)] = value
+    places = [chain.pose(drawn, urdf.root, link).translation for link in urdf.links]
+    most = (_OPEN if source.file.legcal is None else _ROUNDED) * np.ptp(places, axis=0).max()
+    gap = np.abs(chain.residual(drawn)).max(initial=0.0)
+    return chain.pose(drawn, block.base, block.platform) if gap <= most else None
+
+
+def _with_travel(machine: Machine) -> tuple[Machine, list[str]]:
+    """Return a machine with an assumed travel of sliders without limits in the file, and a note."""
+    sliding = {
+        str(leg.prismatic): float(q)
+        for leg, q in zip(machine.legs, readings_at(machine, machine.home), strict=True)
+        if leg.prismatic is not None
+        and not leg.reads_angle
+        and machine.urdf.joints[leg.prismatic].limits is None
+    }
+    if not sliding:
+        return machine, []
+    reach = float(f"{TRAVEL_OF_SIZE * machine.size:.0e}")
+    travels = {name: (q - reach, q + reach) for name, q in sliding.items()}
+    robot, legs = machine.urdf.robot(), list(machine.legs)
+    for element in robot.findall("joint"):
+        if (ends := travels.get(str(element.get("name")))) is not None:
+            limit = element.find("limit")
+            limit = etree.SubElement(element, "limit") if limit is None else limit
+            for key, value in zip(("lower", "upper"), ends, strict=True):
+                limit.set(key, repr(value))
+            for key in ("effort", "velocity"):
+                limit.set(key, limit.get(key, "1000"))
+    for j, leg in enumerate(legs):
+        if (ends := travels.get(str(leg.prismatic))) is not None:
+            actuator = None if leg.actuator is None else replace(leg.actuator, travel=ends)
+            legs[j] = replace(leg, travel=ends, actuator=actuator)
+    names = ", ".join(f"'{name}'" for name in [*sliding][:_SHOWN])
+    note = (
+        f"The file gives no travel for {len(sliding)} sliders ({names}): {reach:g} m to either "
+        "side of the closed pose was assumed; add their limits."
+    )
+    urdf = machine.urdf.edited(robot, travel_needed=True)
+    return replace(machine, urdf=urdf, legs=tuple(legs)), [note]
 
 
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
@@ -234,13 +288,13 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         chains = at_visible_heights(chains, shown, bodies)
     chain = _closed_chain(urdf, closures, in_plane, block, chains)
     home = None if block.home is None else block.home.motion()
-    actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
+    actuators = _actuators(chains, block, source, ends[0])
     legs = tuple(
         leg_of(
             name,
             leg_chain,
             ends,
-            travel=_travel(leg_chain, urdf),
+            travel=_travel(leg_chain, source),
             actuated=leg_chain.motor in file.name_mot,
             spatial=normals is None,
             home=home,
@@ -299,17 +353,17 @@ def _closed_chain(
 
 
 def _actuators(
-    chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
+    chains: Sequence[LegChain], block: LegcalBlock, source: Source, T_body_base: Array
 ) -> dict[str | None, Actuator | None]:
     """Return the actuators by joint, with their numbers from the YAML."""
     stated = {
         chain.motor: actuator_of(
-            chain, T_body_base, _travel(chain, urdf), urdf.joints[str(chain.motor)].child
+            chain, T_body_base, _travel(chain, source), source.urdf.joints[str(chain.motor)].child
         )
         for chain in reversed(chains)  # its point is on the first leg
         if chain.actuator is not None
     }
-    problems = Problems(path)
+    problems = Problems(source.path)
     motors = sorted(str(motor) for motor in stated)
     for name, entry in (block.motors or {}).items():
         actuator, entry_name = stated.get(name), f"legcal.motors.{name}"
@@ -333,10 +387,15 @@ def _actuators(
     return stated
 
 
-def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
-    """Return the limits of the slider or actuator of a leg [m or rad], zero for a rod."""
-    limits = None if chain.motor is None else urdf.joints[chain.motor].limits
-    return (0.0, 0.0) if limits is None else limits
+def _travel(chain: LegChain, source: Source) -> tuple[float, float]:
+    """Return the limits of the slider or actuator of a leg [m or rad], zero for a rod.
+
+    Without limits both are its drawn value.
+    """
+    if chain.motor is None:
+        return 0.0, 0.0
+    drawn = source.values.get(chain.motor, 0.0)
+    return source.urdf.joints[chain.motor].limits or (drawn, drawn)
 
 
 def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[float]) -> Machine:

@@ -43,13 +43,15 @@ class Source:
     file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
     notes: tuple[str, ...] = ()  # notes on the conversion, one sentence each
-    values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
-    poses: Mapping[str, RigidTransform] | None = None
-    is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
-    drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
+    values: Mapping[str, float] = field(default_factory=dict)  # drawn joint values [rad or m]
     base: str | None = None  # stated links of a file without a block
     platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
+
+    @property
+    def drawn(self) -> dict[str, float]:
+        """The drawn values of the motors [rad or m]."""
+        return {motor: self.values.get(motor, 0.0) for motor in self.file.name_mot}
 
     @property
     def closures(self) -> list[Closure]:
