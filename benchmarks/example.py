@@ -7,6 +7,7 @@ alone (default criteria, and the criteria as printed), and of the joint fit; bes
 error that the fit predicts, and the normalised squared error of its parameters.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,8 @@ from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.calibration.result import Calibration
 from legcal.data.outlines import axes_from_outlines
 from legcal.machine.kinematics import pose_differences
-from legcal.machine.leg import KinematicParameters, point_like_legs
-from legcal.machine.parameters import to_vector
+from legcal.machine.leg import Leg
+from legcal.machine.parameters import geometries, to_vector
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import nominal_machine
 
@@ -26,17 +27,15 @@ TRUTH = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"
 
 
 def platform_error(
-    calibration: Calibration, parameters: KinematicParameters, truth: KinematicParameters
+    calibration: Calibration, legs: Sequence[Leg], truth: Sequence[Leg]
 ) -> tuple[float, float]:
-    """Return the mean displacement [m] and rotation [rad] between two sets of parameters."""
+    """Return the mean displacement [m] and rotation [rad] between two sets of legs."""
     measurements, machine = calibration.dataset.measurements, calibration.dataset.machine
     first_row = np.unique(measurements.pose, return_index=True)[1]
     driven = machine.sign * measurements.q[first_row]
     near = calibration.solution.T_Rb_Re
     frame_legs = machine.frame_legs
-    poses, true_poses = (
-        platform_poses(point_like_legs(p), driven, near, frame_legs) for p in (parameters, truth)
-    )
+    poses, true_poses = (platform_poses(some, driven, near, frame_legs) for some in (legs, truth))
     displacement, rotation = pose_differences(poses, true_poses)
     return float(displacement.mean()), float(rotation.mean())
 
@@ -44,32 +43,30 @@ def platform_error(
 def main() -> None:
     """Print a line an estimate."""
     dataset = load_dataset(ROOT / "examples/hexapod")
-    machine, truth = dataset.machine, load_mechanism(TRUTH).parameters
+    machine, truth = dataset.machine, geometries(load_mechanism(TRUTH))
     calibration = calibrate(dataset, use_cache=False)
     solution = calibration.solution
     radii = {cylinder.link: cylinder.radius for leg in machine.legs for cylinder in leg.cylinders}
     axes = axes_from_outlines(solution.outlines, dataset.measurements, radii)
     nominal = nominal_machine(machine)
     steps = {
-        criteria: run_steps(nominal, axes, dataset.measurements, criteria=criteria).parameters
+        criteria: run_steps(nominal, axes, dataset.measurements, criteria=criteria).legs
         for criteria in ("literal", "default")
     }
     rows = {
-        "nominal model": machine.parameters,
+        "nominal model": geometries(machine),
         "four steps, criteria as printed": steps["literal"],
         "four steps, default criteria": steps["default"],
-        "joint fit": solution.parameters,
+        "joint fit": solution.legs,
     }
-    for name, parameters in rows.items():
-        dX, dE = platform_error(calibration, parameters, truth)
+    for name, legs in rows.items():
+        dX, dE = platform_error(calibration, legs, truth)
         print(f"{name:32s} {1e3 * dX:8.3f} mm {np.degrees(dE):8.4f} deg")
     if calibration.platform is not None:  # the motors determine the pose
         sigma = calibration.platform.sigma
         dX, dE = 1e3 * sigma.mean_displacement, np.degrees(sigma.mean_rotation)
         print(f"{'predicted for the fit, 1 sigma':32s} {dX:8.3f} mm {dE:8.4f} deg")
-    error = to_vector(solution.parameters, machine.frame_legs) - to_vector(
-        truth, machine.frame_legs
-    )
+    error = to_vector(solution.legs, machine.frame_legs) - to_vector(truth, machine.frame_legs)
     n = len(error)
     pull = error / solution.estimates.sigma[:n]
     together = error @ np.linalg.solve(solution.estimates.covariance[:n, :n], error) / n

@@ -6,13 +6,13 @@ beside them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 from hexapod_sessions import plain_scene
-from machines import from_vector
+from machines import from_vector, point_like_legs
 from outline_sessions import closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -31,10 +31,8 @@ from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import (
-    KinematicParameters,
     Leg,
     LegKind,
-    point_like_legs,
 )
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
@@ -281,7 +279,7 @@ def _shaken(
 
 FRAME_LEGS = (0, 2, 4)
 RADIUS = 0.010
-TRUTH = KinematicParameters(
+TRUTH = point_like_legs(
     np.array(
         [
             [0.0, 0.0, 0.0],
@@ -313,7 +311,7 @@ class HexapodSession:
     legs: FittedLegs
     measurements: Measurements
     outlines: Outlines
-    truth: KinematicParameters
+    truth: tuple[Leg, ...]
     T_camera_Rb: tuple[RigidTransform, ...]
     T_Rb_Re: tuple[RigidTransform, ...]
 
@@ -339,7 +337,7 @@ def irregular_hexapod(
     pose = np.tile(np.arange(n_poses_per_view), n_views) if shared_poses else np.arange(n_rows)
     poses = [_pose(rng) for _ in range(int(pose.max()) + 1)]
     poses = [poses[k - k % repeats] for k in range(len(poses))]
-    A, B = TRUTH.base_joints, TRUTH.platform_joints
+    A, B = (np.array([getattr(leg, end) for leg in TRUTH]) for end in "AB")
     lengths = np.array([np.linalg.norm(T.apply(B) - A, axis=1) for T in poses])
     names = tuple(f"leg{i + 1}" for i in range(6))
     measurements = Measurements(
@@ -347,7 +345,7 @@ def irregular_hexapod(
         tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
         view,
         pose,
-        (lengths - TRUTH.offsets)[pose],
+        (lengths - [leg.q0 for leg in TRUTH])[pose],
         2e-6,
     )
     # Images show the legs whose base joints are nearest to the camera.
@@ -366,7 +364,7 @@ def irregular_hexapod(
     white = np.tile(sigma_px**2 * np.eye(2), (2 * legs_seen * n_rows, 1, 1))
     outlines = replace(outlines_of(scene), covariance=white)
     radii = {(i, "rod"): RADIUS for i in range(6)}
-    legs = FittedLegs(names, point_like_legs(TRUTH), FRAME_LEGS, radii)
+    legs = FittedLegs(names, TRUTH, FRAME_LEGS, radii)
     return HexapodSession(legs, measurements, outlines, TRUTH, T_cameras, tuple(poses))
 
 
@@ -395,16 +393,16 @@ def disturbed_start(
     xi = to_vector(session.truth, FRAME_LEGS)
     xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
     return Start(
-        point_like_legs(from_vector(xi, 6, FRAME_LEGS)),
+        from_vector(xi, 6, FRAME_LEGS),
         tuple(_shaken(T, camera, angle, rng) for T in session.T_camera_Rb),
         tuple(_shaken(T, camera, angle, rng) for T in session.T_Rb_Re),
         "nominal",
     )
 
 
-def joint_errors(parameters: KinematicParameters) -> Array:
+def joint_errors(legs: Sequence[Leg]) -> Array:
     """Return the errors of the free parameters [m]."""
-    return to_vector(parameters, FRAME_LEGS) - to_vector(TRUTH, FRAME_LEGS)
+    return to_vector(legs, FRAME_LEGS) - to_vector(TRUTH, FRAME_LEGS)
 
 
 def _camera_around(angle: float) -> RigidTransform:

@@ -14,10 +14,9 @@ from legcal.data.measurements import Measurements
 from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, axes_of_table
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import point_like_legs
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.parameters import to_vector
+from legcal.machine.parameters import geometries, to_vector
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation.observe import (
     Images,
@@ -117,15 +116,15 @@ def disturbed_hexapod(seed: int = 0, *, coplanar: bool = False) -> Machine:
 
 def nominal_of(machine: Machine) -> NominalMachine:
     """Return a machine of point-like joints as the steps take it."""
-    legs = point_like_legs(machine.parameters)
+    vector = to_vector(geometries(machine), machine.frame_legs)
+    legs = from_vector(vector, machine.n_legs, machine.frame_legs)
     return NominalMachine(machine.leg_names, legs, machine.frame_legs)
 
 
 def moved(machine: Machine, step: np.ndarray) -> NominalMachine:
     """Return a machine with all parameters changed, as the steps take it."""
-    vector = to_vector(machine.parameters, machine.frame_legs) + step
-    parameters = from_vector(vector, machine.n_legs, machine.frame_legs)
-    legs = point_like_legs(parameters)
+    vector = to_vector(geometries(machine), machine.frame_legs) + step
+    legs = from_vector(vector, machine.n_legs, machine.frame_legs)
     return NominalMachine(machine.leg_names, legs, machine.frame_legs)
 
 

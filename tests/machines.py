@@ -13,7 +13,7 @@ import legcal
 from legcal.descriptions.new_model import Created, Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, LegKind, main_cylinders
+from legcal.machine.leg import JointType, Leg, LegKind, main_cylinders
 from legcal.machine.model import Machine
 from legcal.machine.parameters import free_coordinates
 
@@ -278,9 +278,15 @@ def four_upu() -> MachineSpec:
     return MachineSpec(legs, RigidTransform.from_translation([0.0, 0.0, 0.4]))
 
 
-def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> KinematicParameters:
-    """Return the parameters of a vector in the order of :func:`to_vector`."""
+def point_like_legs(A: Array, B: Array, q0: Array) -> tuple[Leg, ...]:
+    """Return actuated legs with point-like joints, of joint centres and offsets."""
+    S, rows = JointType.SPHERICAL, zip(A, B, q0.tolist(), strict=True)
+    return tuple(Leg(S, S, LegKind.ACTUATED, *row) for row in rows)
+
+
+def from_vector(vector: Array, n_legs: int, frame_legs: Sequence[int]) -> tuple[Leg, ...]:
+    """Return point-like legs of a vector in the order of :func:`to_vector`."""
     free = free_coordinates(n_legs, frame_legs)
     base, platform = np.zeros((n_legs, 3)), np.zeros((n_legs, 3))
     base[free], platform[free], offsets = np.split(vector, [free.sum(), 2 * free.sum()])
-    return KinematicParameters(base, platform, offsets.copy())
+    return point_like_legs(base, platform, offsets)

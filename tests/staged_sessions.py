@@ -1,5 +1,6 @@
 """What the four steps take of shipped machines, and of hexapods of section 4.3."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -13,10 +14,11 @@ from legcal.calibration.identify.session import Session
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import LegAxes, axes_from_outlines
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.leg import KinematicParameters, Leg
+from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
+    geometries,
     moved_legs,
     parametrize,
     to_vector,
@@ -168,12 +170,11 @@ def noisy_session(
     return session, moved(machine, np.random.default_rng(seed).uniform(-0.002, 0.002, 30))
 
 
-def errors(parameters: KinematicParameters, machine: Machine | NominalMachine) -> Array:
+def errors(legs: Sequence[Leg], machine: Machine | NominalMachine) -> Array:
     """Return the absolute error of every parameter [m]."""
-    difference = to_vector(parameters, machine.frame_legs) - to_vector(
-        machine.parameters, machine.frame_legs
-    )
-    return np.asarray(np.abs(difference))
+    true = geometries(machine) if isinstance(machine, Machine) else machine.legs
+    found, wanted = (to_vector(some, machine.frame_legs) for some in (legs, true))
+    return np.asarray(np.abs(found - wanted))
 
 
 def staged(

@@ -14,7 +14,7 @@ from staged_sessions import Observed, errors, exact_session, noisy_session, ship
 from legcal.data.outlines import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegKind, point_like_legs
+from legcal.machine.leg import LegKind
 from legcal.machine.parameters import to_vector
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import StagedResult, run_base_steps, run_platform_steps
@@ -99,21 +99,22 @@ def test_printed_criteria_keep_their_numbers(name: str) -> None:
 
 def test_printed_criteria_are_even_in_z_of_coplanar_joints_and_accept_a_mirror_image() -> None:
     session = exact_session()
-    true, up = session.machine.parameters, np.array([1.0, 1.0, -1.0])
+    up = np.array([1.0, 1.0, -1.0])
     nominal = nominal_of(session.machine)
     flat, mirrored = (
-        replace(nominal, legs=point_like_legs(replace(
-            true, base_joints=true.base_joints * by, platform_joints=true.platform_joints * by
-        )))
+        replace(
+            nominal,
+            legs=tuple(replace(leg, A=leg.A * by, B=leg.B * by) for leg in nominal.legs),
+        )
         for by in (np.array([1.0, 1.0, 0.0]), up)
-    )  # fmt: skip
-    found = staged(session, flat, "literal").parameters
-    for joints in (found.base_joints, found.platform_joints):
+    )
+    found = staged(session, flat, "literal").machine
+    for joints in (found.A, found.B):
         assert np.abs(joints[:, 2]).max() < 1e-6
-    assert errors(found, session.machine).max() > 5e-4
-    assert errors(staged(session, mirrored, "literal").parameters, mirrored).max() < 1e-6
+    assert errors(found.legs, session.machine).max() > 5e-4
+    assert errors(staged(session, mirrored, "literal").legs, mirrored).max() < 1e-6
     with_weights = staged(session, flat)
-    assert errors(with_weights.parameters, session.machine).max() < 1e-6
+    assert errors(with_weights.legs, session.machine).max() < 1e-6
     assert with_weights.diagnostics == ()
 
 
@@ -161,8 +162,8 @@ def test_wrong_outlines_hardly_matter() -> None:
     axes = axes_from_outlines(wrong, session.measurements, session.radii)
     result = staged(replace(session, axes=axes), nominal)
     assert any("Leg leg1 in image 1 was left out" in text for text in result.diagnostics)
-    clean = errors(right.parameters, session.machine).max()
-    assert errors(result.parameters, session.machine).max() < 2.0 * clean + 1e-4
+    clean = errors(right.legs, session.machine).max()
+    assert errors(result.legs, session.machine).max() < 2.0 * clean + 1e-4
 
 
 # Invariance
@@ -203,9 +204,9 @@ def test_scaling_all_lengths_scales_the_result() -> None:
         measurements=replace(m, q=scale * m.q, sigma_q=scale * m.sigma_q),
     )
     vector = partial(to_vector, frame_legs=nominal.frame_legs)
-    scaled = from_vector(scale * vector(nominal.parameters), 6, nominal.frame_legs)
-    second = staged(larger, replace(nominal, legs=point_like_legs(scaled)))
-    apart = scale * vector(first.parameters) - vector(second.parameters)
+    scaled = from_vector(scale * vector(nominal.legs), 6, nominal.frame_legs)
+    second = staged(larger, replace(nominal, legs=scaled))
+    apart = scale * vector(first.legs) - vector(second.legs)
     assert np.abs(apart).max() < 1e-7 * scale
 
 
@@ -219,7 +220,7 @@ def test_a_motor_that_counts_backwards_changes_nothing() -> None:
     legs = tuple(replace(leg, sign=s) for leg, s in zip(nominal.legs, sign.tolist(), strict=True))
     backwards = run_base_steps(replace(nominal, legs=legs), session.axes, m)
     back = run_platform_steps(backwards, replace(m, q=m.q * sign))
-    assert np.allclose(back.parameters.offsets, forth.parameters.offsets, rtol=0.0, atol=1e-12)
+    assert np.allclose(back.machine.lengths, forth.machine.lengths, rtol=0.0, atol=1e-12)
 
 
 def test_legs_that_meet_in_one_platform_joint_are_no_pair() -> None:

@@ -49,7 +49,7 @@ from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.types import Array
-from legcal.machine.leg import ARMS, ParameterId, point_like_legs, radius_name
+from legcal.machine.leg import ARMS, ParameterId, radius_name
 from legcal.simulation.observe import moved_outlines
 
 
@@ -253,7 +253,7 @@ def test_a_leg_that_no_image_shows_is_found_from_its_encoder_whatever_its_sign()
     nominal = zip(session.legs.nominal, sign.tolist(), strict=True)
     legs = replace(session.legs, nominal=tuple(replace(leg, sign=s) for leg, s in nominal))
     found = refine(legs, measurements, shown, disturbed_start(session))
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+    assert np.abs(joint_errors(found.legs)).max() < 1e-9
     assert (2, "rod") not in found.radii
 
 
@@ -265,7 +265,7 @@ def test_errors_agree_with_the_covariance() -> None:
         rng = np.random.default_rng(seed)
         measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
         found = refine(session.legs, measurements, outlines, start)
-        error = joint_errors(found.parameters)
+        error = joint_errors(found.legs)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         z.append(error / found.estimates.sigma[: len(error)])
         scales.append(found.quality.noise.scale)
@@ -296,8 +296,8 @@ def test_the_result_is_reproduced_and_outlines_in_another_order_change_nothing(
 
 
 def vector(found: Solution) -> Array:
-    p = found.parameters
-    return np.concatenate([p.base_joints.ravel(), p.platform_joints.ravel(), p.offsets])
+    legs = found.legs
+    return np.array([[*leg.A, *leg.B, leg.q0] for leg in legs]).ravel()
 
 
 def test_the_better_start_wins_and_between_equal_ones_the_first(
@@ -327,7 +327,7 @@ def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: Hexa
     )
     assert any(f"of {wrong.sum()} of leg1 in view c2" in note for note in found.notes)
     assert not found.left_out  # other starts confirm it
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-4
+    assert np.abs(joint_errors(found.legs)).max() < 1e-4
     one_image = by * (o.row == o.row[wrong].min())[:, None]
     once = moved_outlines(o, PINHOLE, one_image)
     found = refine(small.legs, small.measurements, once, disturbed_start(small))
@@ -374,7 +374,7 @@ def session() -> HexapodSession:
 
 def at_truth(session: HexapodSession) -> Start:
     """Return a start at the truth, poses by the readings."""
-    legs, poses = point_like_legs(TRUTH), session.T_Rb_Re
+    legs, poses = TRUTH, session.T_Rb_Re
     m, cameras = session.measurements, session.T_camera_Rb
     return start_from(legs, m, session.legs, cameras, poses, "nominal")
 

@@ -16,6 +16,7 @@ from legcal.data.outlines import (
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.parameters import geometries
 from legcal.simulation.observe import (
     OutlineNoise,
     TableNoise,
@@ -57,8 +58,8 @@ def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> 
         row = int(axes.row[i])
         T_camera_Rb = session.T_camera_Rb[session.measurements.view[row]]
         pose = session.T_Rb_Re[session.measurements.pose[row]]
-        A = T_camera_Rb.apply(session.machine.parameters.base_joints[axes.leg[i]])
-        B_Rb = pose.apply(session.machine.parameters.platform_joints[axes.leg[i]])
+        A = T_camera_Rb.apply(geometries(session.machine)[axes.leg[i]].A)
+        B_Rb = pose.apply(geometries(session.machine)[axes.leg[i]].B)
         B = T_camera_Rb.apply(B_Rb)
         assert distance_to_line(A, axes.u[i], axes.M[i]) < 1e-9
         assert distance_to_line(B, axes.u[i], axes.M[i]) < 1e-9

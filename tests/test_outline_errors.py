@@ -154,7 +154,7 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     for wrong, (_, reason) in swaps.items():
         assert found.outlines.reason[wrong].reason is Reason.DISAGREES
         assert str(found.outlines.reason[wrong].detail).endswith(reason)
-    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+    assert np.abs(joint_errors(found.legs)).max() < 1e-9
 
 
 def test_errors_of_corners_are_found_in_their_residuals() -> None:
@@ -236,7 +236,7 @@ def test_shared_errors_are_found_and_weighed(session: HexapodSession) -> None:
         measurements = noisy_readings(session, rng)
         outlines = shared_errors(session, rng, 0.06, 0.03)
         found = refine(session.legs, measurements, outlines, start)
-        error = joint_errors(found.parameters)
+        error = joint_errors(found.legs)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         sizes.append(found.quality.noise.scale)
         kinds = {name.rsplit(".", 1)[1] for name in found.posterior.biases}
@@ -258,7 +258,7 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
         shift[observed.index] = sigma * rng.standard_normal(int(place.max()) + 1)[place, None]
         outlines = moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
         found = refine(session.legs, noisy_readings(session, rng), outlines, start)
-        error = joint_errors(found.parameters)
+        error = joint_errors(found.legs)
         normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
         found_px.append(found.quality.shared_px[PLACES[0]])
     assert 0.7 < np.mean(normalised) < 1.2
@@ -279,7 +279,7 @@ def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None
         )
         for polish in (-3.0, 3.0)
     )
-    np.testing.assert_allclose(joint_errors(polished.parameters), joint_errors(matte.parameters))
+    np.testing.assert_allclose(joint_errors(polished.legs), joint_errors(matte.legs))
     assert polished.quality.shared_px[PLACES[0]] == pytest.approx(0.2, rel=0.05)
     sigma, less = (np.sqrt(np.diag(one.kinematic.covariance)) for one in (polished, matte))
     assert np.median(sigma / less) > 2.0
@@ -352,7 +352,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: HexapodSession) -> 
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not given" in n for n in found.notes)
     as_linear = refine(session.legs, session.measurements, outlines, start)
-    right, wrong = (np.sqrt(np.mean(joint_errors(s.parameters) ** 2)) for s in (found, as_linear))
+    right, wrong = (np.sqrt(np.mean(joint_errors(s.legs) ** 2)) for s in (found, as_linear))
     assert right < wrong
     assert found.quality.rms_px is not None
     assert as_linear.quality.rms_px is not None

@@ -23,7 +23,6 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import (
     ARMS,
-    KinematicParameters,
     Leg,
     LegColumns,
     LegKind,
@@ -182,12 +181,14 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
 @lru_cache(maxsize=8)  # a job needs those of one or two machines dozens of times
 def geometries(machine: Machine) -> tuple[Leg, ...]:
     """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
-    parameters = machine.parameters
+    A = machine.T_base_Rb.inv().apply(machine.A_base)
+    B = machine.T_platform_Re.inv().apply([leg.B for leg in machine.legs_of_frames])
+    n_d = len(machine.frame_legs)
+    for rank, j in enumerate(machine.frame_legs):  # zero by definition, not by rounding
+        A[j, rank:n_d] = B[j, rank:n_d] = 0.0
     moved = _in_frames(machine.legs_of_frames, machine.T_base_Rb.inv(), machine.T_platform_Re.inv())
-    return tuple(
-        replace(leg, A=A, B=B)  # zero by definition, not by rounding
-        for leg, A, B in zip(moved, parameters.base_joints, parameters.platform_joints, strict=True)
-    )
+    ends = zip(moved, A, B, strict=True)
+    return tuple(replace(leg, A=A_j, B=B_j) for leg, A_j, B_j in ends)
 
 
 def legs_in_links(machine: Machine, legs: Sequence[Leg]) -> tuple[Leg, ...]:
@@ -233,12 +234,14 @@ def in_joint_frames(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg
     return _in_frames(legs, base, platform)
 
 
-def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
-    """Return parameters as one vector [m], passive or not, in the order of :func:`parametrize`."""
-    free = free_coordinates(len(parameters.offsets), frame_legs)
-    return np.concatenate(
-        [parameters.base_joints[free], parameters.platform_joints[free], parameters.offsets]
-    )
+def to_vector(legs: Sequence[Leg], frame_legs: Sequence[int]) -> Array:
+    """Return joint centres in R_b and R_e and lengths of legs, passive or not, as a vector [m].
+
+    These are all parameters of point-like joints, in the order of :func:`parametrize`.
+    """
+    free = free_coordinates(len(legs), frame_legs)
+    A, B = (np.array(points)[free] for points in ([x.A for x in legs], [x.B for x in legs]))
+    return np.concatenate([A, B, [leg.q0 for leg in legs]])
 
 
 def vector_of(
