@@ -7,29 +7,29 @@ machine closes, and completes lengths and axes of all legs there.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError, Problems
+from legcal.errors import DidNotConverge, ModelError, Problems
 from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross
-from legcal.geometry.motions import motion_of, pose_distance
-from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.equations import posture_constraints
+from legcal.machine.closing import project_pose
+from legcal.machine.home import homes_at_mid_travel, in_modes, readings_at_home, stated_or_middle
 from legcal.machine.leg import (
-    EquationKind,
     JointType,
     Leg,
     LegKind,
 )
+from legcal.machine.loader import machine_of_legs
+from legcal.machine.model import Machine
 from legcal.machine.parameters import n_frame_legs
-from legcal.machine.rods import actuators_of, both_readings, joints_at
-from legcal.machine.solver import postures_after, solve
 from legcal.machine.topology import widest
+from legcal.machine.urdf import Wording
 
 MAX_NUMBER = 1e9  # largest number of a description, in any unit
 _TYPE = re.compile(r"([PR])([RUS])([RUS])|([RUS])(P?)([RUS]?)")
@@ -263,11 +263,6 @@ def _check_travel(
     problems.raise_if_any()
 
 
-TRIALS = 40
-APART = 0.1  # least distance of two poses that are not the same [sizes of the machine, rad]
-LIKELY = 1.2  # turn of a pose that is as likely as home, relative to that of home
-CLOSED = 1e-10  # largest residual of a closed pose, relative to the size of the machine
-ROUNDING = 1e-13
 MAX_HOME_RESIDUAL = 0.01  # of a stated home, relative to the size; rounded digits give less
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
@@ -307,14 +302,15 @@ class Assembled(Description):
 
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
-    home, notes = home_of_description(described)
+    machine = _legs_alone(described)
+    home, q_home, notes = _at_home(described, machine)
     T = home.motion()
-    closure = _ClosingEquations(described, mid_travel=False)
-    readings = closure.readings_of_motors(T)
+    actuators = zip(described.legs, q_home, strict=True)
+    readings = {leg.actuator.joint: q for leg, q in actuators if leg.actuator is not None}
     A = np.array([_at(leg, readings) for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
-    _check_travel(described, lengths, closure.actuators, readings)
+    _check_travel(described, lengths, machine.actuators, readings)
     u = (B - A) / lengths[:, None]
     tangents = np.array([across_leg(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
     if all_revolute(described):
@@ -337,12 +333,7 @@ def assemble(described: Description) -> Assembled:
         legs.append(AssembledLeg(**(vars(entry) | numbers), u=u[j], q0=q0, q_home=q))
     problems.raise_if_any()
     planar = all_revolute(described) and is_planar(legs, T)
-    frame = described.base_frame
-    if frame is None:
-        ends = np.array([(leg.A_base, leg.B_platform) for leg in legs])
-        motors = [leg.name if leg.actuator is None else leg.actuator.joint for leg in legs]
-        n_d = min(n_frame_legs(spatial=not _in_a_plane(legs)), len(legs))
-        frame = tuple(legs[j].name for j in widest(ends[:, 0], ends[:, 1], motors, n_d))
+    frame = described.base_frame or tuple(machine.leg_names[j] for j in machine.frame_legs)
     at_home = {name: readings[name] for name in described.home_readings}
     numbers = {"legs": tuple(legs), "home": home, "base_frame": frame, "home_readings": at_home}
     numbers["notes"] = (*described.notes, *notes)
@@ -405,166 +396,103 @@ def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
     return q0, free if entry.travel is None else entry.travel
 
 
-def home_of_description(described: Description) -> tuple[Home, list[str]]:
-    """Return a pose in which a machine closes, projected onto what its legs keep constant.
-
-    If no home is given, all motors are at the middle of their travel; among such poses the one with
-    the smallest rotation of the platform is taken, and of mirror images in the plane of the base
-    joints the one on the positive side of z. A note names another pose that is as likely.
-    """
-    if described.home is not None:
-        return _project(described, described.home), []
-    closure = _ClosingEquations(described, mid_travel=True)
-    homes = _search(closure, turning=False) or _search(closure, turning=True)
-    if not homes:
-        raise ModelError(
-            f"{described.source}: no home was found: no pose has all motors at the middle of "
-            "their travel with their axes in place, needed a pose in which the machine closes; "
-            "write home, or correct the joints, offsets or travel."
-        )
-    poses = [home.motion() for home in homes[:2]]
-    where = [
-        f"({', '.join(f'{round(1e3 * x) + 0:d}' for x in T.translation)}) mm, turned by "
-        f"{round(T.rotation.as_euler('ZYX', degrees=True)[0]) + 0:d} deg about z"
-        for T in poses
-    ]
-    note = (
-        f"Two poses have all motors at mid-travel: home is {' and not '.join(where)}. If yours is "
-        "the other, give --height, or in the table home (YAML) or the joints of the platform as "
-        "they are at home in the base link ('B1 (home)')."
+def words_of(described: Description) -> Wording:
+    """Return the words for messages about a table."""
+    return Wording(
+        home="home of the table",
+        no_home="the table has no home",
+        state_home="write home, or correct the joints, offsets or travel",
+        correct_home="correct home",
+        state_readings="write home_readings (of arms home_readings_deg) in the table",
+        correct_unit=f"lengths are in {described.unit}: check the numbers and the unit",
     )
-    return homes[0], [note] if len(homes) > 1 else []
 
 
-class _ClosingEquations:
-    """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
+def _legs_alone(described: Description) -> Machine:
+    """Return a machine of the legs alone, without a URDF, for the search of its home.
 
-    Unknown are the pose and the readings of motors that carry joints; the readings are fixed if
-    home is at mid-travel. Residuals are relative to the size of the machine.
+    Joints without a stated axis constrain nothing yet, but in a plane.
     """
-
-    def __init__(self, described: Description, *, mid_travel: bool) -> None:
-        self.planar = all_revolute(described)
-        self.stated = described.home_readings
-        legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
-        self.legs = tuple(leg for leg in legs if leg.n_constraints)
-        self.actuators = actuators_of(self.legs)
-        self.still: Array | None = None
-        if mid_travel:
-            middles = [self.stated.get(a.joint, 0.5 * sum(a.travel)) for a in self.actuators]
-            self.still = np.array(middles)
-        self.A = np.array([leg.A for leg in legs])
-        self.B = np.array([leg.B for leg in legs])
-        lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
-        spread = max(float(np.ptp(points, axis=0).max()) for points in (self.A, self.B))
-        self.size = max(spread, 1e-3, *lengths)
-        turns = [1.0 if actuator.turns else self.size for actuator in self.actuators]
-        self.unit = np.array([1.0] * 3 + [self.size] * 3 + turns)
-
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Return residuals (k, m) and derivatives (k, m, 6 + n) at poses and n readings."""
-        poses, q = points[:, :12].reshape(-1, 3, 4), points[:, 12:]
-        if not self.legs:
-            return np.zeros((len(q), 0)), np.zeros((len(q), 0, 6))
-        R, t = poses[:, :, :3], poses[:, :, 3]
-        with np.errstate(invalid="ignore"):  # a leg without length has no direction
-            equations = posture_constraints(self.legs, R, t, q)
-        values = [equations.values / self.size]
-        slopes = [np.concatenate([equations.by_pose, equations.by_q], axis=2) / self.size]
-        if self.still is not None:
-            slopes[0][:, :, 6:] = 0.0
-        for leg in self.legs if self.planar else ():
-            if leg.base_axis is not None and leg.platform_axis is not None:
-                turned = R @ leg.platform_axis
-                values.append(cross(leg.base_axis, turned))
-                slope = -cross_matrices(leg.base_axis) @ cross_matrices(turned)
-                slopes.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
-        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
-
-    def readings_of_motors(self, T: RigidTransform) -> dict[str, float]:
-        """Return the readings of motors that carry joints at a pose, by their first rods.
-
-        Of the two readings at which a rod reaches the pose the one inside the travel is taken, or
-        the one nearer to the stated reading.
-        """
-        readings = dict[str, float]()
-        for leg in self.legs:
-            actuator = leg.actuator
-            if actuator is None or actuator.joint in readings:
-                continue
-            (low, high), near = actuator.travel, self.stated.get(actuator.joint)
-            readings[actuator.joint] = min(
-                both_readings(leg, T.apply(leg.B)),
-                key=lambda q: max(low - q, q - high, 0.0) if near is None else abs(q - near),
+    source, normal = Path(described.source), np.array([0.0, 0.0, 1.0])
+    first = described.legs[0]
+    of_plane = [normal if v is None else v for v in (first.base_axis, first.platform_axis)]
+    axes = [v for leg in described.legs for v in (leg.base_axis, leg.platform_axis)]
+    in_plane = all_revolute(described) and all(
+        v is None or np.linalg.norm(cross(v, n)) < PARALLEL
+        for v, n in zip(axes, of_plane * len(described.legs), strict=True)
+    )
+    planes = of_plane if in_plane else (None, None)
+    A, B = _joints(described)
+    wide = 4.0 * max(float(np.ptp(points, axis=0).max()) for points in (A, B))
+    legs = []
+    for entry in described.legs:
+        is_rod = entry.kind is LegKind.CONSTANT and entry.offset is not None
+        free = (0.0, wide) if entry.travel is None else entry.travel
+        base_axis, platform_axis = (
+            stated if stated is not None else plane
+            for stated, plane in zip((entry.base_axis, entry.platform_axis), planes, strict=True)
+        )
+        legs.append(
+            Leg(
+                entry.type.base,
+                entry.type.platform,
+                LegKind.PASSIVE if entry.kind is LegKind.CONSTANT and not is_rod else entry.kind,
+                entry.A_base,
+                entry.B_platform,
+                entry.offset or 0.0,
+                base_axis,
+                platform_axis,
+                name=entry.name,
+                prismatic=entry.name,
+                travel=free if entry.actuator is None else entry.actuator.travel,
+                actuator=entry.actuator,
             )
-        return readings
-
-    def readings_at(self, T: RigidTransform) -> Array:
-        """Return the readings (n,) at a pose: fixed ones, or those of the first rods."""
-        if self.still is not None:
-            return self.still
-        return np.array([*self.readings_of_motors(T).values()])
-
-    def _point(self, T: RigidTransform) -> Array:
-        """Return a pose with its readings, (1, 12 + n)."""
-        return np.concatenate([T.as_matrix()[:3].ravel(), self.readings_at(T)])[None]
-
-    def residual(self, T: RigidTransform) -> float:
-        """Return the largest residual at a pose."""
-        return float(np.abs(self(self._point(T))[0]).max(initial=0.0))
-
-    def nearest(self, T: RigidTransform) -> RigidTransform:
-        """Return the nearest pose that closes, as far as steps get nearer to one."""
-        solution = solve(
-            self, postures_after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30
         )
-        pose = solution.points[0, :12].reshape(3, 4)
-        return motion_of(pose[:, :3], pose[:, 3])
-
-    def describe(self, T: RigidTransform) -> list[str]:
-        """Return the residuals at a pose in words."""
-        matrix, q = T.as_matrix()[None], self.readings_at(T)[None]
-        equations = posture_constraints(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], q)
-        (A,) = joints_at(self.legs, q)
-        words, lengths = list[str](), dict[str, list[str]]()  # lengths: legs with the same residual
-        for j, kind, value in zip(equations.leg, equations.kinds, equations.values[0], strict=True):
-            leg = self.legs[j]
-            length = float(np.linalg.norm(T.apply(leg.B) - A[j]))
-            if kind is EquationKind.LENGTH:
-                if abs(value) > CLOSED * self.size:
-                    off = f"{1e3 * length:.6g} mm long instead of {1e3 * leg.q0:.6g} mm"
-                    lengths.setdefault(off, []).append(leg.name)
-                continue
-            angle = np.degrees(np.arccos(min(1.0, abs(float(value)) / length)))
-            if 90.0 - angle > 1e-6:
-                side = "base" if kind is EquationKind.BASE_AXIS else "platform"
-                words.append(
-                    f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
-                    "instead of 90 deg, which an R joint needs,"
-                )
-        words[:0] = [f"{legs_in_words(names)} {off}" for off, names in lengths.items()]
-        return words or ["axes of a planar mechanism that are not parallel"]
+    motors = [leg.motor_label for leg in legs]
+    n_d = min(n_frame_legs(spatial=not in_plane), len(legs))
+    frame_legs = widest(A, B, motors, n_d)
+    normals = (of_plane[0], of_plane[1]) if in_plane else None
+    return machine_of_legs(source, legs, frame_legs, normals, words_of(described))
 
 
-def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
-    """Return a leg with its length at home, passive if any length will do."""
-    length = entry.offset if entry.kind is LegKind.CONSTANT else None
-    if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
-        length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
-    z = np.array([0.0, 0.0, 1.0]) if planar else None
-    return Leg(
-        entry.type.base,
-        entry.type.platform,
-        LegKind.PASSIVE if length is None else LegKind.CONSTANT,
-        entry.A_base,
-        entry.B_platform,
-        0.0 if length is None else length,
-        z if entry.base_axis is None else entry.base_axis,
-        z if entry.platform_axis is None else entry.platform_axis,
-        travel=(0.0, 0.0) if entry.actuator is None else entry.actuator.travel,
-        name=entry.name,
-        actuator=entry.actuator,
-    )
+def _at_home(described: Description, machine: Machine) -> tuple[Home, list[float], list[str]]:
+    """Return a closed pose, the readings of legs there, and notes.
+
+    A stated home is moved onto what the legs keep constant. Without one all motors are at the
+    middle of their travel; a note names another such pose that is as likely.
+    """
+    stated, notes = described.home_readings, list[str]()
+    if described.home is None:
+        try:
+            q = stated_or_middle(machine, stated)
+            (T, *others), mirrored = homes_at_mid_travel(machine, q)
+        except DidNotConverge as error:
+            raise ModelError(error.facts) from error
+        if others := [*others, *([] if mirrored is None else [mirrored])]:
+            where = [
+                f"({', '.join(f'{round(1e3 * x) + 0:d}' for x in T.translation)}) mm, turned by "
+                f"{round(T.rotation.as_euler('ZYX', degrees=True)[0]) + 0:d} deg about z"
+                for T in (T, others[0])
+            ]
+            notes = [
+                f"Two poses have all motors at mid-travel: home is {' and not '.join(where)}. If "
+                "yours is the other, give --height, or in the table home (YAML) or the joints of "
+                "the platform as they are at home in the base link ('B1 (home)')."
+            ]
+        return _written(T), q, notes
+    T = described.home.motion()
+    machine = replace(machine, home=T)
+    q = readings_at_home(machine, stated, {})
+    closed, problem = project_pose(in_modes(machine, T, q), T)
+    if problem is not None:
+        raise ModelError(
+            "home could not be used",
+            f"{problem} there",
+            "a pose in which the machine closes",
+            "correct home, lengths or axes",
+            described.source,
+        )
+    return described.home if closed is T else _written(closed), q, notes
 
 
 def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
@@ -573,59 +501,6 @@ def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
         return entry.A_base
     q = np.array([readings[entry.actuator.joint]])
     return np.asarray(entry.actuator.at(entry.A_base, q)[0])
-
-
-def _project(described: Description, home: Home) -> Home:
-    """Return the closed pose nearest to home."""
-    closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
-    if closure.residual(T) < ROUNDING:
-        return home
-    if closure.residual(T) < MAX_HOME_RESIDUAL:
-        T = closure.nearest(T)
-    if closure.residual(T) < CLOSED:
-        return _written(T)
-    raise ModelError(
-        [
-            f"{described.source}: home could not be used: found {residual} there, needed a pose in "
-            "which the machine closes; correct home, lengths or axes."
-            for residual in closure.describe(home.motion())
-        ]
-    )
-
-
-def _search(closure: _ClosingEquations, *, turning: bool) -> list[Home]:
-    """Return the best pose that seeded starts lead to, and others that are as likely as home."""
-    rng = np.random.default_rng(1965)
-    centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
-    n_trials = TRIALS if turning else 8
-    still = np.zeros(0) if closure.still is None else closure.still
-    starts = np.zeros((n_trials, 3, 4))
-    for trial in range(n_trials):
-        shift = rng.normal(0.0, 1.0, 3) if trial else np.array([0.0, 0.0, 1.0])
-        starts[trial, :, 3] = centre + closure.size * shift
-        turn = rng.normal(0.0, 0.3, 3) if turning else np.zeros(3)
-        starts[trial, :, :3] = Rotation.from_rotvec(turn).as_matrix()
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        values, slopes = closure(points)
-        slopes[:, :, :3] *= turning
-        return values, slopes
-
-    points = np.concatenate([starts.reshape(-1, 12), np.tile(still, (n_trials, 1))], axis=1)
-    solution = solve(
-        equations, postures_after, points, tolerance=1e-15, unit=closure.unit, damped=True
-    )
-    closed, best = list[tuple[float, RigidTransform]](), list[tuple[float, RigidTransform]]()
-    for pose in solution.points[solution.worst <= CLOSED, :12].reshape(-1, 3, 4):
-        T = motion_of(pose[:, :3], pose[:, 3])
-        below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
-        closed.append((10.0 * below + float(T.rotation.magnitude()), T))
-    for rank, T in sorted(closed, key=lambda entry: round(entry[0], 6)):
-        upright = rank % 10.0 if T.translation[2] > -1e-9 else rank
-        apart = [max(np.divide(pose_distance(T, other), (closure.size, 1.0))) for _, other in best]
-        if not best or (min(apart) > APART and upright < LIKELY * best[0][0] + APART):
-            best.append((rank, T))
-    return [_written(closure.nearest(T)) for _, T in best]
 
 
 def _written(T: RigidTransform) -> Home:

@@ -17,7 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
+from legcal.descriptions.description import (
+    Assembled,
+    AssembledLeg,
+    Description,
+    assemble,
+    leg_type,
+    words_of,
+)
 from legcal.descriptions.table import BESIDE, described_machine, read_description
 from legcal.errors import LegcalError, Problem, UsageError
 from legcal.files.folder import new_files, with_schema
@@ -39,7 +46,6 @@ from legcal.machine.spanning_tree import (
     origin_xml_at,
     visual_xml,
 )
-from legcal.machine.urdf import Wording
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
 SHORTEST, LONGEST = 0.8, 1.2  # range of leg lengths, relative to the length at home
@@ -616,15 +622,9 @@ def create_model(
 
 def _load(path: Path, temporary: Path, described: Description) -> Machine:
     """Load the files in the temporary folder; errors name the source instead, in its words."""
-    words = Wording(
-        home="home of the table",
-        correct_home="correct home",
-        state_readings="write home_readings (of arms home_readings_deg) in the table",
-        correct_unit=f"lengths are in {described.unit}: check the numbers and the unit",
-    )
     try:
         source = read_source(path)
-        return load_source(replace(source, urdf=replace(source.urdf, wording=words)))
+        return load_source(replace(source, urdf=replace(source.urdf, wording=words_of(described))))
     except LegcalError as error:
         raise error.told(
             lambda problem: _attributed_to_source(problem, temporary, described.source)

@@ -5,7 +5,7 @@ converted). The links are grouped into rigid bodies, chains of joints between ba
 classified as legs, and a closed pose is found; every check below names the mistake in the file.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problems
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
-from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
@@ -41,7 +40,14 @@ from legcal.machine.equations import (
 )
 from legcal.machine.files import LegcalBlock, MechanismFile
 from legcal.machine.formats import read_source
-from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
+from legcal.machine.home import (
+    check_home_travel,
+    closed_home,
+    home_at_mid_travel,
+    in_modes,
+    readings_at_home,
+    stated_or_middle,
+)
 from legcal.machine.inspection import mechanism_notes, proposal_notes
 from legcal.machine.leg import (
     MAX_LEGS,
@@ -51,13 +57,13 @@ from legcal.machine.leg import (
     MIN_RADIUS,
     EquationKind,
     JointType,
+    Leg,
     LegChain,
     redirected,
 )
-from legcal.machine.model import B_at, Machine, joint_values, readings_at, vectors_A_to_B
+from legcal.machine.model import Machine, joint_values, readings_at, vectors_A_to_B
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
-from legcal.machine.rods import both_readings, rod_mode
 from legcal.machine.shapes import (
     at_visible_heights,
     occluders_of,
@@ -83,7 +89,7 @@ from legcal.machine.topology import (
     propose_block,
     propose_frame,
 )
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import Urdf, Wording, parse_urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
@@ -177,14 +183,14 @@ def load_source(source: Source) -> Machine:
         _check_spread(machine)  # before a search for home in kilometres
         if machine.actuators:
             at_home = source.drawn if file.legcal is None else {}
-            q = _stated_or_middle(machine, block.home_readings or at_home)
+            q = stated_or_middle(machine, block.home_readings or at_home)
             given = home_at_mid_travel(machine, q)
-            machine = _in_modes(machine, given, q)
+            machine = in_modes(machine, given, q)
     else:
         if machine.actuators:
             at_home = {} if file.legcal is not None and file.legcal.home else source.drawn
-            q = _readings_at_home(machine, block.home_readings or {}, at_home)
-            machine = _in_modes(machine, machine.home, q)
+            q = readings_at_home(machine, block.home_readings or {}, at_home)
+            machine = in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
@@ -263,6 +269,35 @@ def _with_travel(machine: Machine) -> tuple[Machine, list[str]]:
     )
     urdf = machine.urdf.edited(robot, travel_needed=True)
     return replace(machine, urdf=urdf, legs=tuple(legs)), [note]
+
+
+def machine_of_legs(
+    path: Path,
+    legs: Sequence[Leg],
+    frame_legs: Sequence[int],
+    normals: Normals | None,  # of a plane of motion, in the links of base and platform
+    wording: Wording,
+) -> Machine:
+    """Return a machine of legs alone, without a URDF, for a search of its home."""
+    urdf = parse_urdf(path, b'<robot name="legs"><link name="base"/></robot>')
+    base_normal, platform_normal = normals or (None, None)
+    return Machine(
+        name=path.stem,
+        yaml_path=path,
+        urdf_path=path,
+        base=urdf.root,
+        platform=urdf.root,
+        platform_joint=None,
+        legs=tuple(legs),
+        frame_legs=tuple(frame_legs),
+        spatial=normals is None,
+        home=RigidTransform.identity(),
+        home_configuration=np.zeros(0),
+        chain=ClosedChain(urdf.text, []),
+        urdf=replace(urdf, wording=wording),
+        base_normal=base_normal,
+        platform_normal=platform_normal,
+    )
 
 
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
@@ -396,83 +431,6 @@ def _travel(chain: LegChain, source: Source) -> tuple[float, float]:
         return 0.0, 0.0
     drawn = source.values.get(chain.motor, 0.0)
     return source.urdf.joints[chain.motor].limits or (drawn, drawn)
-
-
-def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[float]) -> Machine:
-    """Return the machine with its rods on actuators in the mode of a pose and joint values."""
-    B = B_at(machine, T_base_platform.as_matrix()[None])[0]
-    legs = tuple(
-        leg if leg.actuator is None else replace(leg, mode=rod_mode(leg, float(q_j), B_j))
-        for leg, q_j, B_j in zip(machine.legs, q, B, strict=True)
-    )
-    return replace(machine, legs=legs)
-
-
-def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
-    """Refuse readings at home of joints that are no actuators."""
-    joints, problems = sorted(a.joint for a in machine.actuators), Problems(machine.yaml_path)
-    for name in given:
-        if name not in joints:
-            problems.add(
-                f"legcal.home_readings.{name} could not be used",
-                "no actuator of that name",
-                f"one of {', '.join(joints)}",
-                closest(name, joints),
-            )
-    problems.raise_if_any()
-
-
-def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
-    """Return the readings of legs for a search for home: as *given*, else mid-travel."""
-    _check_home_readings(machine, given)
-    return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
-
-
-def _readings_at_home(
-    machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
-) -> list[float]:
-    """Return the joint values at home: as *given* for actuators, else those within the travel.
-
-    If both readings at which a rod reaches the platform are within the travel, the one *drawn* in
-    the file is taken; without one they are refused.
-    """
-    path = machine.yaml_path
-    _check_home_readings(machine, given)
-    B = B_at(machine, machine.home.as_matrix()[None])[0]
-    q = [0.0] * machine.n_legs
-    for j, leg in enumerate(machine.legs):
-        if leg.actuator is None:
-            continue
-        joint = leg.actuator.joint
-        readings = both_readings(leg, B[j])
-        size, unit = SHOWN_IN[leg.reading_unit]
-        choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
-        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
-        near = given.get(joint)
-        if near is not None and not leg.in_travel(np.array([near]))[0]:
-            raise ModelError(
-                f"legcal.home_readings.{joint} could not be used",
-                f"{near:g} {leg.reading_unit}, outside the travel of "
-                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                f"the one of {choices} at home",
-                f"correct it{', in radians' * leg.reads_angle}",
-                path,
-            )
-        if near is None and all(inside):
-            near = drawn.get(joint)
-            if near is None and abs(np.diff(readings)[0]) > 1e-6 * np.ptp(leg.travel):
-                raise ModelError(
-                    f"the assembly of leg '{leg.name}' at home is ambiguous",
-                    f"that its rod reaches the platform at {choices} of '{joint}', both inside "
-                    "its travel",
-                    "one",
-                    f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
-                    path,
-                )
-        if near is None:
-            near = readings[inside.index(True)] if any(inside) else 0.5 * sum(leg.travel)
-        q[j] = min(readings, key=lambda x: abs(x - near))
-    return q
 
 
 def _legs_in_order(
