@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, ModelError, Problems
-from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
+from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
@@ -105,27 +105,16 @@ class Description:
     source: str  # origin of the description, for messages: a path, or --family
     unit: str  # unit of the description, for messages
     legs: tuple[LegEntry, ...]  # the legs in order
-    home: "Home | None"  # T_base_platform of a pose in which it closes
+    home: MotionEntry | None  # T_base_platform of a pose in which it closes
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
     notes: tuple[str, ...] = ()  # assumptions
     home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
 
 
-@dataclass(frozen=True, eq=False)
-class Home:
-    """A pose with its numbers as written."""
-
-    xyz: tuple[float, ...]  # position [m]
-    quat_xyzw: tuple[float, ...]  # unit quaternion, to its digits
-
-    @classmethod
-    def of(cls, xyz: tuple[float, ...], turn: Rotation) -> "Home":
-        """Return a home with the quaternion of a rotation, rounded as in files."""
-        return cls(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
-
-    def motion(self) -> RigidTransform:
-        """Return T_base_platform."""
-        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
+def home_of(xyz: Sequence[float], turn: Rotation) -> MotionEntry:
+    """Return a home with the quaternion of a rotation, rounded as in files."""
+    quat = turn.as_quat(canonical=True).tolist()
+    return MotionEntry.model_validate({"xyz": xyz, "quat_xyzw": quat})
 
 
 def legs_in_words(names: Sequence[str]) -> str:
@@ -148,7 +137,7 @@ def home_at_height(described: Description, height: float, turn: Rotation | None)
         turn = Rotation.from_euler("z", angle, degrees=True)
     middle = A.mean(axis=0) - turn.apply(B.mean(axis=0))
     x, y = (round(float(value), 3) + 0.0 for value in middle[:2])
-    return replace(described, home=Home.of((x, y, height), turn))
+    return replace(described, home=home_of((x, y, height), turn))
 
 
 def joints_from_base(described: Description) -> Description:
@@ -161,7 +150,7 @@ def joints_from_base(described: Description) -> Description:
         replace(leg, B_platform=np.round(leg.B_platform - origin, 12) + 0.0)
         for leg in described.legs
     )
-    home = Home.of(tuple(origin.tolist()), Rotation.identity())
+    home = home_of(tuple(origin.tolist()), Rotation.identity())
     note = (
         "Platform joints are in coordinates of the base at home: the platform link stands in their "
         f"middle, ({', '.join(f'{1e3 * x:.6g}' for x in origin)}) mm in the base link."
@@ -181,7 +170,7 @@ def check_links(described: Description, problems: Problems) -> None:
     A, B = _joints(described)
     apart = float(np.linalg.norm(B.mean(axis=0) - A.mean(axis=0)))
     if 2.0 * apart < np.linalg.norm(B - A, axis=1).mean() or not _closes(
-        described, Home.of((0.0, 0.0, 0.0), Rotation.identity())
+        described, home_of((0.0, 0.0, 0.0), Rotation.identity())
     ):
         return
     middle = ", ".join(f"{x:g}" for x in np.round(1e3 * B.mean(axis=0), 2) + 0.0)
@@ -201,7 +190,7 @@ def _joints(described: Description) -> tuple[Array, Array]:
     return A, np.array([leg.B_platform for leg in described.legs])
 
 
-def _closes(described: Description, home: Home) -> bool:
+def _closes(described: Description, home: MotionEntry) -> bool:
     """Return whether all motors are inside their travel at a pose."""
     A, B = _joints(described)
     lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
@@ -290,7 +279,7 @@ class Assembled(Description):
     """A machine with all its numbers; home is a pose in which it closes, as in the file."""
 
     legs: tuple[AssembledLeg, ...]
-    home: Home
+    home: MotionEntry
     base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
     planar: bool  # motion in the xy plane of base and platform
 
@@ -455,7 +444,9 @@ def _legs_alone(described: Description) -> Machine:
     return machine_of_legs(source, legs, frame_legs, normals, words_of(described))
 
 
-def _at_home(described: Description, machine: Machine) -> tuple[Home, list[float], list[str]]:
+def _at_home(
+    described: Description, machine: Machine
+) -> tuple[MotionEntry, list[float], list[str]]:
     """Return a closed pose, the readings of legs there, and notes.
 
     A stated home is moved onto what the legs keep constant. Without one all motors are at the
@@ -503,8 +494,8 @@ def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
     return np.asarray(entry.actuator.at(entry.A_base, q)[0])
 
 
-def _written(T: RigidTransform) -> Home:
+def _written(T: RigidTransform) -> MotionEntry:
     """Return a computed pose for a file, without the rounding noise of its zeros."""
     entry = motion_to_xyz_quat(T)
     clean = {key: [x if abs(x) > 1e-13 else 0.0 for x in value] for key, value in entry.items()}
-    return Home(tuple(clean["xyz"]), tuple(clean["quat_xyzw"]))
+    return MotionEntry.model_validate(clean)

@@ -42,17 +42,17 @@ from legcal.descriptions.description import (
     MAX_NUMBER,
     NEEDED_TYPE,
     Description,
-    Home,
     LegEntry,
     LegType,
     check_links,
     home_at_height,
+    home_of,
     joints_from_base,
     leg_type,
     legs_in_words,
 )
 from legcal.errors import BadValue, Code, DatasetError, ModelError, Problem, Problems
-from legcal.files.motions import Quaternion, Vector
+from legcal.files.motions import MotionEntry, Quaternion, Vector
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
     FileSchema,
@@ -706,13 +706,13 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
     return np.asarray(axis / np.linalg.norm(axis))
 
 
-def _home(file: TableFile) -> Home | None:
+def _home(file: TableFile) -> MotionEntry | None:
     if file.home is None or file.home.xyz is None:
         return None
     xyz = tuple(file.metres(file.home.xyz))
     if file.home.quat_xyzw is not None:
-        return Home(xyz, file.home.quat_xyzw)
-    return Home.of(xyz, _turn(file.home))
+        return MotionEntry(xyz=xyz, quat_xyzw=file.home.quat_xyzw)
+    return home_of(xyz, _turn(file.home))
 
 
 def _turn(home: HomeEntry) -> Rotation:

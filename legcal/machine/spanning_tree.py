@@ -19,7 +19,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
-from legcal.files.schema import closest
+from legcal.files.schema import closest, unused_name
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.chain import Closure
@@ -73,12 +73,7 @@ class UrdfBuilder:
 
     def unused(self, name: str, others: Set[str] = frozenset()) -> str:
         """Return a name unused by links and joints: the given one, or it with a number."""
-        taken = self.links.keys() | self.joints.keys() | others
-        number, unused = 1, name
-        while unused in taken:
-            number += 1
-            unused = f"{name}_{number}"
-        return unused
+        return unused_name(name, self.links.keys() | self.joints.keys() | others)
 
     def link(self, name: str, visuals: str = "") -> None:
         """Add or replace a link with its visuals."""
