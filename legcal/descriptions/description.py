@@ -19,14 +19,20 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
 from legcal.machine.closing import project_pose
-from legcal.machine.home import homes_at_mid_travel, in_modes, readings_at_home, stated_or_middle
+from legcal.machine.home import (
+    check_home_travel,
+    homes_at_mid_travel,
+    in_modes,
+    readings_at_home,
+    stated_or_middle,
+)
 from legcal.machine.leg import (
     JointType,
     Leg,
     LegKind,
 )
 from legcal.machine.loader import machine_of_legs
-from legcal.machine.model import Machine
+from legcal.machine.model import Machine, readings_at
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.topology import widest
 from legcal.machine.urdf import Wording
@@ -192,67 +198,18 @@ def _joints(described: Description) -> tuple[Array, Array]:
 
 def _closes(described: Description, home: MotionEntry) -> bool:
     """Return whether all motors are inside their travel at a pose."""
-    A, B = _joints(described)
-    lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
-    return all(
-        leg.offset + leg.travel[0] - _SLACK * length
-        <= length
-        <= leg.offset + leg.travel[1] + _SLACK * length
-        for leg, length in zip(described.legs, lengths.tolist(), strict=True)
-        if leg.offset is not None and leg.travel is not None
-    )
+    try:
+        check_home_travel(replace(_legs_alone(described), home=home.motion()), 0.0)
+    except ModelError:
+        return False
+    return True
 
 
-_SLACK = 2.5e-9  # tolerance of lengths, relative to the leg
 _MANY = 3  # legs that hardly all fit by chance
 ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if they coincide
 
 
-def _check_travel(
-    described: Description,
-    lengths: Array,
-    actuators: Sequence[Actuator],
-    readings: Mapping[str, float],
-) -> None:
-    """Refuse leg lengths and readings of motors that carry joints outside their travel at home.
-
-    The sizes of legs and radii are checked when the model is loaded.
-    """
-    outside = list[tuple[str, float, float, float]]()
-    for leg, length in zip(described.legs, lengths.tolist(), strict=True):
-        if leg.kind is LegKind.CONSTANT or leg.travel is None:
-            continue
-        low, high = ((leg.offset or 0.0) + end for end in leg.travel)
-        if not low - _SLACK * length <= length <= high + _SLACK * length:
-            outside.append((leg.name, 1e3 * length, 1e3 * low, 1e3 * high))
-    problems, start = Problems(described.source), "{} cannot close at home"
-    if outside:
-        names, lengths_there, lows, highs = zip(*outside, strict=True)
-        shortest, longest = min(lengths_there), max(lengths_there)
-        there = f"{shortest:.6g} mm" + f" to {longest:.6g} mm" * (longest - shortest > 1e-6)
-        problems.add(
-            start.format(legs_in_words(names)),
-            f"the length {there} there",
-            f"{min(lows):.6g} to {max(highs):.6g} mm (offset plus travel)",
-            "correct home, offsets or travel, and their unit",
-        )
-    for actuator in actuators:
-        q, stated = readings[actuator.joint], described.home_readings.get(actuator.joint)
-        scale, unit = SHOWN_IN[actuator.unit]
-        low, high = actuator.travel
-        is_other = stated is not None and abs(q - stated) > MAX_HOME_RESIDUAL * (high - low)
-        if is_other or max(low - q, q - high) * scale > 1e-6:
-            needed = f"one in its travel of {scale * low:.6g} to {scale * high:.6g} {unit}"
-            problems.add(
-                start.format(f"motor '{actuator.joint}'"),
-                f"the reading {scale * q:.6g} {unit} there",
-                f"that of home_readings, {scale * (stated or 0.0):.6g} {unit}" * is_other or needed,
-                "correct home or home_readings" if is_other else "correct home, lengths or travel",
-            )
-    problems.raise_if_any()
-
-
-MAX_HOME_RESIDUAL = 0.01  # of a stated home, relative to the size; rounded digits give less
+MAX_OFF = 0.01  # of a stated reading at home, relative to the travel
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
 
@@ -291,15 +248,25 @@ class Assembled(Description):
 
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
-    machine = _legs_alone(described)
-    home, q_home, notes = _at_home(described, machine)
+    machine, home, notes = _at_home(described)
     T = home.motion()
-    actuators = zip(described.legs, q_home, strict=True)
-    readings = {leg.actuator.joint: q for leg, q in actuators if leg.actuator is not None}
+    check_home_travel(machine, 0.0)
+    q_home = zip(described.legs, readings_at(machine, T).tolist(), strict=True)
+    readings = {leg.actuator.joint: q for leg, q in reversed([*q_home]) if leg.actuator is not None}
+    for actuator in machine.actuators:
+        q, stated = readings[actuator.joint], described.home_readings.get(actuator.joint)
+        if stated is not None and abs(q - stated) > MAX_OFF * np.ptp(actuator.travel):
+            scale, unit = SHOWN_IN[actuator.unit]
+            raise ModelError(
+                f"home_readings.{actuator.joint} could not be used",
+                f"{scale * stated:.6g} {unit}",
+                f"the reading {scale * q:.6g} {unit} at home",
+                "correct home or home_readings",
+                described.source,
+            )
     A = np.array([_at(leg, readings) for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
-    _check_travel(described, lengths, machine.actuators, readings)
     u = (B - A) / lengths[:, None]
     tangents = np.array([across_leg(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
     if all_revolute(described):
@@ -391,7 +358,8 @@ def words_of(described: Description) -> Wording:
         home="home of the table",
         no_home="the table has no home",
         state_home="write home, or correct the joints, offsets or travel",
-        correct_home="correct home",
+        correct_home="correct home, its joints, offsets or travel, and their unit,",
+        readings="home_readings",
         state_readings="write home_readings (of arms home_readings_deg) in the table",
         correct_unit=f"lengths are in {described.unit}: check the numbers and the unit",
     )
@@ -444,15 +412,13 @@ def _legs_alone(described: Description) -> Machine:
     return machine_of_legs(source, legs, frame_legs, normals, words_of(described))
 
 
-def _at_home(
-    described: Description, machine: Machine
-) -> tuple[MotionEntry, list[float], list[str]]:
-    """Return a closed pose, the readings of legs there, and notes.
+def _at_home(described: Description) -> tuple[Machine, MotionEntry, list[str]]:
+    """Return the legs in a closed pose, the pose as files have it, and notes.
 
     A stated home is moved onto what the legs keep constant. Without one all motors are at the
     middle of their travel; a note names another such pose that is as likely.
     """
-    stated, notes = described.home_readings, list[str]()
+    machine, stated, notes = _legs_alone(described), described.home_readings, list[str]()
     if described.home is None:
         try:
             q = stated_or_middle(machine, stated)
@@ -470,11 +436,12 @@ def _at_home(
                 "yours is the other, give --height, or in the table home (YAML) or the joints of "
                 "the platform as they are at home in the base link ('B1 (home)')."
             ]
-        return _written(T), q, notes
+        home = _written(T)
+        return replace(in_modes(machine, T, q), home=home.motion()), home, notes
     T = described.home.motion()
     machine = replace(machine, home=T)
-    q = readings_at_home(machine, stated, {})
-    closed, problem = project_pose(in_modes(machine, T, q), T)
+    machine = in_modes(machine, T, readings_at_home(machine, stated, {}))
+    closed, problem = project_pose(machine, T)
     if problem is not None:
         raise ModelError(
             "home could not be used",
@@ -483,7 +450,8 @@ def _at_home(
             "correct home, lengths or axes",
             described.source,
         )
-    return described.home if closed is T else _written(closed), q, notes
+    home = described.home if closed is T else _written(closed)
+    return replace(machine, home=home.motion()), home, notes
 
 
 def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:

@@ -45,6 +45,7 @@ _CLOSED = 1e-9  # residual of a closed pose, in leg lengths
 _REGULAR = 1e-4  # singularity measure above which motors hold the platform
 # A home is refused if it is outside the travel by more than both.
 MAX_OUTSIDE = 1.0  # relative to the travel
+_ROUNDED = 2.5e-9  # excess that is rounding [rad], and relative to the leg length
 _MAX_OUTSIDE_OF_LEG = 0.01  # relative to the leg length at home, for sliders with little travel
 
 
@@ -231,10 +232,10 @@ def readings_at_home(
         near = given.get(joint)
         if near is not None and not leg.in_travel(np.array([near]))[0]:
             raise ModelError(
-                f"legcal.home_readings.{joint} could not be used",
-                f"{near:g} {leg.reading_unit}, outside the travel of "
+                f"{machine.urdf.wording.readings}.{joint} could not be used",
+                f"{near:g} {leg.reading_unit}",
+                f"the one of {choices} at home that is in the travel of "
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                f"the one of {choices} at home",
                 f"correct it{', in radians' * leg.reads_angle}",
                 path,
             )
@@ -357,24 +358,24 @@ def _unlikely(machine: Machine, T: RigidTransform) -> float:
     return penalty
 
 
-def check_home_travel(machine: Machine) -> None:
+def check_home_travel(machine: Machine, share: float = MAX_OUTSIDE) -> None:
     """Check that a stated home is not far outside the travel of its motors.
 
     Raises
     ------
     ModelError
-        If an actuated leg is outside its travel by more than the travel itself and by more than
-        1 % of its length, or a motor that carries rods by more than its travel.
+        If an actuated leg is outside its travel by more than a *share* of the travel, and of 1 % of
+        its length, or a motor that carries rods by more than that share of its travel.
     """
     far: dict[int, float] = {}
     q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)
-    for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
+    for j, excess in legs_outside(machine, share).items():
         leg = machine.legs[j]
         if leg.actuator is not None:  # rods may share an actuator
-            is_far = actuators[j] not in {actuators[k] for k in far}
+            is_far = actuators[j] not in {actuators[k] for k in far} and excess > _ROUNDED
         else:
-            allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
-            is_far = leg.kind is LegKind.ACTUATED and excess > allowed
+            allowed = max(share * _MAX_OUTSIDE_OF_LEG, _ROUNDED) * leg.length_at(float(q[j]))
+            is_far = leg.kind is LegKind.ACTUATED and excess > abs(allowed)
         if is_far:
             far[j] = excess
     if not far:
@@ -387,11 +388,14 @@ def check_home_travel(machine: Machine) -> None:
         more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
         others = f" ({len(far) - 1} more {more} as far off)"
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
+    if leg.actuator is None:
+        reading += f", {1e3 * leg.length_at(float(q[worst])):.6g} mm long,"
     raise ModelError(
-        "legcal.home could not be used",
+        f"{machine.urdf.wording.home} could not be used",
         f"{name} at {reading} there{others}",
-        f"a reading near its travel of {travel}",
-        f"correct legcal.home or the limits of the {'slider' if leg.actuator is None else 'motor'}",
+        f"a reading {'near' if share else 'in'} its travel of {travel}",
+        f"{machine.urdf.wording.correct_home} or the limits of the "
+        f"{'slider' if leg.actuator is None else 'motor'}",
         machine.yaml_path,
     )
 

@@ -262,6 +262,7 @@ class Wording:
     no_home: str = "legcal.home is not given"
     state_home: str = "write legcal.home"
     correct_home: str = "correct legcal.home"
+    readings: str = "legcal.home_readings"
     state_readings: str = "write legcal.home_readings with the reading of each actuator at home"
     state_ends: str = "write legcal.base, legcal.platform and legcal.legs"
     correct_ends: str = "correct legcal.base or legcal.platform"
