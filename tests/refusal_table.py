@@ -1198,7 +1198,8 @@ def _described() -> Iterable[Refusal]:
         # what does not fit together, once the machine is put together
         ("length-negative", {"offsets": -380}, ("'leg2'", "at 836.", "2 more", "offset")),
         ("no-home", {"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "mid-travel")),
-        ("open-at-home", sps | {"offsets": 100}, ("'leg2'", "456.088 mm long", "2 more", "0.00 to 150.00 mm")),
+        ("open-at-home", sps | {"offsets": 100},
+         ("'leg2'", "456.088 mm long", "2 more", "0.00 to 150.00 mm")),
         ("passive-metres", sps | {"unit": "m", "kinds": "passive", "offsets": None, "travel": None},
          ("'leg1'", "unit")),
         ("one-line", sps | {"base_joints": [[300, 0, 0], [0, 0, 0], [-300, 0, 0]]}, ("one line",)),

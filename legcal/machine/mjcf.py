@@ -32,11 +32,10 @@ from legcal.machine.spanning_tree import (
     UrdfBuilder,
     close_loops,
     mesh_xml,
-    moving_groups,
     origin_xml,
     visual_xml,
 )
-from legcal.machine.urdf import MJCF, Urdf, XmlProblems, number_list, parse_urdf, parse_xml
+from legcal.machine.urdf import MJCF, XmlProblems, number_list, parse_urdf, parse_xml
 
 WORLD = "world"
 MAX_PARTS = 5000
@@ -92,11 +91,8 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     frames, kinds = close_loops(loops, reader.tree, path)
     name = root.get("model", "").strip() or path.stem
     urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
-    urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)
-    notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
-    values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
     file = MechanismFile(closed_loop=frames, type=kinds, name_mot=motors)
-    return Source(path, file, replace(urdf, wording=MJCF), notes * bool(dropped), values)
+    return Source(path, file, replace(urdf, wording=MJCF), values=reader.references)
 
 
 class MjcfReader:
@@ -612,28 +608,6 @@ class MjcfReader:
 
 def _attributes_of(element: etree._Element) -> dict[str, str]:
     return {str(key): str(value) for key, value in element.attrib.items()}
-
-
-def _without_loose_bodies(
-    urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
-) -> tuple[Urdf, list[str]]:
-    """Return the tree without free bodies outside all closures, and the names of these."""
-    moved = {j.child for j in urdf.joints.values() if j.moves and j.type != "floating"}
-    loose = {
-        link
-        for links, closed in moving_groups(urdf, frames)
-        if not closed and moved.isdisjoint(links)
-        for link in links
-    }
-    if not loose:
-        return urdf, []
-    joints = [j for j in urdf.joints.values() if j.child in loose]
-    for joint in joints:
-        del tree.joints[joint.name]
-    for link in loose:
-        del tree.links[link]
-    freed = [f"'{j.child}'" for j in joints if j.type == "floating"]
-    return parse_urdf(urdf.path, tree.robot(name), travel_needed=False), freed
 
 
 def _z_onto(direction: Array) -> Rotation:

@@ -22,9 +22,9 @@ from legcal.geometry.types import Array
 from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
 from legcal.machine.classification import (
     classify_leg,
+    gap,
     is_actuator,
     joint_tolerance,
-    nearest,
     off_square,
     parallel,
     undirected,
@@ -547,15 +547,10 @@ def _is_an_arm(steps: list[Step], within: float) -> bool:
     """Return whether joints form an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
-    if len(steps) == 1:
-        return True
-    for lower, upper in pairwise(steps):
-        near, far = nearest(
-            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
-        )
-        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
-            return True
-    return False
+    return len(steps) == 1 or any(
+        gap(Axis("", *lower.line(lower.far)), Axis("", *upper.line(upper.near))) > within
+        for lower, upper in pairwise(steps)
+    )
 
 
 def _name(connection: Connection) -> str:
