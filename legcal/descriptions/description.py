@@ -26,11 +26,7 @@ from legcal.machine.home import (
     readings_at_home,
     stated_or_middle,
 )
-from legcal.machine.leg import (
-    JointType,
-    Leg,
-    LegKind,
-)
+from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.loader import machine_of_legs
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.parameters import n_frame_legs
@@ -207,8 +203,6 @@ def _closes(described: Description, home: MotionEntry) -> bool:
 
 _MANY = 3  # legs that hardly all fit by chance
 ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if they coincide
-
-
 MAX_OFF = 0.01  # of a stated reading at home, relative to the travel
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
