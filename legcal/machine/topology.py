@@ -13,6 +13,7 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import OutOfClass, Problem
@@ -453,21 +454,15 @@ def _several_bodies(
     joint, a part of the platform by the joints of several legs.
     """
     base, platform = ends
-    reached, new = {body}, [body]
-    on_base, on_platform = list[Connection](), list[Connection]()
-    while new:
-        here = new.pop()
-        for connection in bodies.connections:
-            if here not in connection.bodies:
-                continue
-            there = connection.bodies[1 - connection.bodies.index(here)]
-            if there == base:
-                on_base.append(connection)
-            elif there == platform:
-                on_platform.append(connection)
-            elif there not in reached:
-                reached.add(there)
-                new.append(there)
+    groups = DisjointSet(name for c in bodies.connections for name in c.bodies)
+    for connection in bodies.connections:
+        if {*connection.bodies}.isdisjoint(ends):
+            groups.merge(*connection.bodies)
+    group = groups.subset(body)
+    on_base, on_platform = (
+        [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
+        for end in (base, platform)
+    )
     if len(on_platform) != 1:
         return None
     if len(on_base) == 1:
