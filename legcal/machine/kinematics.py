@@ -50,8 +50,6 @@ from legcal.machine.ties import machine_ties
 CONTRACTION = 0.5  # largest step relative to the one before; for the first, to 1 rad or leg length
 MIN_STEP = 1.0 / 4096.0  # least step, relative to the path between readings
 LONG_STEP = 1.0 / 16.0  # least step of a first attempt, with a fallback
-RANDOM_ANGLES = 6  # random starts for the angles of all legs
-FEW_RESTARTS = 2  # restarts of single legs that do not close
 MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit is wrong
 MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
 FEW_STEPS = 12  # largest number of Newton steps
@@ -580,19 +578,13 @@ def _closed_at(
     It is the one that Newton steps lead to from the start, if they lead to the pose. The platform
     is free only if slightly inexact axes require it.
     """
-    chain, rng = machine.chain, np.random.default_rng(1965)
-    angles = chain.rotation_columns()
-    turns = np.zeros((1 + RANDOM_ANGLES, chain.nv))
-    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, chain.nv))[:, angles]
-    tries = [(turns[0], True), *[(turns[0], False)] * is_constrained(machine)]
-    tries += [(turn, True) for turn in turns[1:]]
 
     def trials() -> Iterator[Array]:
         if sliders:
             yield start.copy()
-        for turn, exact in tries:
+        for exact in (True, False)[: 1 + is_constrained(machine)]:
             with suppress(DidNotConverge):
-                yield close_at(machine, T, chain.integrate(start, turn), FEW_RESTARTS, exact=exact)
+                yield close_at(machine, T, start, exact=exact)
 
     equations, retract = closure_equations(machine, None, machine.size, free)
     for trial in trials():
