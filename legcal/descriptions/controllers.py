@@ -37,7 +37,6 @@ MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
 LARGEST_EFFECTOR = 0.8  # as EFFECTOR
 LARGEST_TRIM = 0.05  # of a rod, in its length
-DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
 
 
