@@ -1007,9 +1007,9 @@ def _new() -> Iterable[Refusal]:
         ("home", entry(home={"xyz": [0, 0, 440]}), ("home",)),
         ("legs", entry(legs=["a", "a", "b"]), ("legs", "'a'")),
         ("one-point", entry(base_joints=[[1, 2, 3]] * 3), ()),
-        ("millimetres", entry(offsets=0.38, travel=[0, 0.15]), ("leg1", "unit")),
+        ("millimetres", entry(offsets=0.38, travel=[0, 0.15]), ("'leg2'", "2 more", "unit")),
         ("thin", entry(radius=0.014), ("leg1", "radius")),
-        ("across", entry(base_axes=[[0, 1, 0.1], None, None]), ("leg1", "90 deg")),
+        ("across", entry(base_axes=[[0, 1, 0.1], None, None]), ("leg1", "axis at the base")),
     ]  # fmt: skip
     yield from _spoiled("table", f"new {{in}}/{file} -o {{out}}", "tables", rows)
     head, row = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
@@ -1077,17 +1077,19 @@ def _described() -> Iterable[Refusal]:
         ("one-leg", {"base_joints": [[1, 2, 3]]}, ("base_joints", "at least 2")),
         ("frame-twice", {"base_frame": ["leg1", "leg1", "leg2"]},
          ("base_frame", "'leg1' more than once")),
-        ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),
+        ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "2 legs", "needed 3")),
         ("no-xyz", {"home": {"rpy_deg": [0, 0, 0]}}, ("home.xyz",)),
         ("fixed-axis", {"type": "UP", "platform_axes": [[1, 0, 0]] * 3}, ("axis", "fixed")),
         ("two-points", pairs, ("'leg1' and 'leg2'", "same two points")),
         ("rod-length", rod | {"lengths": [None, 455, 455]}, ("lengths", "'leg2'")),
+        ("rod-apart", rod | {"lengths": [None, None, 600]}, ("'leg3'", "144 mm off its")),
         # what does not fit together, once the machine is put together
-        ("length-negative", {"offsets": -380}, ("length of -0.38 m", "offset")),
-        ("no-home", {"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "middle")),
-        ("open-at-home", sps | {"offsets": 100}, ("'leg1'", "close at home", "100 to 250 mm")),
+        ("length-negative", {"offsets": -380}, ("'leg2'", "at 836.", "2 more", "offset")),
+        ("no-home", {"offsets": 10, "travel": [0, 20], "home": None}, ("no home", "mid-travel")),
+        ("open-at-home", sps | {"offsets": 100},
+         ("'leg2'", "456.088 mm long", "2 more", "0.00 to 150.00 mm")),
         ("passive-metres", sps | {"unit": "m", "kinds": "passive", "offsets": None, "travel": None},
-         ("base joints",)),
+         ("'leg1'", "unit")),
         ("one-line", sps | {"base_joints": [[300, 0, 0], [0, 0, 0], [-300, 0, 0]]}, ("one line",)),
         ("axis-along", {"type": "UPS", "base_axes": [[-120, 0, 440], None, None]},
          ("'leg1'", "along the leg")),
@@ -1119,9 +1121,9 @@ def _described() -> Iterable[Refusal]:
         ("no-length", {"lengths": None}, ("'leg1'", "no length")),
         ("point-on-axis", arm1(point=[320, 0, 0]),
          ("'leg1'", "on the axis of 'arm1'", "needed an arm")),
-        ("home-below", {"home": below}, ("'leg5', 'leg6' 702.718 mm long", "400 mm there")),
-        ("travel-at-home", arm1(travel_deg=[40, 70]), ("'arm1'", "20 and", "40 to 70 deg")),
-        ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
+        ("home-below", {"home": below}, ("303 mm off its constant length",)),
+        ("travel-at-home", arm1(travel_deg=[40, 70]), ("'arm1'", "at 20.00", "40.00 to 70.00 deg")),
+        ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "both inside", "home_readings")),
         ("reading-of-arm", {"home_readings": {"arm1": 1}}, ("home_readings.arm1", "no such carri")),
     ]  # fmt: skip
     for name, changed, named in of_motors:
@@ -1196,6 +1198,7 @@ def _exports() -> Iterable[Refusal]:
     rows: Words = [
         ("rod", "hexapod-rod --to linuxcnc -o {out}", ("leg6", those)),
         ("model", "hexapod --to correction -o {out}", ("needed a result", those)),
+        ("rails", "hexaglide --to linuxcnc -o {out}", ("'rail1' moves joints at A",)),
         ("prs", "3-prs --to reprapfirmware -o {out}", ("found 3 rods on them, needed a Delta",)),
         ("arms", "delta --to marlin -o {out}", ("motors that turn", "three linear motors")),
         ("folder", "hexapod --to table -o {in}", ("a folder",)),

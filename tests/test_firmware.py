@@ -90,34 +90,6 @@ MARLIN_HEADER = """
   #define DELTA_DIAGONAL_ROD_TRIM_TOWER { 0.2, -0.3, 0.1 }
 #endif
 """
-LINUXCNC = """
-[TRAJ]
-LINEAR_UNITS = mm
-[HAL]
-setp lineardeltakins.R 130.25
-setp lineardeltakins.L 269.5
-[JOINT_0]
-HOME_OFFSET = 412.5
-[JOINT_1]
-HOME_OFFSET = 413.0
-[JOINT_2]
-HOME_OFFSET = 411.75
-"""
-LINUXCNC_ARMS = """
-[TRAJ]
-LINEAR_UNITS = mm
-[HAL]
-setp rotarydeltakins.platformradius 40.5
-setp rotarydeltakins.footradius 0
-setp rotarydeltakins.thighlength 160
-setp rotarydeltakins.shinlength 320.5
-[JOINT_0]
-HOME_OFFSET = -30
-[JOINT_1]
-HOME_OFFSET = -31
-[JOINT_2]
-HOME_OFFSET = -29.5
-"""
 DUET_AS_MARLIN = """
 M555 P2 ; set output to look like Marlin
 M569 P0 S1
@@ -131,8 +103,6 @@ CONFIGURATIONS = {
     "reprapfirmware": DUET,
     "reprapfirmware-arms": DUET_ARMS,
     "marlin": MARLIN,
-    "linuxcnc": LINUXCNC,
-    "linuxcnc-arms": LINUXCNC_ARMS,
 }
 
 
@@ -195,10 +165,6 @@ def test_files_that_a_configuration_names_are_read_in_their_place(tmp_path: Path
     named = "[include ./axes/in*.cfg] # towers\n[include z-*.cfg]\n[include no/*.cfg]\n"
     file = tmp_path / "printer.cfg"
     assert firmware_table(file, named + KLIPPER[printer:]) == firmware_table(file, KLIPPER)
-    setp = LINUXCNC.partition("[HAL]\n")[2].partition("[JOINT_0]")[0]
-    (tmp_path / "delta.hal").write_text(setp)
-    ini = LINUXCNC.replace(setp, "HALFILE = delta.hal\n")
-    assert firmware_table(file, ini) == firmware_table(file, LINUXCNC)
 
 
 DOCUMENTED = {
@@ -206,12 +172,6 @@ DOCUMENTED = {
     "klipper": ([209.6, 330, 90.45], 168.2, [330.25, 330.75, 330.25], [301.35, 300.9, 300.6]),
     "reprapfirmware": ([209.6, 330.25, 90.1], 131.15, [289.1, 288.7, 289.4], [305.55, 305, 305.05]),
     "marlin": ([210.12, 329.69, 90.05], 124.3, [250.6, 250.1, 250.5], [253.1, 252.7, 253.45]),
-    "linuxcnc": (
-        [90, 210, 330],
-        130.25,
-        [269.5] * 3,
-        (np.array([412.5, 413, 411.75]) - np.sqrt(269.5**2 - 130.25**2)).tolist(),
-    ),
 }
 ARMS = {
     # and the arms, the heights of their shafts, the endstops as height or angle
@@ -223,7 +183,6 @@ ARMS = {
         [210.3, 329.8, 90.15], 48.2, [221, 220.4, 220.7], [101.5, 101.2, 100.9],
         [242, 242.5, 241.6], [62.2, 61.7, 62.1],
     ),
-    "linuxcnc-arms": ([270, 30, 150], 40.5, [320.5] * 3, [160] * 3, [0] * 3, [30, 31, 29.5]),
 }  # fmt: skip
 
 
@@ -232,12 +191,10 @@ def test_readings_are_the_positions_of_motors_that_the_firmware_documents(
     name: str, tmp_path: Path
 ) -> None:
     machine = machine_of(CONFIGURATIONS[name], tmp_path)
-    nozzle = np.array([12.0, -34.0, -300.0 if name == "linuxcnc-arms" else 56.0])
+    nozzle = np.array([12.0, -34.0, 56.0])
     pose = RigidTransform.from_translation(1e-3 * nozzle)
     q = inverse_kinematics(machine, pose)[::2]
     tops = np.array([actuator.travel[1] for actuator in machine.actuators])
-    if name == "linuxcnc-arms":  # counts downwards
-        q, tops = -q, -np.array([actuator.travel[0] for actuator in machine.actuators])
     numbers_of_all: dict[str, Any] = DOCUMENTED | ARMS
     angles, radius, rods, *others = numbers_of_all[name]
     towers = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.radians(angles)]
@@ -452,8 +409,6 @@ REFUSED = [
     (INI.replace("inch", "cubits") + pins(), {}, ("LINEAR_UNITS = cubits",)),
     (INI.replace("inch", "mm") + pins() + "\n" + joints(380.0, (400.0, 700.0)), {},
      ("limits of 400 to 700", "one unit")),
-    (without(LINUXCNC, "UNITS"), {}, ("no unit", "LINEAR_UNITS", "--unit mm or in")),
-    (LINUXCNC.partition("[JOINT_1]")[0], {}, ("no HOME_OFFSET in [JOINT_1]", "home switch")),
     (without(FLYPT, "RigL1"), {}, ("no positive L1 and L2 and L3", "'L1: 1030'")),
     (FLYPT.replace("LinearHexapod", "RotaryHexapod"), {}, ("RotaryHexapod", "LinearHexapod")),
     (FLYPT.replace("<NUDMiddle>860", "<NUDMiddle>33"), {}, ("Middle 33", "all in mm")),

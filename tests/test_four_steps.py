@@ -202,7 +202,7 @@ def test_a_motor_that_counts_backwards_changes_nothing() -> None:
     legs = tuple(replace(leg, sign=s) for leg, s in zip(nominal.legs, sign.tolist(), strict=True))
     backwards = run_base_steps(replace(nominal, legs=legs), session.axes, m)
     back = run_platform_steps(backwards, replace(m, q=m.q * sign))
-    assert np.allclose(back.parameters.offsets, forth.parameters.offsets, rtol=0.0, atol=1e-12)
+    assert np.allclose(back.machine.lengths, forth.machine.lengths, rtol=0.0, atol=1e-12)
 
 
 def test_legs_that_meet_in_one_platform_joint_are_no_pair() -> None:

@@ -28,6 +28,7 @@ from legcal import (
 from legcal.data.outlines import read_observations
 from legcal.errors import NotVisible, UsageError
 from legcal.files.motions import motion_from_xyz_quat
+from legcal.machine.parameters import geometries
 from legcal.perception.board_adjustment import camera_poses_by_board
 from legcal.perception.board_corners import find_corners
 from legcal.simulation.cameras import mild_lens
@@ -58,9 +59,12 @@ def test_the_dataset_has_the_nominal_model_and_the_truth_beside_it(made: Simulat
     assert (dataset.measurements.n_rows, dataset.measurements.n_poses) == (24, 24)
     assert np.array_equal(dataset.machine.A_base, load_mechanism("hexapod").A_base)
     assert dataset.machine.yaml_path.is_relative_to(made.folder)
-    for name in ("base_joints", "platform_joints"):
-        errors = getattr(made.truth.parameters, name) - getattr(made.nominal.parameters, name)
-        assert 1e-3 < np.abs(errors).max() <= 2e-3 + 1e-12
+    for end in ("A", "B"):
+        true, nominal = (
+            np.array([getattr(leg, end) for leg in geometries(machine)])
+            for machine in (made.truth, made.nominal)
+        )
+        assert 1e-3 < np.abs(true - nominal).max() <= 2e-3 + 1e-12
 
 
 def test_outlines_scatter_about_the_true_ones_as_their_covariance_says(

@@ -80,8 +80,7 @@ def test_a_session_is_that_of_the_paper(name: str) -> None:
     error = m.q_of_poses - true
     assert 2.5e-6 < np.abs(error).max() <= 3e-6
     assert m.sigma_q == pytest.approx(3e-6 / np.sqrt(3.0))
-    joints = (machine.parameters.base_joints, machine.parameters.platform_joints)
-    height = np.abs(np.concatenate(joints)[:, 2]).max()
+    height = max(abs(joint[2]) for leg in geometries(machine) for joint in (leg.A, leg.B))
     assert height == pytest.approx(0.0 if name == "coplanar" else 0.030, abs=1e-12)
 
 

@@ -339,9 +339,10 @@ def test_errors_of_one_kind_do_not_depend_on_those_of_another(tmp_path: Path) ->
     hexapod = load_mechanism("hexapod")
     errors = ParameterErrors(Spread(2e-3), Spread(2e-3), coplanar=True)
     true = write_true_model(hexapod, errors, np.random.default_rng(5), tmp_path)
-    for joints in (true.parameters.base_joints, true.parameters.platform_joints):
+    legs = geometries(true)
+    for joints in (np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])):
         assert np.abs(joints[:, 2]).max() < 1e-15
-        assert np.abs(joints - hexapod.parameters.base_joints).max() > 1e-4
+        assert np.abs(joints - [leg.A for leg in geometries(hexapod)]).max() > 1e-4
 
 
 def test_radii_of_the_true_legs_are_drawn_and_nothing_else_with_them(tmp_path: Path) -> None:

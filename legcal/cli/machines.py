@@ -405,12 +405,6 @@ def export(
         Path,
         typer.Option("--output", "-o", metavar="PATH", help="The file to write; of ros a folder."),
     ],
-    inertia: Annotated[
-        bool,
-        typer.Option(
-            "--inertia", help="urdf, ros: give links without inertia a stub, for simulators."
-        ),
-    ] = False,
     nodes: Annotated[
         int | None,
         typer.Option(help="correction: nodes along each coordinate; by default by freedoms."),
@@ -426,7 +420,7 @@ def export(
         source,
         to,
         output,
-        options=ExportOptions(inertia=inertia, nodes=nodes),
+        options=ExportOptions(nodes=nodes),
         force=force,
     )
     lines = [f"written: {path}" for path in exported.paths] + list(exported.notes)

@@ -37,7 +37,6 @@ MIN_APART = 30.0  # [deg] between two towers
 SIZES = (30.0, 5000.0)  # rods [mm]
 LARGEST_EFFECTOR = 0.8  # as EFFECTOR
 LARGEST_TRIM = 0.05  # of a rod, in its length
-DOWN = 70.0  # [deg] of an arm below the horizontal, where neither bed nor limit is stated
 _BEFORE_CODE = re.compile(r"^\s*(?:Recv:\s*)?(?:N\d+|echo:)?\s*")  # in logs of hosts
 
 
@@ -75,9 +74,7 @@ def firmware_table(
     text = _with_named_files(path, text)
     for reads in _DELTAS:
         if (read := reads(path, text)) is not None:
-            if read.unit is None and read.firmware.name != "linuxcnc":
-                unit = unit or "mm"
-            unit = _unit(path, read.unit, unit)
+            unit = _unit(path, read.unit, unit if read.unit else unit or "mm")
             return _table_of_delta(path, read, unit, effector)
     hexapod = linuxcnc_table(path, text, given) or flypt_table(path, text, given, unit)
     if hexapod is None:
@@ -338,25 +335,6 @@ def _speaker(path: Path, text: str, values: Mapping[str, float]) -> str:
     )
 
 
-def _linuxcnc(path: Path, text: str) -> Configuration | None:
-    """Return the numbers of the kinematics of Deltas in a HAL file, or one with its INI lines."""
-    found = re.findall(rf"^\s*setp\s+((\w+)deltakins\.\w+)\s+({NUMBER})", text, re.MULTILINE)
-    if not found:
-        return None
-    values = {pin: float(number) for pin, _, number in found}
-    entries = ini_entries(text)
-    for key, words in entries.items():
-        if number := re.match(NUMBER, words):
-            values[key] = float(number[0])
-    return Configuration(
-        _named("linuxcnc", turns=found[0][1] == "rotary"),
-        values,
-        unit=linuxcnc_unit(path, entries),
-        effector=values.get("rotarydeltakins.footradius") or None,
-        lowest=-values.get("JOINT_0.MAX_LIMIT", DOWN) if found[0][1] == "rotary" else None,
-    )
-
-
 # --- Deltas -------------------------------------------------------------------------------------
 
 _WORDS = {
@@ -413,8 +391,6 @@ def _needed(firmware: Firmware, p: Parameter) -> str:
     """Return the meaning of a parameter."""
     if p.field != "stop" or not firmware.stops_are_motors:
         return _WORDS[p.field]
-    if p.key.startswith("JOINT"):
-        return "the position of the joint at its home switch"
     return "the lowest and highest angle of the arms"
 
 
@@ -449,14 +425,13 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
             "motors that move the nozzle from there to the bed; correct the numbers of the "
             "endstops, or the unit of lengths."
         )
-    sense = -1.0 if firmware.counts_down else 1.0
-    travels = np.sort(sense * np.stack([low, at_stops], axis=1), axis=1).tolist()
+    travels = np.stack([low, at_stops], axis=1).tolist()
     motors: list[dict[str, Any]] = [{"direction": [0, 0, 1], "travel": q} for q in travels]
     if ideal.turns:
         shafts = ((ideal.radius + r)[:, None] * out + centre).tolist()
         motors = [
             {"point": point, "axis": axis, "travel_deg": q}
-            for point, axis, q in zip(shafts, (-sense * along).tolist(), travels, strict=True)
+            for point, axis, q in zip(shafts, (-along).tolist(), travels, strict=True)
         ]
     ends = ideal.positions(np.stack([np.asarray(low), at_stops]))[:, 2]
     thick = float(np.round(ROD * np.mean(ideal.rod), 2))
@@ -482,8 +457,7 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
         f"{thick:g} {unit} of the rods (--leg-radius). Where rods are looked for in photographs "
         "depends on these, the numbers of the firmware do not.",
         f"A reading is {'the angle of an arm' if ideal.turns else 'the height of a carriage'} as "
-        f"{firmware.title} counts it, the endstop the {'lower' if sense < 0.0 else 'upper'} end of "
-        "the travel.",
+        f"{firmware.title} counts it, the endstop the upper end of the travel.",
     )
 
 
@@ -569,7 +543,6 @@ _DELTAS: Sequence[Callable[[Path, str], Configuration | None]] = (
     _klipper,
     _marlin_header,
     _g_code,
-    _linuxcnc,
 )
 
 
@@ -604,9 +577,8 @@ def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | N
     if kinematics != "genhexkins":
         raise ModelError(
             f"{path}: the LinuxCNC configuration could not be used: found KINEMATICS = "
-            f"{kinematics}, needed genhexkins, or setp lines of lineardeltakins or "
-            "rotarydeltakins in it or a HAL file that it names; describe another machine in a "
-            "table (legcal new --template)."
+            f"{kinematics}, needed genhexkins; describe another machine in a table (legcal new "
+            "--template)."
         )
     numbers = {
         match[1]: float(match[2])

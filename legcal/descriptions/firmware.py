@@ -17,9 +17,6 @@ that they add up to these numbers, which :data:`FIRMWARES` lists:
   arms) and M666, whose values raise endstops, of arms in degrees.
 - Marlin: ``module/delta.cpp``, ``M665.cpp``, ``M666.cpp``: after its endstop a carriage moves by
   the value of M666, which is negative or zero.
-- LinuxCNC: ``lineardeltakins`` and ``rotarydeltakins`` (``lineardeltakins-common.h``,
-  ``rotarydeltakins-common.h``), which know no towers but regular ones; arms have z = 0 at their
-  shafts and count downwards.
 """
 
 from __future__ import annotations
@@ -141,7 +138,6 @@ class Firmware:
     after: str  # what the owner does with them
     turns: bool = False
     stops_are_motors: bool = False
-    counts_down: bool = False  # its motors, unlike those of IdealDelta
     least: frozenset[str] = field(default_factory=frozenset)  # shared as the least of the towers
 
     def ideal(self, values: Mapping[str, float]) -> IdealDelta:
@@ -186,7 +182,6 @@ class Firmware:
 _KLIPPER = "abc"
 _STEPPERS = tuple(f"stepper_{letter}" for letter in _KLIPPER)
 _TOWERS = tuple(f"tower_{letter}" for letter in "xyz")
-_JOINTS = tuple(f"joint_{i}" for i in range(TOWERS))
 _LINEAR = {"angle": (210.0, 330.0, 90.0)}
 
 
@@ -246,19 +241,6 @@ _DUET_AFTER = (
     "replace the same values in config.g and delete those of config-override.g, keep the tilt of "
     f"the bed (A and B of M666), then M999 and G28; {_BED}calibrate the endstops alone (G30 S3)"
 )
-
-_LINUXCNC_AFTER = (
-    "put the setp lines into the HAL file and HOME_OFFSET into the INI file, where joints home at "
-    f"the ends of the travel at the top; {_BED}set z = 0 by a G54 offset"
-)
-
-
-def _linuxcnc_lines(module: str, *pins: str) -> str:
-    pin_lines = [f"setp {module}.{pin} {{{module}.{pin}}}" for pin in pins]
-    joint_lines = [f"# [JOINT_{i}]\n# HOME_OFFSET = {{JOINT_{i}.HOME_OFFSET}}" for i in _ALL]
-    units = "\n# For the INI file:\n# [TRAJ]\n# LINEAR_UNITS = mm"
-    return "\n".join([*pin_lines, units, *joint_lines, ""])
-
 
 FIRMWARES = (
     Firmware(
@@ -350,39 +332,5 @@ FIRMWARES = (
         "send these lines, then M500 and G28 (DELTA_RADIUS_TRIM_TOWER in Configuration.h must be "
         f"zero or left out); {_BED}set its height alone (G33 P1) and level it (G29)",
         least=frozenset({"M665 H"}),
-    ),
-    Firmware(
-        "linuxcnc",
-        "LinuxCNC",
-        (
-            Parameter("lineardeltakins.R", "radius"),
-            Parameter("lineardeltakins.L", "rod"),
-            *(Parameter(f"JOINT_{i}.HOME_OFFSET", "stop", (i,)) for i in _ALL),
-        ),
-        {"angle": (90.0, 210.0, 330.0)},
-        _JOINTS,
-        _linuxcnc_lines("lineardeltakins", "R", "L"),
-        _LINUXCNC_AFTER,
-        stops_are_motors=True,
-    ),
-    Firmware(
-        "linuxcnc",
-        "LinuxCNC",
-        (
-            Parameter("rotarydeltakins.platformradius", "radius"),
-            Parameter("rotarydeltakins.footradius", "radius", sign=-1.0, is_fitted=False),
-            Parameter("rotarydeltakins.thighlength", "arm"),
-            Parameter("rotarydeltakins.shinlength", "rod"),
-            *(Parameter(f"JOINT_{i}.HOME_OFFSET", "stop", (i,), sign=-1.0) for i in _ALL),
-        ),
-        {"angle": (270.0, 30.0, 150.0)},
-        _JOINTS,
-        _linuxcnc_lines(
-            "rotarydeltakins", "platformradius", "footradius", "thighlength", "shinlength"
-        ),
-        _LINUXCNC_AFTER,
-        turns=True,
-        stops_are_motors=True,
-        counts_down=True,
     ),
 )

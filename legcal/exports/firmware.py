@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.descriptions.controllers import SIDES, STRUTS, Rig, read_delta, rig_in
 from legcal.descriptions.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
-from legcal.exports.correction import poses_at_readings, stacked
+from legcal.exports.correction import stacked
 from legcal.exports.subject import (
     ExportedFile,
     ExportOptions,
@@ -34,6 +34,7 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import random_poses, workspace
+from legcal.machine.kinematics import poses_at_readings
 from legcal.machine.leg import LegKind
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
@@ -89,7 +90,9 @@ def firmware_files(name: str, subject: Subject, options: ExportOptions, path: Pa
     after, frame = _placed(ideal, seen)
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        there, reached = poses_at_readings(
+            subject.nominal, readings[:, list(machine.motors)], poses
+        )
         then = _mounted(subject.nominal, firmware)
         nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
         before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
@@ -246,8 +249,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         np.array([row.sign for row in rows]),
         start,
     )
-    has_height = any(p.field == "height" for p in firmware.parameters)
-    return mounted.over_bed() if has_height or not firmware.turns else mounted
+    return mounted.over_bed()
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,13 +428,6 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
 # LinuxCNC
 
 
-def linuxcnc_refusal(subject: Subject) -> str | None:
-    """Return the reason for refusing a machine that no kinematics of LinuxCNC are like, or None."""
-    refusal = hexapod_refusal(subject)
-    of_deltas = firmware_refusal("linuxcnc", subject)
-    return None if of_deltas is None else refusal and f"{refusal}, or a Delta with three motors"
-
-
 def hexapod_refusal(subject: Subject) -> str | None:
     """Return the reason for refusing a machine unsupported by genhexkins, or None."""
     machine, legs = subject.machine, subject.machine.legs
@@ -453,8 +448,6 @@ def hexapod_refusal(subject: Subject) -> str | None:
 def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
-    if machine.actuators:
-        return firmware_files("linuxcnc", subject, options, path)
     home = readings_at(machine, machine.home)
     pose = [*(_MM * machine.home.translation), *machine.home.rotation.as_euler("xyz", degrees=True)]
     lines = [
@@ -533,7 +526,9 @@ def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     after = places.placed(written)
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        there, reached = poses_at_readings(
+            subject.nominal, readings[:, list(machine.motors)], poses
+        )
         of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
         before = places.placed(of_nominal.nearest()[:_N])
     sentences, figures = in_words("FlyPT Mover", "at the joints of the platform", after, before)

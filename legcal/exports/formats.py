@@ -16,8 +16,8 @@ from legcal.exports.firmware import (
     firmware_refusal,
     flypt_files,
     flypt_refusal,
+    hexapod_refusal,
     linuxcnc_files,
-    linuxcnc_refusal,
 )
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
 from legcal.exports.parameter_files import csv_files, json_files, table_files
@@ -35,22 +35,21 @@ Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
 @dataclass(frozen=True)
 class Format:
-    """A format: its renderer, its restrictions and its options."""
+    """A format: its renderer and its restrictions."""
 
     render: Render  # files from a subject, options and the requested path
     # reason for refusing a machine, or None
     refusal: Callable[[Subject], str | None] = lambda _: None
     is_folder: bool = False
-    options: tuple[str, ...] = ()  # supported fields of ExportOptions
 
 
 FORMATS: dict[str, Format] = {
     "table": Format(table_files),
     "csv": Format(csv_files),
     "json": Format(json_files),
-    "urdf": Format(urdf_files, options=("inertia",)),
+    "urdf": Format(urdf_files),
     "mjcf": Format(mjcf_files, mjcf_refusal),
-    "linuxcnc": Format(linuxcnc_files, linuxcnc_refusal),
+    "linuxcnc": Format(linuxcnc_files, hexapod_refusal),
     **{
         name: Format(partial(firmware_files, name), partial(firmware_refusal, name))
         for name in ("klipper", "reprapfirmware", "marlin")
@@ -59,8 +58,8 @@ FORMATS: dict[str, Format] = {
     "python": Format(python_files, kinematics_refusal),
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),
-    "ros": Format(ros_files, is_folder=True, options=("inertia",)),
-    "correction": Format(correction_files, correction_refusal, options=("nodes",)),
+    "ros": Format(ros_files, is_folder=True),
+    "correction": Format(correction_files, correction_refusal),
 }
 _FILE = OutputFile("the export", "export", "", "a new file or --force")
 _FOLDER = OutputKind("export", "", "")
@@ -147,7 +146,10 @@ def export(
     """
     given = ExportOptions() if options is None else options
     format = _format(to)
-    _check_options(to, format, given)
+    if given.nodes is not None and to != "correction":
+        raise UsageError(
+            f"--nodes could not be used: found it with --to {to}, needed correction; leave it out."
+        )
     destination = Path(path)
     if str(path) == "":
         raise UsageError(
@@ -196,20 +198,6 @@ def _format(to: str) -> Format:
             f"{', '.join(FORMATS)}; give one of them with --to."
         )
     return FORMATS[to]
-
-
-def _check_options(to: str, format: Format, given: ExportOptions) -> None:
-    """Refuse options that the format does not support."""
-    nothing = ExportOptions()
-    for name in vars(nothing):
-        if getattr(given, name) != getattr(nothing, name) and name not in format.options:
-            takes = [
-                other for other, other_format in FORMATS.items() if name in other_format.options
-            ]
-            raise UsageError(
-                f"--{name} could not be used: found it with --to {to}, needed "
-                f"{' or '.join(takes)}; leave it out."
-            )
 
 
 def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:

@@ -24,6 +24,7 @@ from legcal.exports.subject import (
     other_gains,
 )
 from legcal.files.motions import motion_to_xyz_quat
+from legcal.files.schema import unused_name
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.urdf import UrdfJoint, origins_of, parse_robot
@@ -35,13 +36,13 @@ _SHAPES = ("visual", "collision")
 
 def urdf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the URDF file."""
-    content, notes = urdf_text(subject.machine, inertia=options.inertia)
+    content, notes = urdf_text(subject.machine)
     return Rendered((ExportedFile("", content),), notes)
 
 
 def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     """Return the URDF and the numbers of the calibration."""
-    content, notes = urdf_text(subject.machine, inertia=options.inertia)
+    content, notes = urdf_text(subject.machine)
     name = identifier(subject.name)
     document = {
         "legcal_calibration": 1,
@@ -55,15 +56,11 @@ def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     return Rendered(files, notes)
 
 
-def urdf_text(machine: Machine, *, inertia: bool) -> tuple[bytes, tuple[str, ...]]:
+def urdf_text(machine: Machine) -> tuple[bytes, tuple[str, ...]]:
     """Return a self-contained URDF, and the elements left out."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     robot = etree.fromstring(machine.urdf.content, parser)
     meshes = _without_meshes(robot)
-    if inertia:
-        for link in robot.iterfind("link"):
-            if link.find("inertial") is None:
-                link.append(_stub())
     joints = machine.urdf.joints
     for i, closure in enumerate(machine.chain.closures, start=1):
         kind = "spherical" if closure.kind == "3d" else "fixed"
@@ -106,17 +103,6 @@ def _without_meshes(robot: etree._Element) -> list[str]:
             removed.append(texture.get("filename", "a texture without a name"))
             parent.remove(texture)
     return removed
-
-
-def _stub() -> etree._Element:
-    """Return an inertia accepted by simulators."""
-    inertial = etree.Element("inertial")
-    etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
-    etree.SubElement(inertial, "mass", value=repr(STUB_MASS))
-    moments = {f"i{pair}": "0.0" for pair in ("xy", "xz", "yz")}
-    moments |= {f"i{pair}": repr(STUB_INERTIA) for pair in ("xx", "yy", "zz")}
-    etree.SubElement(inertial, "inertia", moments)
-    return inertial
 
 
 def _calibration(subject: Subject) -> dict[str, object]:
@@ -180,16 +166,13 @@ def mjcf_refusal(subject: Subject) -> str | None:
             "readings, as those of MuJoCo do"
         )
     urdf = subject.machine.urdf
-    above = {joint.child: joint for joint in urdf.joints.values()}
     for joint in urdf.joints.values():
-        link = joint.parent
-        while joint.type == "floating" and link in above:
-            if above[link].moves:
+        for above in urdf.joints_above(joint.parent):
+            if joint.type == "floating" and above.moves:
                 return (
-                    f"found the floating joint '{joint.name}' below '{above[link].name}', which "
+                    f"found the floating joint '{joint.name}' below '{above.name}', which "
                     "moves, needed it to hang from the world alone (MuJoCo)"
                 )
-            link = above[link].parent
     return None
 
 
@@ -211,13 +194,10 @@ class _Writer:
         urdf = machine.urdf
         robot = parse_robot(urdf.path, urdf.content)
         self._links = {str(e.get("name")): e for e in robot.iterfind("link")}
-        self._below: dict[str, list[UrdfJoint]] = {}
-        for joint in urdf.joints.values():
-            self._below.setdefault(joint.parent, []).append(joint)
         self._world = etree.Element("worldbody")
         self._name = {link: link for link in urdf.links}  # names of bodies; the root is the world
         if WORLD in self._name and urdf.root != WORLD:
-            self._name[WORLD] = _unused(WORLD, set(urdf.links))
+            self._name[WORLD] = unused_name(WORLD, set(urdf.links))
         self._joints = set(urdf.joints)
         self._motors = {machine.legs[j].prismatic for j in machine.motors}
         self._body: dict[str, etree._Element] = {urdf.root: self._world}
@@ -235,7 +215,7 @@ class _Writer:
         pending = [machine.urdf.root]
         while pending:
             link = pending.pop(0)
-            for joint in self._below.get(link, []):
+            for joint in machine.urdf.below[link]:
                 self._add(joint)
                 pending.append(joint.child)
         equality = etree.SubElement(mujoco, "equality")
@@ -273,7 +253,7 @@ class _Writer:
                 (f"{joint.name}_y", "slide", turned @ _Y, y),
                 (f"{joint.name}_turn", "hinge", _Z, np.arctan2(sine, cosine)),
             ):
-                _joint(body, _unused(name, self._joints), kind, axis, value)
+                _joint(body, unused_name(name, self._joints), kind, axis, value)
         elif joint.moves:
             value = home[chain.q_index(joint.name)]
             if joint.type == "continuous":
@@ -344,11 +324,3 @@ def _pose(T: RigidTransform) -> dict[str, str]:
 def _text(*numbers: float) -> str:
     """Return numbers that are read back exactly."""
     return " ".join(repr(float(x)) for x in numbers)
-
-
-def _unused(name: str, taken: set[str]) -> str:
-    """Return an unused name."""
-    unused = name
-    while unused in taken:
-        unused += "_"
-    return unused

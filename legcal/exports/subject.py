@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from legcal.files.schema import unused_name
 from legcal.machine.leg import LegColumns
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
@@ -27,7 +28,6 @@ RESULT_NAME = "result.json"
 class ExportOptions:
     """Options of some formats."""
 
-    inertia: bool = False  # urdf, ros: stubs of inertia in links that have none
     nodes: int | None = None  # correction: nodes of the grid along each coordinate
 
 
@@ -163,12 +163,7 @@ def identifiers(names: Iterable[str]) -> list[str]:
     """Return names as distinct identifiers."""
     unique_names: list[str] = []
     for name in names:
-        plain, number = identifier(name), 1
-        unique = plain
-        while unique in unique_names:
-            number += 1
-            unique = f"{plain}_{number}"
-        unique_names.append(unique)
+        unique_names.append(unused_name(identifier(name), unique_names))
     return unique_names
 
 

@@ -343,7 +343,7 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
             _merge(body_of, T_body_link, joint.parent, joint.child, T)
     for closure in closures:
         if closure.kind == "6d":
-            first, second = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
+            first, second = (urdf.link_of(name) for name in (closure.frame_1, closure.frame_2))
             if body_of[first] == body_of[second]:
                 raise ModelError(
                     f"the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' could not "
@@ -371,18 +371,13 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
     spheres = []
     for i, closure in enumerate(closures):
         if closure.kind == "3d":
-            first, second = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
+            first, second = (urdf.link_of(name) for name in (closure.frame_1, closure.frame_2))
             bodies, poses = (
                 (body_of[first], body_of[second]),
                 (T_body_link[first], T_body_link[second]),
             )
             spheres.append(Connection("sphere", bodies, poses, None, i))
     return Bodies(body_of, T_body_link, (*tree, *spheres))
-
-
-def frame_link(urdf: Urdf, frame: str) -> str:
-    """Return the link of a frame, named by a link or by the joint whose child it is."""
-    return frame if frame in urdf.links else urdf.joints[frame].child
 
 
 def _merge(

@@ -64,7 +64,6 @@ def close_at(
     machine: Machine,
     T_base_platform: RigidTransform,
     start: Array | None = None,
-    restarts: int = RESTARTS,
     *,
     exact: bool = True,
 ) -> Array:
@@ -92,7 +91,7 @@ def close_at(
     configuration = _placed(machine, T_base_platform, start, tolerance)
     rng = np.random.default_rng(20020701)
     # Gaps in leg lengths: gaps of short legs would weigh too little beside angles.
-    for _ in range(restarts):
+    for _ in range(RESTARTS):
         equations, retract = closure_equations(machine, T_base_platform, metre, angles)
         solution = solve(
             equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True

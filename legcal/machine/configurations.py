@@ -10,6 +10,7 @@ collisions, and away from singularities on the way, too (:class:`Feasibility`).
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from enum import StrEnum
 from functools import lru_cache
 from itertools import islice
@@ -107,14 +108,9 @@ def random_configurations(
     """
     generator, configurations = np.random.default_rng(rng), list[Array]()
     if mechanism.is_determined:
-        for share in SHARES:
-            if len(configurations) == count:
-                break
-            for q, _, _ in _usable(mechanism, generator, count - len(configurations), share):
-                try:
-                    configurations.append(follow(mechanism, mechanism.home_configuration, q))
-                except DidNotConverge:  # joints of the chain do not turn so far
-                    continue
+        for q, _, _ in _sampled(mechanism, generator, lambda: count - len(configurations)):
+            with suppress(DidNotConverge):  # joints of the chain do not turn so far
+                configurations.append(follow(mechanism, mechanism.home_configuration, q))
     else:
         walk = _walk(mechanism, generator, lambda c: not beyond_travel(mechanism, c).any())
         for configuration in islice(walk, count):
@@ -141,12 +137,9 @@ def random_poses(
         drawn = random_configurations(machine, count, rng)
         return drawn.readings, drawn.poses
     generator, readings, poses = np.random.default_rng(rng), list[Array](), list[RigidTransform]()
-    for share in SHARES:
-        if len(poses) == count:
-            break
-        for _, row, T in _usable(machine, generator, count - len(poses), share):
-            readings.append(row)
-            poses.append(motion_of(T[:, :3], T[:, 3]))
+    for _, row, T in _sampled(machine, generator, lambda: count - len(poses)):
+        readings.append(row)
+        poses.append(motion_of(T[:, :3], T[:, 3]))
     _require(machine, count, len(poses))
     return np.array(readings).reshape(count, machine.n_legs), poses
 
@@ -190,13 +183,23 @@ def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
     return readings[:, [names.index(name) for name in machine.leg_names]], poses
 
 
+def _sampled(
+    machine: Machine, generator: np.random.Generator, missing: Callable[[], int]
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield readings of motors and of all legs, and poses (3, 4), until none is *missing*.
+
+    Readings of motors that are drawn again are nearer to home.
+    """
+    for share in SHARES:
+        if (count := missing()) == 0:
+            return
+        yield from _usable(machine, generator, count, share)
+
+
 def _usable(
     machine: Machine, generator: np.random.Generator, count: int, share: float
 ) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield readings of motors and of all legs, and poses (3, 4), of usable ones of some draws.
-
-    Readings of motors are in a share of the travel about home.
-    """
+    """Yield those of some draws that are usable, in a share of the travel about home."""
     motors = list(machine.motors)
     lower, upper = motor_travel(machine)
     home = machine.home_configuration[slider_columns(machine, motors)[0]]

@@ -18,7 +18,6 @@ from legcal.geometry.motions import motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import (
     CLOSED,
-    ROUNDING,
     TOLERANCE,
     close_at,
     closure_equations,
@@ -51,11 +50,10 @@ from legcal.machine.ties import machine_ties
 CONTRACTION = 0.5  # largest step relative to the one before; for the first, to 1 rad or leg length
 MIN_STEP = 1.0 / 4096.0  # least step, relative to the path between readings
 LONG_STEP = 1.0 / 16.0  # least step of a first attempt, with a fallback
-RANDOM_ANGLES = 6  # random starts for the angles of all legs
-FEW_RESTARTS = 2  # restarts of single legs that do not close
 MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit is wrong
 MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
 FEW_STEPS = 12  # largest number of Newton steps
+REACHED = 1e-9  # residual of a reached pose [leg lengths]
 NEAR = 0.01  # largest distance of the pose at which a chain closes [leg lengths, rad]
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
@@ -467,7 +465,9 @@ def follow(
     T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
         if is_redundant:
-            failure = _disagreement(machine, _nearest(machine, T, readings), readings, which)
+            (near,), _ = poses_at_readings(machine, readings[None], T.as_matrix()[None, :3])
+            T = motion_of(near[:, :3], near[:, 3])
+            failure = _disagreement(machine, T, readings, which)
             if failure is not None:
                 raise failure
         raise DidNotConverge(
@@ -497,14 +497,6 @@ def follow(
     return closed
 
 
-def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
-    """Return the pose near T_base_platform with the smallest residuals of readings (n_motors,)."""
-    equations = equations_of_readings(machine, readings[None])
-    tolerance = ROUNDING * machine.size
-    solution = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
-    return motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
-
-
 def equations_of_readings(machine: Machine, readings: Array) -> Equations:
     """Return the equations of poses at readings of the motors (k, n_motors) [m, rad]."""
     n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
@@ -516,6 +508,19 @@ def equations_of_readings(machine: Machine, readings: Array) -> Equations:
         return rows.values, rows.by_pose
 
     return equations
+
+
+def poses_at_readings(machine: Machine, readings: Array, near: Array) -> tuple[Array, BoolArray]:
+    """Return the poses (k, 3, 4) at readings of the motors, near others, and which were reached."""
+    scale = machine.size
+    solution = solve(
+        equations_of_readings(machine, readings),
+        poses_after,
+        near,
+        tolerance=0.1 * TOLERANCE * scale,
+        unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
+    )
+    return solution.points, solution.worst <= REACHED * scale
 
 
 def follow_poses(
@@ -573,19 +578,13 @@ def _closed_at(
     It is the one that Newton steps lead to from the start, if they lead to the pose. The platform
     is free only if slightly inexact axes require it.
     """
-    chain, rng = machine.chain, np.random.default_rng(1965)
-    angles = chain.rotation_columns()
-    turns = np.zeros((1 + RANDOM_ANGLES, chain.nv))
-    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, chain.nv))[:, angles]
-    tries = [(turns[0], True), *[(turns[0], False)] * is_constrained(machine)]
-    tries += [(turn, True) for turn in turns[1:]]
 
     def trials() -> Iterator[Array]:
         if sliders:
             yield start.copy()
-        for turn, exact in tries:
+        for exact in (True, False)[: 1 + is_constrained(machine)]:
             with suppress(DidNotConverge):
-                yield close_at(machine, T, chain.integrate(start, turn), FEW_RESTARTS, exact=exact)
+                yield close_at(machine, T, start, exact=exact)
 
     equations, retract = closure_equations(machine, None, machine.size, free)
     for trial in trials():

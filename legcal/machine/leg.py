@@ -457,24 +457,6 @@ class Leg:
         return len(self.equations) - (self.kind is not LegKind.CONSTANT)
 
 
-@dataclass(frozen=True, eq=False)
-class KinematicParameters:
-    """Joint centres in R_b and R_e and leg lengths: all parameters of point-like joints."""
-
-    base_joints: Array  # (n_legs, 3) A in R_b [m]
-    platform_joints: Array  # (n_legs, 3) B in R_e [m]
-    offsets: Array  # (n_legs,) q0, or the length of constant legs [m]
-
-
-def parameters_of_legs(legs: Sequence[Leg]) -> KinematicParameters:
-    """Return the joint centres and lengths of legs."""
-    return KinematicParameters(
-        np.array([leg.A for leg in legs]),
-        np.array([leg.B for leg in legs]),
-        np.array([leg.q0 for leg in legs]),
-    )
-
-
 def mean_length(legs: Sequence[Leg], pose: Array) -> float:
     """Return the mean length of legs at a pose (3, 4) [m]."""
     R, t = pose[:, :3], pose[:, 3]

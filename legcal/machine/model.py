@@ -18,9 +18,7 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
 from legcal.machine.leg import (
     Cylinder,
-    KinematicParameters,
     Leg,
-    parameters_of_legs,
     with_platform_points,
     with_radii,
 )
@@ -236,18 +234,6 @@ class Machine:
     def home_of_frames(self) -> RigidTransform:
         """T_Rb_Re at home."""
         return self.T_base_Rb.inv() * self.home * self.T_platform_Re
-
-    @cached_property
-    def parameters(self) -> KinematicParameters:
-        """The kinematic parameters xi, in R_b and R_e [m]."""
-        base = self.T_base_Rb.inv().apply(self.A_base)
-        platform = self.T_platform_Re.inv().apply([leg.B for leg in self.legs_of_frames])
-        n_d = len(self.frame_legs)
-        for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
-            base[leg, rank:n_d] = 0.0
-            platform[leg, rank:n_d] = 0.0
-        parameters = parameters_of_legs(self.legs_of_frames)
-        return replace(parameters, base_joints=base, platform_joints=platform)
 
     def with_radii(self, radius: Callable[[int, Cylinder], float]) -> "Machine":
         """Return the machine with other radii of its visible cylinders; see :func:`with_radii`."""

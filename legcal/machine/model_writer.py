@@ -33,6 +33,7 @@ from legcal.machine.meshes import mesh_file
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_arms, moved_origins
 from legcal.machine.rods import actuators_of
+from legcal.machine.topology import distinct_joint
 from legcal.machine.urdf import UrdfPatch, written
 
 CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
@@ -98,14 +99,10 @@ def _with_paths(machine: Machine, destination: Path) -> bytes:
 
 
 def _joint_of(machine: Machine, leg: Leg) -> str:
-    """Return a joint that identifies a leg: its slider, or any other of its own."""
-    if leg.prismatic is not None and leg.actuator is None:
-        return leg.prismatic
+    """Return a joint that identifies a leg: one that moves, or any other of its own."""
     chain = leg.urdf_chain
-    steps = chain.steps[chain.actuator is not None :]
-    moving = [step.connection.joint for step in steps if step.connection.joint]
-    fixed = [joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies]
-    return str([*moving, *fixed][0])
+    fixed = (joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies)
+    return distinct_joint(chain) or next(fixed)
 
 
 def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None:

@@ -22,7 +22,7 @@ from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm
-from legcal.machine.chain import Bodies, Closure, frame_link, rigid_bodies
+from legcal.machine.chain import Bodies, Closure, rigid_bodies
 from legcal.machine.leg import Leg, LegChain, Step
 from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_links, twist_after
@@ -122,9 +122,7 @@ def with_separate_origins(
             else:
                 frame = str(missing.frame)
                 link, joint = _unused(f"{frame}_mount", names)
-                patch.add_frame(
-                    frame_link(urdf, frame), link, link, joint, RigidTransform.identity()
-                )
+                patch.add_frame(urdf.link_of(frame), link, link, joint, RigidTransform.identity())
                 # In this closure only: closures that share a frame get a link each.
                 changed[missing.closure] = _with_frame(changed[missing.closure], frame, link)
             urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
@@ -185,7 +183,6 @@ class Handles:
         self._closures = closures
         self._fixed = rigid_bodies(urdf, (), platform_joint)
         self.bodies: Bodies = rigid_bodies(urdf, closures, platform_joint)
-        self._above = {joint.child: joint for joint in urdf.joints.values()}
 
     def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
         """Return the handle of a joint in a body."""
@@ -204,7 +201,7 @@ class Handles:
         connection = step.connection
         if connection.closure is not None:
             closure = self._closures[connection.closure]
-            return frame_link(self._urdf, (closure.frame_1, closure.frame_2)[side])
+            return self._urdf.link_of((closure.frame_1, closure.frame_2)[side])
         joint = self._urdf.joints[str(connection.joint)]
         return (joint.parent, joint.child)[side]
 
@@ -217,12 +214,9 @@ class Handles:
 
     def _onward(self, joint: UrdfJoint, body: str) -> UrdfJoint:
         """Return the fixed joint from the child of a joint to the rest of its body."""
-        link, onward = body, None
-        while link != joint.child and link in self._above:
-            onward = self._above[link]
-            link = onward.parent
-        if link == joint.child and onward is not None and self._carries_only(link, onward):
-            return onward
+        for onward in self._urdf.joints_above(body):
+            if onward.parent == joint.child and self._carries_only(joint.child, onward):
+                return onward
         raise NoOriginError(joint=joint.name)
 
     def _weld(self, joint: UrdfJoint, body: str, leg: str) -> Handle:
@@ -231,7 +225,7 @@ class Handles:
         problem: NoOriginError | None = None
         for i, closure in enumerate(self._closures):
             frames = closure.frame_1, closure.frame_2
-            on = [self._fixed.body_of[frame_link(self._urdf, frame)] for frame in frames]
+            on = [self._fixed.body_of[self._urdf.link_of(frame)] for frame in frames]
             if closure.kind == "6d" and set(on) == {ours, theirs}:
                 for wanted in (ours, theirs):
                     try:
@@ -253,17 +247,17 @@ class Handles:
     def _carrier(self, closure: int, side: int) -> UrdfJoint:
         """Return the fixed joint under a closure frame, which must carry nothing else."""
         frame = (self._closures[closure].frame_1, self._closures[closure].frame_2)[side]
-        link = frame_link(self._urdf, frame)
-        above = self._above.get(link)
+        link = self._urdf.link_of(frame)
+        above = self._urdf.above.get(link)
         if above is not None and not above.moves and self._carries_only(link, None, closures=1):
             return above
         raise NoOriginError(frame=frame, closure=closure)
 
     def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
         """Return whether a link carries at most one joint, and this number of closure frames."""
-        joints = [joint for joint in self._urdf.joints.values() if joint.parent == link]
+        joints = self._urdf.below[link]
         frames = [f for c in self._closures for f in (c.frame_1, c.frame_2)]
-        uses = sum(frame_link(self._urdf, frame) == link for frame in frames)
+        uses = sum(self._urdf.link_of(frame) == link for frame in frames)
         return joints == ([] if below is None else [below]) and uses == closures
 
 

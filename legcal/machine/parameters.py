@@ -23,7 +23,6 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import (
     ARMS,
-    KinematicParameters,
     Leg,
     LegColumns,
     LegKind,
@@ -39,11 +38,23 @@ _BLOCKS = (
     *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
     *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # those of its actuator
 )
-_LOCAL_NAMES = (
-    *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
-    "offset",
-    *(f"{side}_axis.{angle}" for side in ("base", "platform") for angle in (1, 2)),
-    "twist",
+# Name and unit of each of LegColumns, after the name of the leg or of the joint of its motor.
+_COLUMNS = (
+    *((f"{side}.{axis}", "m") for side in ("base", "platform") for axis in "xyz"),
+    ("offset", "m"),
+    *((f"{side}_axis.{angle}", "rad") for side in ("base", "platform") for angle in (1, 2)),
+    ("twist", "rad"),
+    *(
+        (f"{part}.{k}", unit)
+        for part, unit in (("axis", "rad"), ("axis_point", "m"))
+        for k in (1, 2)
+    ),
+    ("gain", ""),
+    *(
+        (f"{part}.{k}", unit)
+        for part, unit in (("arm_axis", "rad"), ("arm_point", "m"))
+        for k in (1, 2)
+    ),
 )
 
 
@@ -98,49 +109,21 @@ def parametrize(
             for column in block:
                 if not free[j, column]:
                     continue
-                if column < columns.OWN:
-                    name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
-                else:
-                    name, unit = _name_of_actuator(leg, column)
-                    shared = next((i for i, (n, _) in enumerate(parameters) if n == name), None)
-                    if shared is not None:
-                        place[j, column] = shared
-                        continue
-                place[j, column] = len(parameters)
-                parameters.append((name, unit))
+                parameter = _name_of(names[j], leg, column), _COLUMNS[column][1]
+                if parameter not in parameters:  # legs on one motor share its numbers
+                    parameters.append(parameter)
+                place[j, column] = parameters.index(parameter)
     return Parametrization(tuple(n for n, _ in parameters), tuple(u for _, u in parameters), place)
 
 
-def _local_name(leg: Leg, column: int) -> str:
-    """Return the name of a number of the leg itself."""
-    is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
-    return "length" if is_length else _LOCAL_NAMES[column]
-
-
-def _unit(column: int) -> str:
-    """Return the unit of a number."""
-    return "m" if column <= LegColumns.LENGTH else "rad"
-
-
-def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
-    """Return the name and the unit of a number of the actuator of a leg."""
-    actuator = leg.actuator
-    if actuator is None:
-        raise ValueError("a leg that hangs on no actuator has no numbers of one")
-    if column == ActuatorColumns.GAIN:
-        return f"{actuator.joint}.gain", ""
-    axis = "axis" if actuator.turns else "direction"
-    vector, columns, unit = next(
-        (vector, columns, unit)
-        for vector, columns, unit in (
-            (axis, ActuatorColumns.AXIS, "rad"),
-            ("axis_point", ActuatorColumns.POINT, "m"),
-            ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
-            ("arm_point", ActuatorColumns.ARM_POINT, "m"),
-        )
-        if columns.start <= column < columns.stop
-    )
-    return f"{actuator.joint}.{vector}.{column - columns.start + 1}", unit
+def _name_of(name: str, leg: Leg, column: int) -> str:
+    """Return the name of a parameter of a leg, or of its motor."""
+    number, motor = _COLUMNS[column][0], leg.actuator
+    if column < LegColumns.OWN or motor is None:
+        is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
+        return f"{name}.{'length' if is_length else number}"
+    is_direction = column < ActuatorColumns.AXIS.stop and not motor.turns
+    return f"{motor.joint}.{number.replace('axis', 'direction') if is_direction else number}"
 
 
 def is_held_by_default(name: str) -> bool:
@@ -182,12 +165,14 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
 @lru_cache(maxsize=8)  # a job needs those of one or two machines dozens of times
 def geometries(machine: Machine) -> tuple[Leg, ...]:
     """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
-    parameters = machine.parameters
+    A = machine.T_base_Rb.inv().apply(machine.A_base)
+    B = machine.T_platform_Re.inv().apply([leg.B for leg in machine.legs_of_frames])
+    n_d = len(machine.frame_legs)
+    for rank, j in enumerate(machine.frame_legs):  # zero by definition, not by rounding
+        A[j, rank:n_d] = B[j, rank:n_d] = 0.0
     moved = _in_frames(machine.legs_of_frames, machine.T_base_Rb.inv(), machine.T_platform_Re.inv())
-    return tuple(
-        replace(leg, A=A, B=B)  # zero by definition, not by rounding
-        for leg, A, B in zip(moved, parameters.base_joints, parameters.platform_joints, strict=True)
-    )
+    ends = zip(moved, A, B, strict=True)
+    return tuple(replace(leg, A=A_j, B=B_j) for leg, A_j, B_j in ends)
 
 
 def legs_in_links(machine: Machine, legs: Sequence[Leg]) -> tuple[Leg, ...]:
@@ -233,12 +218,14 @@ def in_joint_frames(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg
     return _in_frames(legs, base, platform)
 
 
-def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
-    """Return parameters as one vector [m], in the order of :func:`parametrize`."""
-    free = free_coordinates(len(parameters.offsets), frame_legs)
-    return np.concatenate(
-        [parameters.base_joints[free], parameters.platform_joints[free], parameters.offsets]
-    )
+def to_vector(legs: Sequence[Leg], frame_legs: Sequence[int]) -> Array:
+    """Return joint centres in R_b and R_e and lengths of legs, passive or not, as a vector [m].
+
+    These are all parameters of point-like joints, in the order of :func:`parametrize`.
+    """
+    free = free_coordinates(len(legs), frame_legs)
+    A, B = (np.array(points)[free] for points in ([x.A for x in legs], [x.B for x in legs]))
+    return np.concatenate([A, B, [leg.q0 for leg in legs]])
 
 
 def vector_of(

@@ -15,13 +15,14 @@ from typing import Literal
 
 import numpy as np
 from lxml import etree
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
-from legcal.files.schema import closest
+from legcal.files.schema import closest, unused_name
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.chain import Closure, frame_link
+from legcal.machine.chain import Closure
 from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
 from legcal.machine.urdf import (
     LOOP_TAGS,
@@ -42,13 +43,15 @@ class Source:
     file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
     notes: tuple[str, ...] = ()  # notes on the conversion, one sentence each
-    values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
-    poses: Mapping[str, RigidTransform] | None = None
-    is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
-    drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
+    values: Mapping[str, float] = field(default_factory=dict)  # drawn joint values [rad or m]
     base: str | None = None  # stated links of a file without a block
     platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
+
+    @property
+    def drawn(self) -> dict[str, float]:
+        """The drawn values of the motors [rad or m]."""
+        return {motor: self.values.get(motor, 0.0) for motor in self.file.name_mot}
 
     @property
     def closures(self) -> list[Closure]:
@@ -70,12 +73,7 @@ class UrdfBuilder:
 
     def unused(self, name: str, others: Set[str] = frozenset()) -> str:
         """Return a name unused by links and joints: the given one, or it with a number."""
-        taken = self.links.keys() | self.joints.keys() | others
-        number, unused = 1, name
-        while unused in taken:
-            number += 1
-            unused = f"{name}_{number}"
-        return unused
+        return unused_name(name, self.links.keys() | self.joints.keys() | others)
 
     def link(self, name: str, visuals: str = "") -> None:
         """Add or replace a link with its visuals."""
@@ -214,46 +212,28 @@ def check_one_mechanism(source: Source) -> None:
 
 
 def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[list[str], bool]]:
-    """Return the groups of connected links, without those on the ground."""
-    group = {link: link for link in urdf.links}
+    """Return the groups of connected links, without those on the ground, and whether loops close.
 
-    def find(link: str) -> str:
-        while group[link] != link:
-            group[link] = group[group[link]]
-            link = group[link]
-        return link
-
+    The links of each are in the order of the file.
+    """
+    groups = DisjointSet(urdf.links)
     for joint in urdf.joints.values():
         if not joint.moves:
-            group[find(joint.child)] = find(joint.parent)
-    ground = find(urdf.root)
+            groups.merge(joint.parent, joint.child)
+    ground = groups[urdf.root]
+    on_ground = groups.subset(ground)
     pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
-    ends = [(frame_link(urdf, first), frame_link(urdf, second)) for first, second in closures]
-    for first, second in (*pairs, *ends):
-        if ground not in (find(first), find(second)):
-            group[find(second)] = find(first)
-    closed = {find(link) for pair in ends for link in pair} - {ground}
-    groups: dict[str, list[str]] = {}
-    for link in urdf.links:
-        if find(link) != ground:
-            groups.setdefault(find(link), []).append(link)
-    return [(links, name in closed) for name, links in groups.items()]
-
-
-def reference_poses(urdf: Urdf) -> dict[str, RigidTransform]:
-    """Return the pose of every link in the root link, all joint values zero."""
-    children: dict[str, list[str]] = {}
-    for joint in urdf.joints.values():
-        children.setdefault(joint.parent, []).append(joint.name)
-    poses = {urdf.root: RigidTransform.identity()}
-    pending = [urdf.root]
-    while pending:
-        link = pending.pop()
-        for name in children.get(link, ()):
-            joint = urdf.joints[name]
-            poses[joint.child] = poses[link] * joint.T_parent_origin
-            pending.append(joint.child)
-    return poses
+    ends = [(urdf.link_of(first), urdf.link_of(second)) for first, second in closures]
+    for pair in (*pairs, *ends):
+        if on_ground.isdisjoint(pair):
+            groups.merge(*pair)
+    closed = {link for pair in ends for link in pair}
+    found = dict.fromkeys(groups[link] for link in urdf.links if link not in on_ground)
+    subsets = [groups.subset(name) for name in found]
+    return [
+        ([link for link in urdf.links if link in links], not closed.isdisjoint(links))
+        for links in subsets
+    ]
 
 
 LoopKind = Literal["point", "weld"]

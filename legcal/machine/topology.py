@@ -13,18 +13,19 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import OutOfClass, Problem
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
-from legcal.machine.chain import Bodies, Closure, Connection, frame_link, rigid_bodies
+from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
 from legcal.machine.classification import (
     classify_leg,
+    gap,
     is_actuator,
     joint_tolerance,
-    nearest,
     off_square,
     parallel,
     undirected,
@@ -32,7 +33,7 @@ from legcal.machine.classification import (
 from legcal.machine.files import LegcalBlock
 from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
-from legcal.machine.spanning_tree import Source, reference_poses
+from legcal.machine.spanning_tree import Source
 from legcal.machine.urdf import Urdf
 
 Normals = tuple[Array, Array]
@@ -238,7 +239,7 @@ def _block_on(
 
 def _is_used(urdf: Urdf, closures: Sequence[Closure], link: str) -> bool:
     """Return whether a moving joint or a closure is on a link itself."""
-    ends = {frame_link(urdf, frame) for c in closures for frame in (c.frame_1, c.frame_2)}
+    ends = {urdf.link_of(frame) for c in closures for frame in (c.frame_1, c.frame_2)}
     return link in ends or any(
         j.moves and link in (j.parent, j.child) for j in urdf.joints.values()
     )
@@ -250,21 +251,25 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
     count = n_frame_legs(spatial=normals is None)
     if len(names) <= count:
         return list(names)
-    ends = (
-        np.array([chain.A for chain in chains]),
-        np.array([chain.B_platform for chain in chains]),
-    )
+    A, B = (np.array([getattr(c, end) for c in chains]) for end in ("A", "B_platform"))
     if normals is not None:
-        ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
-    chosen = list(combinations(range(len(names)), count))
-    of_motors = [
-        [chains[j].motor if chains[j].actuator is not None else names[j] for j in c] for c in chosen
+        A, B = _flat(A, normals[0]), _flat(B, normals[1])
+    motors = [
+        name if c.actuator is None else c.motor for name, c in zip(names, chains, strict=True)
     ]
-    most = max(len(set(of_legs)) for of_legs in of_motors)  # one leg per actuator, if possible
-    chosen = [c for c, m in zip(chosen, of_motors, strict=True) if len(set(m)) == most]
-    spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
-    first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
-    return [names[j] for j in chosen[first]]
+    return [names[j] for j in widest(A, B, motors, count)]
+
+
+def widest(A: Array, B: Array, motors: Sequence[str | None], count: int) -> tuple[int, ...]:
+    """Return a number of legs with the largest span of joints on base and platform, (n, 3) each.
+
+    If possible each is on a motor of its own.
+    """
+    chosen = list(combinations(range(len(A)), count))
+    n_motors = [len({motors[j] for j in legs}) for legs in chosen]
+    chosen = [legs for legs, n in zip(chosen, n_motors, strict=True) if n == max(n_motors)]
+    spans = np.array([_span(A[list(legs)]) * _span(B[list(legs)]) for legs in chosen])
+    return chosen[int(np.argmax(spans >= spans.max() * (1.0 - TIE)))]
 
 
 def level_rotation(A: Array, B: Array) -> Rotation:
@@ -333,18 +338,15 @@ def normals_of_closures(
     """
     if in_link_frames is None:
         return [None] * len(closures)
-    poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
     virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
     floats = virtual is not None and virtual.type == "floating"
     normals: list[Array | None] = []
     for closure in closures:
-        link = above = frame_link(urdf, closure.frame_1)
-        while above in parents and parents[above] is not virtual:
-            above = parents[above].parent
+        link = urdf.link_of(closure.frame_1)
         root, normal = (block.base, in_link_frames[0])
-        if above in parents and floats:
+        if floats and virtual in urdf.joints_above(link):
             root, normal = (block.platform, in_link_frames[1])
-        turn = poses[link].rotation.inv() * poses[root].rotation
+        turn = urdf.poses[link].rotation.inv() * urdf.poses[root].rotation
         normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
     return [None, *normals[1:]] if floats else normals
 
@@ -452,21 +454,15 @@ def _several_bodies(
     joint, a part of the platform by the joints of several legs.
     """
     base, platform = ends
-    reached, new = {body}, [body]
-    on_base, on_platform = list[Connection](), list[Connection]()
-    while new:
-        here = new.pop()
-        for connection in bodies.connections:
-            if here not in connection.bodies:
-                continue
-            there = connection.bodies[1 - connection.bodies.index(here)]
-            if there == base:
-                on_base.append(connection)
-            elif there == platform:
-                on_platform.append(connection)
-            elif there not in reached:
-                reached.add(there)
-                new.append(there)
+    groups = DisjointSet(name for c in bodies.connections for name in c.bodies)
+    for connection in bodies.connections:
+        if {*connection.bodies}.isdisjoint(ends):
+            groups.merge(*connection.bodies)
+    group = groups.subset(body)
+    on_base, on_platform = (
+        [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
+        for end in (base, platform)
+    )
     if len(on_platform) != 1:
         return None
     if len(on_base) == 1:
@@ -546,15 +542,10 @@ def _is_an_arm(steps: list[Step], within: float) -> bool:
     """Return whether joints form an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
-    if len(steps) == 1:
-        return True
-    for lower, upper in pairwise(steps):
-        near, far = nearest(
-            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
-        )
-        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
-            return True
-    return False
+    return len(steps) == 1 or any(
+        gap(Axis("", *lower.line(lower.far)), Axis("", *upper.line(upper.near))) > within
+        for lower, upper in pairwise(steps)
+    )
 
 
 def _name(connection: Connection) -> str:
@@ -648,8 +639,8 @@ def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: st
             uses[joint.parent] += 1
     for closure in closures:
         for frame in (closure.frame_1, closure.frame_2):
-            if frame_link(urdf, frame) in uses:
-                uses[frame_link(urdf, frame)] += 1
+            if urdf.link_of(frame) in uses:
+                uses[urdf.link_of(frame)] += 1
     return max(links, key=lambda link: uses[link])
 
 

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -261,9 +262,11 @@ class Wording:
     no_home: str = "legcal.home is not given"
     state_home: str = "write legcal.home"
     correct_home: str = "correct legcal.home"
+    readings: str = "legcal.home_readings"
     state_readings: str = "write legcal.home_readings with the reading of each actuator at home"
     state_ends: str = "write legcal.base, legcal.platform and legcal.legs"
     correct_ends: str = "correct legcal.base or legcal.platform"
+    correct_unit: str = "write all lengths in metres (are they millimetres?)"
 
 
 BLOCK = Wording()
@@ -332,6 +335,42 @@ class Urdf:
     def text(self) -> str:
         """The XML as text."""
         return self.content.decode("utf-8-sig")
+
+    @cached_property
+    def above(self) -> dict[str, UrdfJoint]:
+        """The joint above each link but the root."""
+        return {joint.child: joint for joint in self.joints.values()}
+
+    @cached_property
+    def below(self) -> dict[str, list[UrdfJoint]]:
+        """The joints below each link, in the order of the file."""
+        below: dict[str, list[UrdfJoint]] = {link: [] for link in self.links}
+        for joint in self.joints.values():
+            below[joint.parent].append(joint)
+        return below
+
+    @cached_property
+    def poses(self) -> dict[str, RigidTransform]:
+        """The pose of every link in the root link, all joint values zero."""
+        poses, pending = {self.root: RigidTransform.identity()}, [self.root]
+        while pending:
+            link = pending.pop()
+            for joint in self.below[link]:
+                poses[joint.child] = poses[link] * joint.T_parent_origin
+                pending.append(joint.child)
+        return poses
+
+    def link_of(self, frame: str) -> str:
+        """Return the link of a frame, named by a link or by the joint whose child it is."""
+        return frame if frame in self.links else self.joints[frame].child
+
+    def joints_above(self, link: str) -> list[UrdfJoint]:
+        """Return the joints from a link up to the root."""
+        joints = []
+        while link in self.above:
+            joints.append(self.above[link])
+            link = joints[-1].parent
+        return joints
 
     def robot(self) -> etree._Element:
         """Return the ``<robot>`` element, which may be changed for :meth:`edited`."""

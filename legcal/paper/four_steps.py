@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import LegAxes
-from legcal.machine.leg import KinematicParameters, Leg
+from legcal.machine.leg import Leg
 from legcal.paper.criteria import Criteria
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
@@ -27,11 +27,6 @@ class StagedResult:
     def legs(self) -> tuple[Leg, ...]:
         """Identified legs, in R_b and R_e."""
         return self.machine.legs
-
-    @property
-    def parameters(self) -> KinematicParameters:
-        """Joint centres [m] and offsets [m]."""
-        return self.machine.parameters
 
 
 def run_steps(

@@ -63,7 +63,7 @@ class JointsInBase:
     @property
     def A_Rb(self) -> Array:
         """Base joint centres, (n_legs, 3) [m]."""
-        return self.machine.parameters.base_joints
+        return self.machine.A
 
 
 def locate_joints_in_base(
@@ -227,11 +227,7 @@ def _joints_of_base(
     for v, R in turns:
         is_located, T = joints.located[v], cameras[v]
         C[v, is_located] = R.T @ np.linalg.inv(information[is_located]) @ R
-        A[v, is_located] = (
-            A[v, is_located]
-            if T is None
-            else T.inv().apply(machine.parameters.base_joints[is_located])
-        )
+        A[v, is_located] = A[v, is_located] if T is None else T.inv().apply(machine.A[is_located])
     return adjusted_to_base(machine, joints, A, C, measurements)
 
 
@@ -244,7 +240,7 @@ def _points_on_rays(
     group, leg = np.nonzero(joints.located[placed])
     view = placed[group]
     A, C = joints.A[view, leg], joints.covariance[view, leg, :3, :3]
-    A_Rb = machine.parameters.base_joints[leg]
+    A_Rb = machine.A[leg]
     return SeenPoints(group, A_Rb, A, C, np.zeros_like(A)), components(list(poses.values())), placed
 
 

@@ -345,7 +345,7 @@ def points_in_both(
 ) -> tuple[Array, Array]:
     """Return the joints of the base (n, 3) that a view locates, in R_b and in the camera [m]."""
     located = joints.located[view]
-    return machine.parameters.base_joints[located], joints.A[view, located]
+    return machine.A[located], joints.A[view, located]
 
 
 # Candidate camera poses, in closed form: three joints not on a line determine the pose. Joints on

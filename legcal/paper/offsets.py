@@ -156,7 +156,7 @@ def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
     Two legs that meet in one platform joint are at distance zero for any offsets; a leg that is
     fixed to the platform ends on it for any offset.
     """
-    q0, B = machine.offsets, machine.parameters.platform_joints
+    q0, B = machine.offsets, machine.B
     pairs = pairs_of_legs(directions, q0)
     legs = directions.leg[pairs]
     gap = np.linalg.norm(B[legs[:, 0]] - B[legs[:, 1]], axis=1)

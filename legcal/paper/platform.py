@@ -120,7 +120,7 @@ def build_mean_distances(
     """
     q0 = machine.offsets
     pairs = pairs_of_legs(directions, q0)
-    B = machine.parameters.platform_joints[directions.leg[pairs]]
+    B = machine.B[directions.leg[pairs]]
     apart = _APART * float(np.mean(q0[np.isfinite(q0)]))
     pairs = pairs[np.linalg.norm(B[:, 1] - B[:, 0], axis=1) > apart]
     key = np.column_stack([directions.view[pairs[:, 0]], directions.leg[pairs]])

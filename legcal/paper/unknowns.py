@@ -22,11 +22,9 @@ from scipy.sparse import csc_array
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import (
     EquationKind,
-    KinematicParameters,
     Leg,
     LegColumns,
     LegKind,
-    parameters_of_legs,
 )
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
@@ -72,15 +70,25 @@ class NominalMachine:
         return is_spatial(self.frame_legs)
 
     @cached_property
-    def parameters(self) -> KinematicParameters:
-        """Joint centres and offsets [m]; constant legs have their length."""
-        return parameters_of_legs(self.legs)
+    def A(self) -> Array:
+        """Joint centres of the base in R_b, (n_legs, 3) [m]."""
+        return np.array([leg.A for leg in self.legs])
+
+    @cached_property
+    def B(self) -> Array:
+        """Joint centres of the platform in R_e, (n_legs, 3) [m]."""
+        return np.array([leg.B for leg in self.legs])
+
+    @cached_property
+    def lengths(self) -> Array:
+        """Offsets, or the length of constant legs, (n_legs,) [m]."""
+        return np.array([leg.q0 for leg in self.legs])
 
     @cached_property
     def offsets(self) -> Array:
         """Offsets, (n_legs,) [m]; NaN for passive legs, like their readings."""
         passive = np.array([leg.kind is LegKind.PASSIVE for leg in self.legs])
-        return np.where(passive, np.nan, self.parameters.offsets)
+        return np.where(passive, np.nan, self.lengths)
 
     @cached_property
     def constant(self) -> BoolArray:
@@ -255,7 +263,7 @@ def hold_at_nominal(
     information = _without_poses(problem.derivative_at_start(weighted=weighted), n)
     lengths = machine.offsets[np.isfinite(machine.offsets)]
     if not len(lengths):  # a machine that is moved by hand
-        lengths = machine.parameters.offsets
+        lengths = machine.lengths
     sigma_length = _SIGMA_LENGTH * float(np.mean(np.abs(lengths)))
     sigma = np.where(unknowns.is_angle, _SIGMA_AXIS, sigma_length)[wanted]
     in_it = np.zeros(len(problem.start), dtype=np.bool_)

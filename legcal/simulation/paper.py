@@ -31,10 +31,11 @@ from legcal.geometry.motions import look_at
 from legcal.geometry.types import BoolArray
 from legcal.machine.closing import solve_poses
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import Leg, parameters_of_legs
+from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
+from legcal.machine.rods import ends_at_poses
 from legcal.pages.svg import Bars, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
@@ -217,8 +218,7 @@ def checked_poses(
 def _errors(truth: Machine, legs: Sequence[Leg], checked: RigidTransform) -> Record:
     """Return the errors of eq (20) and of every parameter, or the failure to compute them."""
     estimated, true = (
-        to_vector(parameters_of_legs(some_legs), truth.frame_legs)
-        for some_legs in (legs, geometries(truth))
+        to_vector(some_legs, truth.frame_legs) for some_legs in (legs, geometries(truth))
     )
     try:
         errors = platform_errors(truth, legs, checked)
@@ -259,10 +259,10 @@ def poses_by_readings(
     truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform
 ) -> tuple[RigidTransform, BoolArray]:
     """Return the poses of legs at the readings of true poses, and a mask of those that exist."""
-    R, t, true = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation, truth.parameters
-    arms = true.platform_joints @ np.swapaxes(R, -1, -2)
-    lengths = np.linalg.norm(arms + t[:, None] - true.base_joints, axis=-1)
-    solved = solve_poses(legs, truth.frame_legs, R, t, lengths - true.offsets)
+    R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
+    A, B = ends_at_poses(geometries(truth), R, t)
+    lengths = np.linalg.norm(B - A, axis=-1)
+    solved = solve_poses(legs, truth.frame_legs, R, t, lengths - truth.q0)
     poses = RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
     return poses, np.asarray(solved.missed <= _MAX_ERROR * lengths.max(axis=1))
 
@@ -402,7 +402,7 @@ class PaperDocument(Document):
             initial=[row for row in rows if row.estimator == INITIAL],
             names=list(parametrize(first.leg_names, geometries(first), first.frame_legs).names),
             true_values_mm={
-                name: (1e3 * to_vector(m.parameters, m.frame_legs)).tolist()
+                name: (1e3 * to_vector(geometries(m), m.frame_legs)).tolist()
                 for name, m in machines.items()
             },
             as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},

@@ -50,10 +50,8 @@ from legcal.estimation.solver import NormalEquations, robust_cost
 from legcal.estimation.uncertainty import WorstDirection, named_covariance, worst_directions
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import (
-    KinematicParameters,
     Leg,
     Link,
-    parameters_of_legs,
     radius_name,
     with_platform_points,
 )
@@ -221,11 +219,6 @@ class Solution:
     details: tuple[str, ...] = ()  # on the starts, one sentence each
     left_out: tuple[str, ...] = ()  # legs in views with most outlines rejected, unconfirmed
     edges: Outlines | None = None  # straight edges of bodies, with the rejections of the fit
-
-    @property
-    def parameters(self) -> KinematicParameters:
-        """Joint centres, and offsets or constant lengths [m]."""
-        return parameters_of_legs(self.legs)
 
     def cameras_in_base(self, T_base_Rb: RigidTransform) -> tuple[RigidTransform, ...]:
         """Return T_base_camera of every view, with R_b at its nominal pose in the base."""

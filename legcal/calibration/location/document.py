@@ -353,24 +353,22 @@ def _with_frames(machine: Machine, location: Location) -> bytes:
 
 def _from_root(urdf: Urdf, base: str) -> RigidTransform:
     """Return T_root_base; refuse a moving joint between them."""
-    above = {joint.child: joint for joint in urdf.joints.values()}
-    T, link = RigidTransform.identity(), base
-    while link != urdf.root:
-        joint = above[link]
+    T = RigidTransform.identity()
+    for joint in urdf.joints_above(base):
         if joint.moves:
             raise ModelError(
                 f"{urdf.path}: the world could not be written: found the base '{base}' below the "
                 f"joint '{joint.name}', which moves, needed fixed joints between it and the root "
                 f"'{urdf.root}'; hang the platform from the base."
             )
-        T, link = joint.T_parent_origin * T, joint.parent
+        T = joint.T_parent_origin * T
     return T
 
 
 def _joint_of_world(machine: Machine) -> str:
     """Return the fixed joint below a world link that carries the whole machine."""
     urdf = machine.urdf
-    below = [joint for joint in urdf.joints.values() if joint.parent == _WORLD]
+    below = urdf.below.get(_WORLD, [])
     if urdf.root == _WORLD != machine.base and len(below) == 1 and not below[0].moves:
         return below[0].name
     raise UsageError(
