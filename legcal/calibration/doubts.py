@@ -114,9 +114,7 @@ def doubts_of(
         else [
             *of.moved_parameters(),
             *_held_out(held_out),
-            *of.cameras(),
-            *of.left_out(),
-            *noise,
+            *(of.cameras() or [*of.left_out(), *noise]),
         ]
     )
     if session.findings and any(one.code in OF_CHANGES for one in symptoms):
@@ -369,7 +367,8 @@ class _Evidence:
         if not views:
             return []
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
-        what = f"the measurements contradict the camera of {few_views(views)}"
+        found = max(self.solution.camera_doubts, key=lambda wrong: wrong.apart).found
+        what = f"the measurements contradict the camera of {few_views(views)}: {found}"
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "
             "zoomed, scaled or cropped"

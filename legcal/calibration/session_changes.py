@@ -45,6 +45,7 @@ from legcal.estimation.uncertainty import (
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LegColumns
+from legcal.vision.camera import shared_cameras
 
 MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
@@ -59,6 +60,7 @@ _COARSE = 15  # groups of images whose scores say how much those of errors once 
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
+MOST_REJECTED = 0.5  # outlines of an image that says anything of others
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
@@ -66,6 +68,7 @@ Kind = Literal[
     "drift",
     "camera",
     "focal_length",
+    "camera_file",
     "lag",
     "backlash",
     "gain",
@@ -149,7 +152,7 @@ class Finding:
         return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
 
 
-_WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity")
+_WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity", "camera_file")
 _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative amounts
     "lag": ("ahead of", "behind"),
     "gain": ("too large", "too small"),
@@ -281,11 +284,23 @@ def session_tests(
     """
     if not len(posterior.problem.outlines):
         return SessionTests()
+    left_out = _left_out(posterior.problem)
+    tests = _tests(_with_rejected(posterior), measurements, sequences)
+    if not left_out.any() or any(finding.kind not in OF_SCATTER for finding in tests.findings):
+        return tests
+    # A wrong row, or a photograph of another, says nothing about those of the others
+    return _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
+
+
+def _tests(
+    posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
+) -> SessionTests:
+    """Test a fit with some outlines for numbers that it lacks."""
     has_order = len(sequences) > 0
     fit = _Fit.of(
         posterior, measurements, sequences if has_order else [np.arange(measurements.n_rows)]
     )
-    hypotheses = [*fit.of_motors(), *fit.of_views()]
+    hypotheses = [*fit.of_motors(), *fit.of_views(), *fit.of_camera_files()]
     hypotheses = [h for h in hypotheses if any(c.any() for c in h.columns.values())]
     if not hypotheses:
         return SessionTests()
@@ -314,7 +329,12 @@ def session_tests(
         scores = scores.with_noise(noise)
         solved = [scores.solved(number.test) for number in lacking]
         lacking, _ = _forward_selection(scores, solved, len(tests))
-    findings = [fit.finding(number, measurements, len(tests)) for number in lacking]
+    # The fit itself names camera files that are wrong; here they explain what others would
+    findings = [
+        fit.finding(number, measurements, len(tests))
+        for number in lacking
+        if number.test.of.kind != "camera_file"
+    ]
     if noise is not None:
         findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
@@ -387,22 +407,33 @@ def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArra
                 yield run
 
 
-def _with_rejected(posterior: Posterior) -> FitProblem:
-    """Return the problem with what it rejected, what is far off with the weights of Huber's loss.
+def _with_rejected(posterior: Posterior, among: Array | float = 1.0) -> Posterior:
+    """Return the fit with what it rejected, what is far off with the weights of Huber's loss.
 
     A fit rejects outlines, and readings of redundant motors, on one side of a change where the
-    other side has more.
+    other side has more. *Among* some outlines.
     """
     problem, noise, state = posterior.problem, posterior.noise, posterior.state
     offsets, claimed = problem.offsets(state), problem.outlines.covariance
     distance = np.sqrt(noise.squared_norms(offsets, claimed))
-    problem = problem.weighted(noise, _HUBER / np.maximum(distance, _HUBER))
-    if not problem.legs.is_redundant:
-        return problem
-    factor, sigma = problem.factor("readings"), problem.readings.sigma
-    distance = np.abs(factor.rows(state).r[:, 0]) / sigma
-    root = np.sqrt(_HUBER / np.maximum(distance, _HUBER)) / sigma
-    return problem.with_factors(replace(factor, whitening=root[:, None, None]))
+    problem = problem.weighted(noise, among * _HUBER / np.maximum(distance, _HUBER))
+    if problem.legs.is_redundant:
+        factor, sigma = problem.factor("readings"), problem.readings.sigma
+        distance = np.abs(factor.rows(state).r[:, 0]) / sigma
+        root = np.sqrt(_HUBER / np.maximum(distance, _HUBER)) / sigma
+        problem = problem.with_factors(replace(factor, whitening=root[:, None, None]))
+    return replace(posterior, problem=problem)
+
+
+def _left_out(problem: FitProblem) -> BoolArray:
+    """Return the outlines (n,) of images most of whose outlines a fit rejects."""
+    o = problem.outlines
+    rejected = ~np.asarray(problem.factor("outlines").whitening).any(axis=(1, 2))
+    left_out = np.zeros(len(o), dtype=np.bool_)
+    for image in set(zip(o.view[rejected].tolist(), o.pose[rejected].tolist(), strict=True)):
+        of_image = (o.view == image[0]) & (o.pose == image[1])
+        left_out[of_image] = rejected[of_image].mean() > MOST_REJECTED
+    return left_out
 
 
 def _size(number: _Solved) -> tuple[str, float, float]:
@@ -618,8 +649,7 @@ class _Fit:
     def of(
         cls, posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
     ) -> _Fit:
-        """Linearise a fit, with what it rejected."""
-        posterior = replace(posterior, problem=_with_rejected(posterior))
+        """Linearise a fit."""
         problem, state = posterior.problem, posterior.state
         linear = linearize(problem, state)
         normal = normal_equations(problem, state, linear)
@@ -682,6 +712,22 @@ class _Fit:
             zoom = residuals.zoomed(v)
             focal = {name: -zoom[name][..., None] for name in shares}
             yield _Hypothesis("focal_length", view, "1", focal, shares, True)
+
+    def of_camera_files(self) -> Iterator[_Hypothesis]:
+        """Yield the intrinsics of each camera file, and of each view, that may be wrong."""
+        problem, course = self.problem, self.course
+        tables = {"outlines": problem.outlines, **{one.name: one for one in problem.boards}}
+        shares = {name: course.of_images(x.view, x.pose) for name, x in tables.items() if len(x)}
+        residuals = CameraResiduals(problem, self.state, self.linear)
+        owners = np.array(shared_cameras(problem.outlines.views, problem.first_cameras))
+        n_images = np.bincount([v for v, _ in course.rows], minlength=len(owners))
+        views = np.eye(len(owners), dtype=np.bool_)[n_images >= 2 * MIN_IMAGES]
+        for chosen in np.unique(np.vstack([owners[:, None] == owners, views]), axis=0):
+            errors = chain.from_iterable(residuals.errors_of_files(chosen).values())
+            changes = [residuals.changes(error) for error in errors]
+            if changes:
+                columns = {of: np.stack([one[of] for one in changes], axis=-1) for of in shares}
+                yield _Hypothesis("camera_file", "", "", columns, shares, False)
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""

@@ -40,7 +40,7 @@ READING_UNITS = (*LENGTH, *ANGLE, PULSES)
 USUAL_UNITS = {False: ("m", "mm", "cm", "in"), True: ("rad", "deg", PULSES)}
 USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 # Fractions of the travel in use: in the stated unit, and in another that is certainly meant
-HARDLY_MOVES, SURELY_MOVES = 0.02, 0.5
+HARDLY_MOVES, SURELY_MOVES = 0.04, 0.5  # inches taken for mm use a 25th
 MIN_POSES = 5  # different poses: fewer are a check, perhaps close together
 
 
