@@ -304,18 +304,9 @@ def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
 
 
 def _look_for_still_encoders(checklist: _Checklist, shares: Mapping[str, float]) -> None:
-    """Look for encoders with constant readings, or with a small part of their travel."""
-    constant = [
-        encoder.column for encoder in checklist.encoders if encoder.least == encoder.greatest
-    ]
-    if 0 < len(constant) < len(checklist.encoders):
-        checklist.add(
-            "readings",
-            "warning",
-            f"{checklist.dataset.table_path}: found the same reading in all rows of "
-            f"{few(constant)}, while other encoders move; check that these were recorded, and move "
-            "these legs as well.",
-        )
+    """Look for encoders that use a small part of their travel."""
+    constant = {e.column for e in checklist.encoders if e.least == e.greatest}  # noted by the table
+    if len(constant) < len(checklist.encoders):
         shares = {name: share for name, share in shares.items() if name not in constant}
     still = [name for name, share in shares.items() if share < LITTLE_USED]
     if still:

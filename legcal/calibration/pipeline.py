@@ -335,7 +335,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
     A refusal names the likely mistakes of the session before their consequences, and also notes on
-    files of photographs that contradict their camera: they may be the cause.
+    odd readings and files of photographs that contradict their camera: they may be the cause.
 
     Raises
     ------
@@ -354,7 +354,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         return _estimate(data, rows, options, diagnosed)
     except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
         is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
-        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.file_notes
+        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.notes
         if not (diagnosis or notes):
             raise
         refused: Sequence[str | Problem] = error.facts

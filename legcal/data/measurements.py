@@ -153,7 +153,7 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
 
     Unknown views and images are refused, unless said otherwise.
     """
-    names = places(measurements)
+    m, names = measurements, places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
     index = {place: row for row, place in enumerate(names)}
     named = list(zip(table.text("view"), table.text("image"), strict=True))
@@ -165,6 +165,10 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
             table.refuse(i, unknown, "a view with measurements", "view", remedy=remedy)
         else:
             near = closest(image, [name for v, name in names if v == view])
+            poses = [m.pose_labels[p] for p, v in zip(m.pose, m.view, strict=True)
+                     if m.pose_labels and m.views[v].name == view]  # fmt: skip
+            if len(twice := {pose for pose in poses if poses.count(pose) > 1}) and image in poses:
+                near = f"pose {min(twice)} has several rows of that view: delete all but one"
             needed = f"an image of view {view} in the measurements"
             table.refuse(i, describe(image), needed, "image", remedy=near)
     return rows
@@ -295,6 +299,13 @@ def readings_in(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
+    still = np.ptp(readings, axis=0) == 0.0 if len(readings) else np.ones(len(motors), dtype=bool)
+    if still.any() and not still.all():
+        constant = few([str(leg.prismatic) for leg, one in zip(motors, still, strict=True) if one])
+        notes.append(
+            f"{table.path}: found the same reading in all rows of {constant}, while other encoders "
+            "move; check that these were recorded, and move these legs as well."
+        )
     groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]

@@ -401,7 +401,13 @@ def likely_cause(
     possible = [m for m in corrected if in_travel(m.q, legs).all()]
     if possible and len(values) > 1:
         best = max(possible, key=lambda m: float(m.used(legs).mean()))
-        return best.said(legs, name, in_dataset=in_dataset)
+        as_stated = float(Meaning(tuple(units), joint_values(values, units)).used(legs).max())
+        if best.used(legs).mean() >= HARDLY_MOVES or not HARDLY_MOVES <= as_stated <= 1.0:
+            return best.said(legs, name, in_dataset=in_dataset)
+        return (
+            "they move no further than the travel, and so look like readings from another zero: "
+            "shift them into it, or correct limits and offset of the model"
+        )
     low, high = USUAL_PULSES
     if turns and name != PULSES and np.all((values > low) & (values < high)):
         return "these look like pulses of servos in us: " + (
