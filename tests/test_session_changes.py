@@ -170,6 +170,29 @@ def test_the_first_finding_is_what_was_done_with_its_amount(
         assert finding.between == (labels[11 + CHANGED_AT], labels[12 + CHANGED_AT])
 
 
+def _exchanged(dataset: Dataset) -> Dataset:
+    """Exchange two photographs of the first view."""
+    outlines = dataset.observations
+    assert outlines is not None
+    rows = np.arange(24)
+    rows[[3, 7]] = 7, 3
+    return replace(dataset, observations=replace(outlines, row=rows[outlines.row]))
+
+
+@pytest.mark.parametrize(
+    ("change", "codes"),
+    [
+        (_exchanged, []),
+        (lambda d: with_rays(d, np.arange(24) >= 12, zoomed(3.0 * ZOOM)), ["camera"]),
+    ],
+    ids=["photographs exchanged", "camera file of a view"],
+)
+def test_readings_and_autofocus_are_not_accused_of_wrong_rows_or_a_camera_file(
+    healthy: Dataset, change: Callable[[Dataset], Dataset], codes: list[str]
+) -> None:
+    assert [doubt.code for doubt in calibrate(change(healthy)).doubts] == codes
+
+
 def test_a_joint_that_moved_is_named_and_not_the_encoder_of_its_leg(
     healthy: Dataset, start: Start
 ) -> None:

@@ -60,7 +60,8 @@ _COARSE = 15  # groups of images whose scores say how much those of errors once 
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
-MOST_REJECTED = 0.5  # outlines of an image that says anything of others
+MOST_REJECTED = 0.5  # outlines of an image that is not left out
+FEW = 0.1  # of the outlines
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
@@ -68,7 +69,6 @@ Kind = Literal[
     "drift",
     "camera",
     "focal_length",
-    "camera_file",
     "lag",
     "backlash",
     "gain",
@@ -79,6 +79,9 @@ Kind = Literal[
     "autofocus",
     "vibration",
 ]
+# What camera files say, which the fit itself names; here it explains what others would
+_CAMERA_FILE = "camera_file"
+_Tested = Kind | Literal["camera_file"]
 OF_MOTORS: frozenset[Kind] = frozenset(
     ("encoder", "drift", "lag", "backlash", "gain", "pitch", "eccentricity", "reading_noise")
 )
@@ -152,7 +155,7 @@ class Finding:
         return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
 
 
-_WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity", "camera_file")
+_WITHOUT_ORDER: tuple[_Tested, ...] = ("gain", "pitch", "eccentricity", _CAMERA_FILE)
 _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative amounts
     "lag": ("ahead of", "behind"),
     "gain": ("too large", "too small"),
@@ -230,7 +233,7 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
 class _Hypothesis:
     """A number that a fit lacks, by what a unit of it does to whitened residuals in each image."""
 
-    kind: Kind
+    kind: _Tested
     subject: str
     unit: str
     columns: Mapping[str, Array]  # (n, q, d) of factors by name
@@ -286,10 +289,12 @@ def session_tests(
         return SessionTests()
     left_out = _left_out(posterior.problem)
     tests = _tests(_with_rejected(posterior), measurements, sequences)
-    if not left_out.any() or any(finding.kind not in OF_SCATTER for finding in tests.findings):
+    changes = any(finding.kind not in OF_SCATTER for finding in tests.findings)
+    if changes or not 0.0 < left_out.mean() <= FEW:
         return tests
-    # A wrong row, or a photograph of another, says nothing about those of the others
-    return _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
+    # A few wrong rows, or photographs of others, are no scatter if there is none without them
+    others = _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
+    return tests if {finding.kind for finding in others.findings} & OF_SCATTER else others
 
 
 def _tests(
@@ -329,11 +334,10 @@ def _tests(
         scores = scores.with_noise(noise)
         solved = [scores.solved(number.test) for number in lacking]
         lacking, _ = _forward_selection(scores, solved, len(tests))
-    # The fit itself names camera files that are wrong; here they explain what others would
     findings = [
-        fit.finding(number, measurements, len(tests))
+        fit.finding(number, kind, measurements, len(tests))
         for number in lacking
-        if number.test.of.kind != "camera_file"
+        if (kind := number.test.of.kind) != _CAMERA_FILE
     ]
     if noise is not None:
         findings.append(fit.scattering(noise, hypotheses))
@@ -727,7 +731,7 @@ class _Fit:
             changes = [residuals.changes(error) for error in errors]
             if changes:
                 columns = {of: np.stack([one[of] for one in changes], axis=-1) for of in shares}
-                yield _Hypothesis("camera_file", "", "", columns, shares, False)
+                yield _Hypothesis(_CAMERA_FILE, "", "", columns, shares, False)
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""
@@ -828,12 +832,14 @@ class _Fit:
                         least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 
-    def finding(self, number: _Solved, measurements: Measurements, n_tests: int) -> Finding:
+    def finding(
+        self, number: _Solved, kind: Kind, measurements: Measurements, n_tests: int
+    ) -> Finding:
         """Return a number that the fit lacks."""
         test, hypothesis = number.test, number.test.of
         holds = test.holds.astype(np.float64)[:, None]
         return Finding(
-            hypothesis.kind,
+            kind,
             hypothesis.subject,
             *_size(number),
             test.between,
