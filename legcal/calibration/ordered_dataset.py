@@ -273,8 +273,8 @@ def nominal_poses(
     refused |= {
         first[k]: Cause(
             "found that the nominal model cannot reach them, with a residual of {:.1f} mm at the "
-            "nearest pose, needed at most {:.1f} mm; check these readings, their columns, the joints "
-            "of the model and legcal.home, or take",
+            "nearest pose, needed at most {:.1f} mm; check these readings, their columns, the "
+            "joints of the model and legcal.home, or take",
             (1e3 * float(residual[k]), 1e3 * limit),
         )
         for k in unreached
