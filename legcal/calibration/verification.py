@@ -323,6 +323,7 @@ def _together(name: str, changes: Sequence[Change]) -> Change:
 SIGNIFICANCE = 0.01
 MAX_SIGNIFICANCE = 0.5
 BETTER = 2.5  # smallest difference of costs that decides for another minimum
+_BY_CHANCE = 1e-6  # probability of new images that agree as well as those of the calibration
 PRIOR_SIGMA = 0.009  # [rad, mean leg lengths]; below the limit for directions held at nominal
 
 
@@ -442,7 +443,12 @@ def check(
     sentences = (diagnosis.sentence for diagnosis in estimate.diagnosis)
     on_images = (*estimate.image_notes, *estimate.fit_notes)
     of_images = notes_beside(estimate.diagnosis, on_images, "legcal calibrate --check")
+    known = (
+        "These images agree with the earlier result far better than new ones could: they appear to "
+        "be those of its calibration, which cannot show a change; take new ones."
+    )
     notes = (*sentences, *dataset.notes, *of_images, *solution.notes)
+    notes = (*[known] * (answer.movement.p_value > 1.0 - _BY_CHANCE), *notes)
     return replace(answer, notes=tuple(dict.fromkeys(notes)))
 
 
