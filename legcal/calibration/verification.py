@@ -383,7 +383,7 @@ class Check:
 
 def check(
     source: str | Path | Dataset,
-    result: str | Path,
+    result: str | Path | EarlierResult,
     *,
     significance: float = SIGNIFICANCE,
     progress: Progress = False,
@@ -395,7 +395,7 @@ def check(
     ----------
     source : path or Dataset
         The new images, from arbitrary cameras. Nothing is written into their folder.
-    result : path
+    result : path or EarlierResult
         The result folder of the earlier calibration.
     significance : float
         Probability of a false alarm.
@@ -423,7 +423,7 @@ def check(
             f"needed a probability above 0 and up to {MAX_SIGNIFICANCE:g} (0.01 gives one "
             "false alarm in a hundred checks); correct it."
         )
-    earlier = load_result(result)
+    earlier = result if isinstance(result, EarlierResult) else load_result(result)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
     prior = _EarlierEstimate.of(dataset.machine, earlier)
