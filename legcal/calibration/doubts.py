@@ -367,8 +367,11 @@ class _Evidence:
         if not views:
             return []
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
-        found = max(self.solution.camera_doubts, key=lambda wrong: wrong.apart).found
-        what = f"the measurements contradict the camera of {few_views(views)}: {found}"
+        wrong = max(self.solution.camera_doubts, key=lambda one: one.apart)
+        what = (
+            f"the measurements contradict the camera of {few_views(views)}, above all the "
+            f"{wrong.name}: {wrong.found}"
+        )
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "
             "zoomed, scaled or cropped"
