@@ -369,8 +369,8 @@ class _Evidence:
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
         wrong = max(self.solution.camera_doubts, key=lambda one: one.apart)
         what = (
-            f"the measurements contradict the camera of {few_views(views)}, above all the "
-            f"{wrong.name}: {wrong.found}"
+            f"the measurements contradict the camera of {few_views(views)}, above all its "
+            f"{wrong.kind.replace('_', ' ')}: {wrong.found}"
         )
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "

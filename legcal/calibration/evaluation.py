@@ -7,7 +7,6 @@ the rotation between the two orientations.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.calibration.documents import ComparedParameter, EvaluationDocument
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.errors import DidNotConverge, ModelError, UsageError
+from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.motions import components, motions_of, product
 from legcal.geometry.types import Array
 from legcal.machine.closing import solve_poses
@@ -104,7 +103,8 @@ def evaluate(
     If the motors do not determine the pose, only parameters are compared and both arrays of
     platform errors are empty.
     """
-    machine, truth = _machine_of(model), _machine_of(reference)
+    given = (getattr(one, "machine", one) for one in (model, reference))  # also of a result
+    machine, truth = (x if isinstance(x, Machine) else load_mechanism(x) for x in given)
     truth = _in_the_order_of(truth, machine)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
@@ -152,19 +152,6 @@ def evaluate(
         n_left_out,
         unreached,
     )
-
-
-def _machine_of(given: str | Path | Machine | EarlierResult) -> Machine:
-    """Return a machine, that of a result, or that of a file."""
-    if isinstance(given, str | os.PathLike):
-        return load_mechanism(given)
-    machine = getattr(given, "machine", given)
-    if not isinstance(machine, Machine):
-        raise UsageError(
-            f"The models could not be compared: found a {type(given).__name__}, needed a path, a "
-            "Machine or a result of legcal.load_result; give the folder of the result."
-        )
-    return machine
 
 
 def _in_the_order_of(reference: Machine, model: Machine) -> Machine:

@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, combinations, pairwise
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -79,9 +79,6 @@ Kind = Literal[
     "autofocus",
     "vibration",
 ]
-# What camera files say, which the fit itself names; here it explains what others would
-_CAMERA_FILE = "camera_file"
-_Tested = Kind | Literal["camera_file"]
 OF_MOTORS: frozenset[Kind] = frozenset(
     ("encoder", "drift", "lag", "backlash", "gain", "pitch", "eccentricity", "reading_noise")
 )
@@ -155,7 +152,7 @@ class Finding:
         return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
 
 
-_WITHOUT_ORDER: tuple[_Tested, ...] = ("gain", "pitch", "eccentricity", _CAMERA_FILE)
+_WITHOUT_ORDER: tuple[str, ...] = ("gain", "pitch", "eccentricity", "camera_file")
 _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative amounts
     "lag": ("ahead of", "behind"),
     "gain": ("too large", "too small"),
@@ -233,7 +230,8 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
 class _Hypothesis:
     """A number that a fit lacks, by what a unit of it does to whitened residuals in each image."""
 
-    kind: _Tested
+    # The fit itself names camera files that are wrong: here they explain what others would
+    kind: Kind | Literal["camera_file"]
     subject: str
     unit: str
     columns: Mapping[str, Array]  # (n, q, d) of factors by name
@@ -305,7 +303,7 @@ def _tests(
     fit = _Fit.of(
         posterior, measurements, sequences if has_order else [np.arange(measurements.n_rows)]
     )
-    hypotheses = [*fit.of_motors(), *fit.of_views(), *fit.of_camera_files()]
+    hypotheses = [*fit.of_motors(), *fit.of_views()]
     hypotheses = [h for h in hypotheses if any(c.any() for c in h.columns.values())]
     if not hypotheses:
         return SessionTests()
@@ -334,11 +332,8 @@ def _tests(
         scores = scores.with_noise(noise)
         solved = [scores.solved(number.test) for number in lacking]
         lacking, _ = _forward_selection(scores, solved, len(tests))
-    findings = [
-        fit.finding(number, kind, measurements, len(tests))
-        for number in lacking
-        if (kind := number.test.of.kind) != _CAMERA_FILE
-    ]
+    named = [number for number in lacking if number.test.of.kind != "camera_file"]
+    findings = [fit.finding(number, measurements, len(tests)) for number in named]
     if noise is not None:
         findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
@@ -433,11 +428,8 @@ def _left_out(problem: FitProblem) -> BoolArray:
     """Return the outlines (n,) of images most of whose outlines a fit rejects."""
     o = problem.outlines
     rejected = ~np.asarray(problem.factor("outlines").whitening).any(axis=(1, 2))
-    left_out = np.zeros(len(o), dtype=np.bool_)
-    for image in set(zip(o.view[rejected].tolist(), o.pose[rejected].tolist(), strict=True)):
-        of_image = (o.view == image[0]) & (o.pose == image[1])
-        left_out[of_image] = rejected[of_image].mean() > MOST_REJECTED
-    return left_out
+    image = o.view * problem.n_elements + o.pose
+    return np.asarray(np.bincount(image, rejected) > MOST_REJECTED * np.bincount(image))[image]
 
 
 def _size(number: _Solved) -> tuple[str, float, float]:
@@ -689,12 +681,14 @@ class _Fit:
         yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
 
     def of_views(self) -> Iterator[_Hypothesis]:
-        """Yield what may have changed about the camera of each view.
+        """Yield what may have changed about the camera of each view, and wrong camera files.
 
-        Corners of a board on the base are means over the images of a view, changed by the share of
-        those after a change.
+        A file may be wrong in all views that have it, or in one. Corners of a board on the base are
+        means over the images of a view, changed by the share of those after a change.
         """
         problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        owners = np.array(shared_cameras(problem.outlines.views, problem.first_cameras))
+        of_files = [owners == owner for owner in owners]
         boards = {corners.name: corners for corners in problem.boards if len(corners)}
         shares = {
             name: course.of_images(table.view, table.pose)
@@ -704,6 +698,7 @@ class _Fit:
         for v, view in enumerate(problem.outlines.views):
             if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
                 continue
+            of_files.append(np.arange(len(owners)) == v)
             moved = []
             for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
                 error = np.zeros((len(problem.outlines.views), 6))
@@ -716,22 +711,11 @@ class _Fit:
             zoom = residuals.zoomed(v)
             focal = {name: -zoom[name][..., None] for name in shares}
             yield _Hypothesis("focal_length", view, "1", focal, shares, True)
-
-    def of_camera_files(self) -> Iterator[_Hypothesis]:
-        """Yield the intrinsics of each camera file, and of each view, that may be wrong."""
-        problem, course = self.problem, self.course
-        tables = {"outlines": problem.outlines, **{one.name: one for one in problem.boards}}
-        shares = {name: course.of_images(x.view, x.pose) for name, x in tables.items() if len(x)}
-        residuals = CameraResiduals(problem, self.state, self.linear)
-        owners = np.array(shared_cameras(problem.outlines.views, problem.first_cameras))
-        n_images = np.bincount([v for v, _ in course.rows], minlength=len(owners))
-        views = np.eye(len(owners), dtype=np.bool_)[n_images >= 2 * MIN_IMAGES]
-        for chosen in np.unique(np.vstack([owners[:, None] == owners, views]), axis=0):
-            errors = chain.from_iterable(residuals.errors_of_files(chosen).values())
-            changes = [residuals.changes(error) for error in errors]
-            if changes:
+        for views in np.unique(of_files, axis=0):
+            errors = chain.from_iterable(residuals.errors_of_files(views).values())
+            if changes := [residuals.changes(error) for error in errors]:
                 columns = {of: np.stack([one[of] for one in changes], axis=-1) for of in shares}
-                yield _Hypothesis(_CAMERA_FILE, "", "", columns, shares, False)
+                yield _Hypothesis("camera_file", "", "", columns, shares, False)
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""
@@ -832,14 +816,12 @@ class _Fit:
                         least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 
-    def finding(
-        self, number: _Solved, kind: Kind, measurements: Measurements, n_tests: int
-    ) -> Finding:
+    def finding(self, number: _Solved, measurements: Measurements, n_tests: int) -> Finding:
         """Return a number that the fit lacks."""
         test, hypothesis = number.test, number.test.of
         holds = test.holds.astype(np.float64)[:, None]
         return Finding(
-            kind,
+            cast(Kind, hypothesis.kind),
             hypothesis.subject,
             *_size(number),
             test.between,

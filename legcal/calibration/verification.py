@@ -444,8 +444,8 @@ def check(
     on_images = (*estimate.image_notes, *estimate.fit_notes)
     of_images = notes_beside(estimate.diagnosis, on_images, "legcal calibrate --check")
     known = (
-        "These images agree with the earlier result far better than new ones could: they appear to "
-        "be those of its calibration, which cannot show a change; take new ones."
+        "These images appear to be those of the earlier calibration itself, as they agree better "
+        "than new ones could: they cannot show a change; take new ones."
     )
     notes = (*sentences, *dataset.notes, *of_images, *solution.notes)
     notes = (*[known] * (answer.movement.p_value > 1.0 - _BY_CHANCE), *notes)

@@ -153,7 +153,7 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
 
     Unknown views and images are refused, unless said otherwise.
     """
-    m, names = measurements, places(measurements)
+    names = places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
     index = {place: row for row, place in enumerate(names)}
     named = list(zip(table.text("view"), table.text("image"), strict=True))
@@ -165,10 +165,6 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
             table.refuse(i, unknown, "a view with measurements", "view", remedy=remedy)
         else:
             near = closest(image, [name for v, name in names if v == view])
-            poses = [m.pose_labels[p] for p, v in zip(m.pose, m.view, strict=True)
-                     if m.pose_labels and m.views[v].name == view]  # fmt: skip
-            if len(twice := {pose for pose in poses if poses.count(pose) > 1}) and image in poses:
-                near = f"pose {min(twice)} has several rows of that view: delete all but one"
             needed = f"an image of view {view} in the measurements"
             table.refuse(i, describe(image), needed, "image", remedy=near)
     return rows

@@ -66,7 +66,6 @@ _TILT = 0.5  # [rad] from the normal of a planar machine
 _SEED = 2002
 _EXACT = 2.5e-7  # mean leg lengths: standard deviation of what is known exactly
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
-FARTHEST = 100.0  # sizes of the machine to a camera: beyond, T_base_camera is in millimetres
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
 _BOARD = 0.5  # half side of a board on the platform, over the spread of its joints
@@ -418,9 +417,8 @@ def recorded_session(
         replace(
             view,
             T_base_camera=default.T_base_camera
-            if (hint := view.T_base_camera) is None
-            or np.linalg.norm(hint.translation) > FARTHEST * machine.size
-            else to_Rb * hint,
+            if view.T_base_camera is None
+            else to_Rb * view.T_base_camera,
         )
         for view, default in zip(views, placed, strict=True)
     )

@@ -147,11 +147,6 @@ class WrongIntrinsic:
     error: Array  # (n_views, 5) the correction, in all views
 
     @property
-    def name(self) -> str:
-        """What it is, with its view."""
-        return f"{_TESTED[self.kind][2]} {self.view}"
-
-    @property
     def found(self) -> str:
         """What the measurements say, as a clause."""
         (given, *_), (change, *_), (sigma, *_) = self.given, self.change, self.sigma
@@ -178,7 +173,7 @@ class WrongIntrinsic:
     def __str__(self) -> str:
         against = "the other views of its camera" if self.kind == "zoom" else "the measurements"
         return (
-            f"The {self.name} does not agree with {against}: {self.found}, "
+            f"The {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
             f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
             f"this error; {_REMEDIES[self.kind].format(self.view)}."
         )
