@@ -270,7 +270,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 401}, UsageError, "1 to 400"),
     ({"images": 9, "images_per_view": 3}, UsageError, "--images-per-view"),
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
-    ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
+    ({"images": 2, "cameras": 3}, UsageError, "--images 3"),
     ({"cameras": 0}, UsageError, "--cameras 0"),
     ({"target": 0.0}, UsageError, "more than 0"),
     ({"seed": -1}, UsageError, "--seed"),
