@@ -138,6 +138,20 @@ def test_rows_of_one_label_share_a_pose_and_the_mean_reading(folder: Folder) -> 
         read(folder)
 
 
+def test_readings_from_another_zero_and_still_encoders_are_called_so(folder: Folder) -> None:
+    for row in folder.rows:
+        row[JOINTS[2]] = 0.07
+    folder.write()
+    (note,) = load_dataset(folder.path).notes
+    assert "the same reading in all rows of leg3_prismatic" in note
+    for row in folder.rows:
+        row.update({name: row[name] + 0.21 for name in JOINTS})
+    folder.write()
+    with pytest.raises(DatasetError, match="from another zero") as refusal:
+        load_dataset(folder.path)
+    assert "inches" not in str(refusal.value)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_reading_outside_the_travel_is_noted_or_refused(folder: Folder, sign: float) -> None:
     end, travel = (0.144 if sign > 0.0 else -0.004), 0.148

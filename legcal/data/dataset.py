@@ -464,7 +464,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera, unit: float) -> View:
     return View(
         name=name,
         camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_given=entry.gamma is not None),
-        T_base_camera=motion_from_xyz_quat(unit * np.array(T.xyz), T.quat_xyzw) if T else None,
+        T_base_camera=motion_from_xyz_quat([unit * x for x in T.xyz], T.quat_xyzw) if T else None,
         legs=None if entry.legs is None else tuple(entry.legs),
     )
 
