@@ -103,7 +103,7 @@ def evaluate(
     If the motors do not determine the pose, only parameters are compared and both arrays of
     platform errors are empty.
     """
-    given = (getattr(one, "machine", one) for one in (model, reference))  # also of a result
+    given = (x if isinstance(x, str | Path | Machine) else x.machine for x in (model, reference))
     machine, truth = (x if isinstance(x, Machine) else load_mechanism(x) for x in given)
     truth = _in_the_order_of(truth, machine)
     poses: list[RigidTransform] = []

@@ -406,7 +406,7 @@ def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArra
                 yield run
 
 
-def _with_rejected(posterior: Posterior, among: Array | float = 1.0) -> Posterior:
+def _with_rejected(posterior: Posterior, among: BoolArray | float = 1.0) -> Posterior:
     """Return the fit with what it rejected, what is far off with the weights of Huber's loss.
 
     A fit rejects outlines, and readings of redundant motors, on one side of a change where the
@@ -429,7 +429,8 @@ def _left_out(problem: FitProblem) -> BoolArray:
     o = problem.outlines
     rejected = ~np.asarray(problem.factor("outlines").whitening).any(axis=(1, 2))
     image = o.view * problem.n_elements + o.pose
-    return np.asarray(np.bincount(image, rejected) > MOST_REJECTED * np.bincount(image))[image]
+    most = MOST_REJECTED * np.bincount(image)
+    return np.asarray((np.bincount(image, rejected) > most)[image], dtype=np.bool_)
 
 
 def _size(number: _Solved) -> tuple[str, float, float]:
