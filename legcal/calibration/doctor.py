@@ -305,10 +305,8 @@ def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
 
 def _look_for_still_encoders(checklist: _Checklist, shares: Mapping[str, float]) -> None:
     """Look for encoders that use a small part of their travel."""
-    constant = {e.column for e in checklist.encoders if e.least == e.greatest}  # noted by the table
-    if len(constant) < len(checklist.encoders):
-        shares = {name: share for name, share in shares.items() if name not in constant}
-    still = [name for name, share in shares.items() if share < LITTLE_USED]
+    moves = any(shares.values())  # an encoder that never does is noted by the table, beside others
+    still = [x for x, share in shares.items() if share < LITTLE_USED and (share or not moves)]
     if still:
         percent = _range([100.0 * shares[name] for name in still])
         checklist.add(

@@ -190,8 +190,7 @@ def calibrate(
     """
     # 1. Load and identify.
     if criteria not in get_args(Criteria):
-        needed = " or ".join(get_args(Criteria))
-        raise UsageError(f"The criteria are {criteria!r}, needed {needed}; correct them.")
+        raise UsageError(f"The criteria are {criteria!r}, needed default or literal; correct them.")
     if output is not None:
         check_destination(output_path(output))
     overrides = overrides_of_call(priors, fixed, free)

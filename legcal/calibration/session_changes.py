@@ -60,8 +60,7 @@ _COARSE = 15  # groups of images whose scores say how much those of errors once 
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
-MOST_REJECTED = 0.5  # outlines of an image that is not left out
-FEW = 0.1  # of the outlines
+MOST_REJECTED, FEW = 0.5, 0.1  # outlines of an image that is not left out; of images that are
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
