@@ -170,6 +170,13 @@ def test_the_first_finding_is_what_was_done_with_its_amount(
         assert finding.between == (labels[11 + CHANGED_AT], labels[12 + CHANGED_AT])
 
 
+def test_a_slip_is_found_where_readings_are_stated_as_exact(healthy: Dataset, start: Start) -> None:
+    slipped = _with_readings(_slipped)(healthy)
+    m = replace(slipped.measurements, sigma_q=1e-9, sigma_by_joint={})
+    finding = _findings(replace(slipped, measurements=m), start)[0]
+    assert (finding.kind, finding.subject) == ("encoder", "leg2")
+
+
 def _exchanged(dataset: Dataset) -> Dataset:
     """Exchange two photographs of the first view."""
     outlines = dataset.observations
