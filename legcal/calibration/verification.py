@@ -443,10 +443,7 @@ def check(
     sentences = (diagnosis.sentence for diagnosis in estimate.diagnosis)
     on_images = (*estimate.image_notes, *estimate.fit_notes)
     of_images = notes_beside(estimate.diagnosis, on_images, "legcal calibrate --check")
-    known = (
-        "These images appear to be those of the earlier calibration itself, as they agree better "
-        "than new ones could: they cannot show a change; take new ones."
-    )
+    known = "These images appear to be those of the earlier calibration itself: take new ones."
     notes = (*sentences, *dataset.notes, *of_images, *solution.notes)
     notes = (*[known] * (answer.movement.p_value > 1.0 - _BY_CHANCE), *notes)
     return replace(answer, notes=tuple(dict.fromkeys(notes)))
