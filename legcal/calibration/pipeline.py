@@ -189,7 +189,7 @@ def calibrate(
         parameter or contradict each other.
     """
     # 1. Load and identify.
-    if criteria not in get_args(Criteria):
+    if criteria not in (*get_args(Criteria), None):
         raise UsageError(f"The criteria are {criteria!r}, needed default or literal; correct them.")
     if output is not None:
         check_destination(output_path(output))
