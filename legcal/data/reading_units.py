@@ -34,7 +34,7 @@ from legcal.machine.leg import Leg
 PULSES = "us"
 SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
 SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
-LEAST_SIGMA = 1e-7  # [m or rad]: exact beside outlines, and not so small that numbers lose it
+LEAST_SIGMA = 1e-6  # fraction of the travel: exact beside outlines, and not lost in rounding
 MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
 READING_UNITS = (*LENGTH, *ANGLE, PULSES)
 # Units that tables are usually in, of motors that slide and that turn
@@ -220,7 +220,8 @@ def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, flo
     It is the stated value of its motor, or else the usual one: *sigma_q* [m] for a sliding motor.
     """
     sigmas = [stated.get(str(leg.prismatic), usual_sigma(leg, sigma_q)) for leg in legs]
-    return np.maximum(sigmas, LEAST_SIGMA)
+    least = LEAST_SIGMA * np.ptp(np.reshape([leg.travel for leg in legs], (-1, 2)), axis=1)
+    return np.maximum(sigmas, np.where(np.isfinite(least), least, 0.0))
 
 
 def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:
