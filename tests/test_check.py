@@ -71,6 +71,15 @@ def _of_leg(dataset: Dataset, leg: int) -> Dataset:
     return replace(dataset, observations=shown)
 
 
+def test_images_of_the_calibration_itself_are_no_proof(result: Path, images: Path) -> None:
+    again = check(result.parent / "set", result)
+    assert not again.movement.moved
+    assert "those of the earlier calibration" in again.notes[0]
+    assert not any(
+        "those of the earlier calibration" in note for note in check(images, result).notes
+    )
+
+
 def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path) -> None:
     before = files_of(images)
     found = check(images, result)

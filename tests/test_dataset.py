@@ -44,6 +44,19 @@ def test_a_dataset_is_named_by_its_folder_or_its_file(
         np.testing.assert_array_equal(load_dataset(name).measurements.q, expected.measurements.q)
 
 
+def test_cameras_in_millimetres_are_taken_so_and_said(folder: Folder) -> None:
+    near = read(folder).views[0].T_base_camera
+    assert near is not None
+    hint = folder.entry["views"]["c1"]["T_base_camera"]
+    hint["xyz"] = [1e3 * x for x in hint["xyz"]]
+    folder.write()
+    dataset = load_dataset(folder.path)
+    T = dataset.measurements.views[0].T_base_camera
+    assert T is not None
+    np.testing.assert_allclose(T.as_matrix(), near.as_matrix(), atol=1e-12)
+    assert [note for note in dataset.notes if "view c1" in note and "millimetres" in note]
+
+
 def test_views_keep_their_camera_pose_and_legs(folder: Folder) -> None:
     folder.entry["views"]["c1"]["T_base_camera"]["quat_xyzw"] = [0.0, 0.0, 0.7071, 0.7071]
     folder.entry["views"]["c9"] = {"camera": "camera_info.yaml"}
@@ -95,6 +108,20 @@ def test_rows_of_one_label_share_a_pose_and_the_mean_reading(folder: Folder) -> 
     folder.rows[2][JOINTS[2]] += 1e-4
     with pytest.raises(DatasetError, match=r"row 1 .*leg3_prismatic: the pose b .* 0.0001 m"):
         read(folder)
+
+
+def test_readings_from_another_zero_and_still_encoders_are_called_so(folder: Folder) -> None:
+    for row in folder.rows:
+        row[JOINTS[2]] = 0.07
+    folder.write()
+    (note,) = load_dataset(folder.path).notes
+    assert "the same reading in all rows of leg3_prismatic" in note
+    for row in folder.rows:
+        row.update({name: row[name] + 0.21 for name in JOINTS})
+    folder.write()
+    with pytest.raises(DatasetError, match="from another zero") as refusal:
+        load_dataset(folder.path)
+    assert "inches" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -268,7 +268,7 @@ REFUSED: list[tuple[dict[str, Any], type[legcal.LegcalError], str]] = [
     ({"images": 401}, UsageError, "1 to 400"),
     ({"images": 9, "images_per_view": 3}, UsageError, "--images-per-view"),
     ({"images": 9, "target": 1e-4}, UsageError, "--target"),
-    ({"images": 2, "cameras": 3}, UsageError, "3 --images"),
+    ({"images": 2, "cameras": 3}, UsageError, "--images 3"),
     ({"cameras": 0}, UsageError, "--cameras 0"),
     ({"target": 0.0}, UsageError, "more than 0"),
     ({"seed": -1}, UsageError, "--seed"),
@@ -320,7 +320,7 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=around(1.4))  # fmt: skip
     refused(NotVisible, "; use a board with larger squares", board="chessboard:9x6:5mm")
-    refused(NotIdentifiable, "plan .* --images or more", images=1, places=around(1.4))
+    refused(NotIdentifiable, "give --images . or more", images=1, places=around(1.4))
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
     upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))
     assert difference(upright, tilted) == "axes of joints up to 15 deg from those of the model"

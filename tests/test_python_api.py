@@ -50,6 +50,7 @@ def test_a_result_that_is_loaded_says_what_the_calibration_said(example_run: Run
     assert loaded.summary() == calibration.summary()
     assert calibration.verdict.sentence in calibration.summary()
     assert "outlines of 45 images used" in repr(loaded)
+    assert legcal.evaluate(loaded, example_run.output).displacement.max() == 0.0
     table = calibration.table()
     rows = {row["parameter"]: row for row in table}
     found = calibration.solution.estimates.values["leg2.offset"]

@@ -168,6 +168,36 @@ def test_the_first_finding_is_what_was_done_with_its_amount(
         assert finding.between == (labels[11 + CHANGED_AT], labels[12 + CHANGED_AT])
 
 
+def test_a_slip_is_found_where_readings_are_stated_as_exact(healthy: Dataset, start: Start) -> None:
+    slipped = _with_readings(_slipped)(healthy)
+    m = replace(slipped.measurements, sigma_q=1e-9, sigma_by_joint={})
+    finding = _findings(replace(slipped, measurements=m), start)[0]
+    assert (finding.kind, finding.subject) == ("encoder", "leg2")
+
+
+def _exchanged(dataset: Dataset) -> Dataset:
+    """Exchange two photographs of the first view."""
+    outlines = dataset.observations
+    assert outlines is not None
+    rows = np.arange(24)
+    rows[[3, 7]] = 7, 3
+    return replace(dataset, observations=replace(outlines, row=rows[outlines.row]))
+
+
+@pytest.mark.parametrize(
+    ("change", "codes"),
+    [
+        (_exchanged, []),
+        (lambda d: with_rays(d, np.arange(24) >= 12, zoomed(3.0 * ZOOM)), ["camera"]),
+    ],
+    ids=["photographs exchanged", "camera file of a view"],
+)
+def test_readings_and_autofocus_are_not_accused_of_wrong_rows_or_a_camera_file(
+    healthy: Dataset, change: Callable[[Dataset], Dataset], codes: list[str]
+) -> None:
+    assert [doubt.code for doubt in calibrate(change(healthy)).doubts] == codes
+
+
 def test_a_joint_that_moved_is_named_and_not_the_encoder_of_its_leg(
     healthy: Dataset, start: Start
 ) -> None:

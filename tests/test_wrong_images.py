@@ -220,7 +220,6 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     ("written", "words"),
     [
         (lambda T: T.inv(), "if it is T_camera_base, the inverse:"),
-        (lambda T: _pose(1e3 * T.translation, T.rotation), "if its xyz are millimetres:"),
         (
             lambda T: _pose(T.translation, _w_first(T.rotation)),
             "if its quaternion is in the order w, x, y, z:",

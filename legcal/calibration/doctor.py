@@ -304,20 +304,9 @@ def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
 
 
 def _look_for_still_encoders(checklist: _Checklist, shares: Mapping[str, float]) -> None:
-    """Look for encoders with constant readings, or with a small part of their travel."""
-    constant = [
-        encoder.column for encoder in checklist.encoders if encoder.least == encoder.greatest
-    ]
-    if 0 < len(constant) < len(checklist.encoders):
-        checklist.add(
-            "readings",
-            "warning",
-            f"{checklist.dataset.table_path}: found the same reading in all rows of "
-            f"{few(constant)}, while other encoders move; check that these were recorded, and move "
-            "these legs as well.",
-        )
-        shares = {name: share for name, share in shares.items() if name not in constant}
-    still = [name for name, share in shares.items() if share < LITTLE_USED]
+    """Look for encoders that use a small part of their travel."""
+    moves = any(shares.values())  # an encoder that never does is noted by the table, beside others
+    still = [x for x, share in shares.items() if share < LITTLE_USED and (share or not moves)]
     if still:
         percent = _range([100.0 * shares[name] for name in still])
         checklist.add(

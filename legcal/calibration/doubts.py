@@ -116,9 +116,7 @@ def doubts_of(
         else [
             *of.moved_parameters(),
             *_held_out(held_out),
-            *of.cameras(),
-            *of.left_out(),
-            *noise,
+            *(of.cameras() or [*of.left_out(), *noise]),
         ]
     )
     if session.findings and any(one.code in OF_CHANGES for one in symptoms):
@@ -134,8 +132,8 @@ def doubts_of(
         *(Doubt("readings", what, remedy, is_grave=True) for what, remedy in contradicted),
         *_legs_left_out(solution, explained),
         *_clicks(dataset, solution),
-        *(one for one in _strayed_cameras(dataset, solution) if one.is_grave or not causes),
         *_views(dataset, solution, corners),
+        *(one for one in _strayed_cameras(dataset, solution) if one.is_grave or not causes),
         *([] if causes else _few_outlines(solution.outlines)),
         *of.nominal_lengths(),
         *of.no_better(),
@@ -410,7 +408,11 @@ class _Evidence:
         if not views:
             return []
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
-        what = f"the measurements contradict the camera of {few_views(views)}"
+        wrong = max(self.solution.camera_doubts, key=lambda one: one.apart)
+        what = (
+            f"the measurements contradict the camera of {few_views(views)}, above all its "
+            f"{wrong.kind.replace('_', ' ')}: {wrong.found}"
+        )
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "
             "zoomed, scaled or cropped"

@@ -5,10 +5,12 @@ the displacement of the platform joint of the first frame leg (the origin of R_e
 the rotation between the two orientations.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -25,6 +27,9 @@ from legcal.machine.kinematics import followed_poses, platforms_in_base, pose_di
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of, vector_of
+
+if TYPE_CHECKING:
+    from legcal.calibration.result_folder import EarlierResult
 
 MAX_DRAWS = 20  # largest number of draws to replace poses that the reference does not reach
 FIRST_POSES = 10  # poses of the first draw; the only one if the reference reaches none of them
@@ -67,8 +72,8 @@ class Evaluation:
 
 
 def evaluate(
-    model: str | Path | Machine,
-    reference: str | Path | Machine,
+    model: str | Path | Machine | EarlierResult,
+    reference: str | Path | Machine | EarlierResult,
     *,
     dataset: str | Path | None = None,
 ) -> Evaluation:
@@ -76,7 +81,7 @@ def evaluate(
 
     Parameters
     ----------
-    model, reference : path, name or Machine
+    model, reference : path, name, Machine or EarlierResult
         The two mechanisms; they must have the same legs and frames.
     dataset : path, optional
         Compare at the readings of this dataset that both models reach; by default at 100 poses of
@@ -98,8 +103,8 @@ def evaluate(
     If the motors do not determine the pose, only parameters are compared and both arrays of
     platform errors are empty.
     """
-    machine = model if isinstance(model, Machine) else load_mechanism(model)
-    truth = reference if isinstance(reference, Machine) else load_mechanism(reference)
+    given = (x if isinstance(x, str | Path | Machine) else x.machine for x in (model, reference))
+    machine, truth = (x if isinstance(x, Machine) else load_mechanism(x) for x in given)
     truth = _in_the_order_of(truth, machine)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []

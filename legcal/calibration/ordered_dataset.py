@@ -273,7 +273,8 @@ def nominal_poses(
     refused |= {
         first[k]: Cause(
             "found that the nominal model cannot reach them, with a residual of {:.1f} mm at the "
-            "nearest pose, needed at most {:.1f} mm; check these readings and legcal.home, or take",
+            "nearest pose, needed at most {:.1f} mm; check these readings, their columns, the "
+            "joints of the model and legcal.home, or take",
             (1e3 * float(residual[k]), 1e3 * limit),
         )
         for k in unreached
@@ -283,7 +284,7 @@ def nominal_poses(
         raise DatasetError(
             [
                 f"The readings of {images_in_words(measurements, rows)} could not be used: {cause} "
-                f"the image{'s' * (len(rows) > 1)} out."
+                f"the image{'s' * (len(rows) > 1)} out of the tables."
                 for cause, rows in by_cause(refused)
             ]
         )

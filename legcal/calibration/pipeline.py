@@ -22,6 +22,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -116,7 +117,7 @@ def calibrate(
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
     holdout: float | None = None,
-    leave_out: str = "",
+    leave_out: str | Sequence[str] = "",
     split: Sequence[str] = (),
     overlays: bool = False,
     only: Group | None = None,
@@ -153,7 +154,7 @@ def calibrate(
     holdout : float, optional
         Hold out this fraction of the images, and compare them with the prediction of the fit to the
         others.
-    leave_out : str
+    leave_out : str or sequence of str
         Leave these images out of the fit: ``p22``, ``p22..p45`` in the order in which they were
         taken, ``c2`` for a view, ``c2:p22`` where several views have that name; by commas.
     split : sequence of str
@@ -188,6 +189,8 @@ def calibrate(
         parameter or contradict each other.
     """
     # 1. Load and identify.
+    if criteria not in (*get_args(Criteria), None):
+        raise UsageError(f"The criteria are {criteria!r}, needed default or literal; correct them.")
     if output is not None:
         check_destination(output_path(output))
     overrides = overrides_of_call(priors, fixed, free)
@@ -197,6 +200,7 @@ def calibrate(
     choices = chosen_parameters(dataset, overrides)
     by_parts = Choices.by_tolerances(dataset.machine, only)
     choices = replace(choices, built=by_parts.built, only=by_parts.only)
+    leave_out = ",".join(listed(leave_out))
     left_out = chosen_images(dataset, leave_out) if leave_out else None
     if zeros := own_zeros(dataset, listed(split), left_out):
         dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
@@ -335,7 +339,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
     A refusal names the likely mistakes of the session before their consequences, and also notes on
-    files of photographs that contradict their camera: they may be the cause.
+    odd readings and files of photographs that contradict their camera: they may be the cause.
 
     Raises
     ------
@@ -354,7 +358,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         return _estimate(data, rows, options, diagnosed)
     except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
         is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
-        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.file_notes
+        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.notes
         if not (diagnosis or notes):
             raise
         refused: Sequence[str | Problem] = error.facts

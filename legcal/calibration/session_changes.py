@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, combinations, pairwise
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -45,6 +45,7 @@ from legcal.estimation.uncertainty import (
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LegColumns
+from legcal.vision.camera import shared_cameras
 
 MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
@@ -59,6 +60,7 @@ _COARSE = 15  # groups of images whose scores say how much those of errors once 
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
+MOST_REJECTED, FEW = 0.5, 0.1  # outlines of an image that is not left out; of images that are
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
@@ -149,7 +151,7 @@ class Finding:
         return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
 
 
-_WITHOUT_ORDER: tuple[Kind, ...] = ("gain", "pitch", "eccentricity")
+_WITHOUT_ORDER: tuple[str, ...] = ("gain", "pitch", "eccentricity", "camera_file")
 _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative amounts
     "lag": ("ahead of", "behind"),
     "gain": ("too large", "too small"),
@@ -227,7 +229,8 @@ _WORDS: Mapping[Kind, tuple[str, str]] = {
 class _Hypothesis:
     """A number that a fit lacks, by what a unit of it does to whitened residuals in each image."""
 
-    kind: Kind
+    # The fit itself names camera files that are wrong: here they explain what others would
+    kind: Kind | Literal["camera_file"]
     subject: str
     unit: str
     columns: Mapping[str, Array]  # (n, q, d) of factors by name
@@ -281,6 +284,20 @@ def session_tests(
     """
     if not len(posterior.problem.outlines):
         return SessionTests()
+    left_out = _left_out(posterior.problem)
+    tests = _tests(_with_rejected(posterior), measurements, sequences)
+    changes = any(finding.kind not in OF_SCATTER for finding in tests.findings)
+    if changes or not 0.0 < left_out.mean() <= FEW:
+        return tests
+    # A few wrong rows, or photographs of others, are no scatter if there is none without them
+    others = _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
+    return tests if {finding.kind for finding in others.findings} & OF_SCATTER else others
+
+
+def _tests(
+    posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
+) -> SessionTests:
+    """Test a fit with some outlines for numbers that it lacks."""
     has_order = len(sequences) > 0
     fit = _Fit.of(
         posterior, measurements, sequences if has_order else [np.arange(measurements.n_rows)]
@@ -314,7 +331,8 @@ def session_tests(
         scores = scores.with_noise(noise)
         solved = [scores.solved(number.test) for number in lacking]
         lacking, _ = _forward_selection(scores, solved, len(tests))
-    findings = [fit.finding(number, measurements, len(tests)) for number in lacking]
+    named = [number for number in lacking if number.test.of.kind != "camera_file"]
+    findings = [fit.finding(number, measurements, len(tests)) for number in named]
     if noise is not None:
         findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
@@ -387,22 +405,31 @@ def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArra
                 yield run
 
 
-def _with_rejected(posterior: Posterior) -> FitProblem:
-    """Return the problem with what it rejected, what is far off with the weights of Huber's loss.
+def _with_rejected(posterior: Posterior, among: BoolArray | float = 1.0) -> Posterior:
+    """Return the fit with what it rejected, what is far off with the weights of Huber's loss.
 
     A fit rejects outlines, and readings of redundant motors, on one side of a change where the
-    other side has more.
+    other side has more. *Among* some outlines.
     """
     problem, noise, state = posterior.problem, posterior.noise, posterior.state
     offsets, claimed = problem.offsets(state), problem.outlines.covariance
     distance = np.sqrt(noise.squared_norms(offsets, claimed))
-    problem = problem.weighted(noise, _HUBER / np.maximum(distance, _HUBER))
-    if not problem.legs.is_redundant:
-        return problem
-    factor, sigma = problem.factor("readings"), problem.readings.sigma
-    distance = np.abs(factor.rows(state).r[:, 0]) / sigma
-    root = np.sqrt(_HUBER / np.maximum(distance, _HUBER)) / sigma
-    return problem.with_factors(replace(factor, whitening=root[:, None, None]))
+    problem = problem.weighted(noise, among * _HUBER / np.maximum(distance, _HUBER))
+    if problem.legs.is_redundant:
+        factor, sigma = problem.factor("readings"), problem.readings.sigma
+        distance = np.abs(factor.rows(state).r[:, 0]) / sigma
+        root = np.sqrt(_HUBER / np.maximum(distance, _HUBER)) / sigma
+        problem = problem.with_factors(replace(factor, whitening=root[:, None, None]))
+    return replace(posterior, problem=problem)
+
+
+def _left_out(problem: FitProblem) -> BoolArray:
+    """Return the outlines (n,) of images most of whose outlines a fit rejects."""
+    o = problem.outlines
+    rejected = ~np.asarray(problem.factor("outlines").whitening).any(axis=(1, 2))
+    image = o.view * problem.n_elements + o.pose
+    most = MOST_REJECTED * np.bincount(image)
+    return np.asarray((np.bincount(image, rejected) > most)[image], dtype=np.bool_)
 
 
 def _size(number: _Solved) -> tuple[str, float, float]:
@@ -618,8 +645,7 @@ class _Fit:
     def of(
         cls, posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
     ) -> _Fit:
-        """Linearise a fit, with what it rejected."""
-        posterior = replace(posterior, problem=_with_rejected(posterior))
+        """Linearise a fit."""
         problem, state = posterior.problem, posterior.state
         linear = linearize(problem, state)
         normal = normal_equations(problem, state, linear)
@@ -655,12 +681,14 @@ class _Fit:
         yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
 
     def of_views(self) -> Iterator[_Hypothesis]:
-        """Yield what may have changed about the camera of each view.
+        """Yield what may have changed about the camera of each view, and wrong camera files.
 
-        Corners of a board on the base are means over the images of a view, changed by the share of
-        those after a change.
+        A file may be wrong in all views that have it, or in one. Corners of a board on the base are
+        means over the images of a view, changed by the share of those after a change.
         """
         problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        owners = np.array(shared_cameras(problem.outlines.views, problem.first_cameras))
+        of_files = [owners == owner for owner in owners]
         boards = {corners.name: corners for corners in problem.boards if len(corners)}
         shares = {
             name: course.of_images(table.view, table.pose)
@@ -670,6 +698,7 @@ class _Fit:
         for v, view in enumerate(problem.outlines.views):
             if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
                 continue
+            of_files.append(np.arange(len(owners)) == v)
             moved = []
             for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
                 error = np.zeros((len(problem.outlines.views), 6))
@@ -682,6 +711,11 @@ class _Fit:
             zoom = residuals.zoomed(v)
             focal = {name: -zoom[name][..., None] for name in shares}
             yield _Hypothesis("focal_length", view, "1", focal, shares, True)
+        for views in np.unique(of_files, axis=0):
+            errors = chain.from_iterable(residuals.errors_of_files(views).values())
+            if changes := [residuals.changes(error) for error in errors]:
+                columns = {of: np.stack([one[of] for one in changes], axis=-1) for of in shares}
+                yield _Hypothesis("camera_file", "", "", columns, shares, False)
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""
@@ -787,7 +821,7 @@ class _Fit:
         test, hypothesis = number.test, number.test.of
         holds = test.holds.astype(np.float64)[:, None]
         return Finding(
-            hypothesis.kind,
+            cast(Kind, hypothesis.kind),
             hypothesis.subject,
             *_size(number),
             test.between,

@@ -323,6 +323,7 @@ def _together(name: str, changes: Sequence[Change]) -> Change:
 SIGNIFICANCE = 0.01
 MAX_SIGNIFICANCE = 0.5
 BETTER = 2.5  # smallest difference of costs that decides for another minimum
+_BY_CHANCE = 1e-6  # probability of new images that agree as well as those of the calibration
 PRIOR_SIGMA = 0.009  # [rad, mean leg lengths]; below the limit for directions held at nominal
 
 
@@ -382,7 +383,7 @@ class Check:
 
 def check(
     source: str | Path | Dataset,
-    result: str | Path,
+    result: str | Path | EarlierResult,
     *,
     significance: float = SIGNIFICANCE,
     progress: Progress = False,
@@ -394,7 +395,7 @@ def check(
     ----------
     source : path or Dataset
         The new images, from arbitrary cameras. Nothing is written into their folder.
-    result : path
+    result : path or EarlierResult
         The result folder of the earlier calibration.
     significance : float
         Probability of a false alarm.
@@ -422,7 +423,7 @@ def check(
             f"needed a probability above 0 and up to {MAX_SIGNIFICANCE:g} (0.01 gives one "
             "false alarm in a hundred checks); correct it."
         )
-    earlier = load_result(result)
+    earlier = result if isinstance(result, EarlierResult) else load_result(result)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
     prior = _EarlierEstimate.of(dataset.machine, earlier)
@@ -442,7 +443,9 @@ def check(
     sentences = (diagnosis.sentence for diagnosis in estimate.diagnosis)
     on_images = (*estimate.image_notes, *estimate.fit_notes)
     of_images = notes_beside(estimate.diagnosis, on_images, "legcal calibrate --check")
+    known = "These images appear to be those of the earlier calibration itself: take new ones."
     notes = (*sentences, *dataset.notes, *of_images, *solution.notes)
+    notes = (*[known] * (answer.movement.p_value > 1.0 - _BY_CHANCE), *notes)
     return replace(answer, notes=tuple(dict.fromkeys(notes)))
 
 

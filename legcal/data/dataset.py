@@ -50,6 +50,7 @@ from legcal.data.reading_units import (
 )
 from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
+from legcal.files.motions import motion_from_xyz_quat
 from legcal.files.schema import closest, describe
 from legcal.machine.files import shipped_folder, shipped_names
 from legcal.machine.leg import Link
@@ -66,6 +67,7 @@ PLAN_NAME = "plan.json"  # plan in the folder of a planned session
 POSES_NAME = "poses.csv"  # its poses
 CACHE_NAME = ".legcal-cache.json"
 MAX_KEPT = 128 * 2**20  # size of the cache of decoded images [bytes]
+FARTHEST = 50.0  # sizes of the machine from base to camera, in metres
 MIN_CORNERS = 4  # corners in an image that must place its camera
 
 
@@ -314,8 +316,13 @@ def load_dataset(
     ]
     if problems:
         raise DatasetError(problems)
+    in_mm = [
+        name
+        for name, view in entry.views.items()
+        if (T := view.T_base_camera) and np.linalg.norm(T.xyz) > FARTHEST * machine.size
+    ]
     views = tuple(
-        _view(name, view, cameras[path])
+        _view(name, view, cameras[path], 1e-3 if name in in_mm else 1.0)
         for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
     )
     table_path = folder / entry.measurements
@@ -339,6 +346,9 @@ def load_dataset(
     )
     if unread:
         notes = (*notes, _without_readings(table_path, machine, unread))
+    if in_mm:
+        what = f"T_base_camera of {few_views(in_mm)} is too far for metres, and its xyz"
+        notes = (*notes, f"{yaml_path}: {what} were taken as millimetres: write metres.")
     measurements, origin, taken = expand_hand_held(yaml_path, rows, entry.views)
     if taken:
         raise DatasetError(taken)
@@ -448,12 +458,13 @@ def _mechanism_path(folder: Path, named: str) -> Path:
     return path
 
 
-def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
-    """Return a view of the measurements."""
+def _view(name: str, entry: ViewEntry, camera: Camera, unit: float) -> View:
+    """Return a view of the measurements; the unit of T_base_camera is in metres."""
+    T = entry.T_base_camera
     return View(
         name=name,
         camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_given=entry.gamma is not None),
-        T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
+        T_base_camera=motion_from_xyz_quat([unit * x for x in T.xyz], T.quat_xyzw) if T else None,
         legs=None if entry.legs is None else tuple(entry.legs),
     )
 

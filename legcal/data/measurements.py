@@ -295,6 +295,13 @@ def readings_in(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
+    still = np.ptp(readings, axis=0) == 0.0 if len(readings) else np.ones(len(motors), dtype=bool)
+    if still.any() and not still.all():
+        constant = few([str(leg.prismatic) for leg, one in zip(motors, still, strict=True) if one])
+        notes.append(
+            f"{table.path}: found the same reading in all rows of {constant}, while other encoders "
+            "move; check that these were recorded, and move these legs as well."
+        )
     groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]

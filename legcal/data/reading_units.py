@@ -34,13 +34,14 @@ from legcal.machine.leg import Leg
 PULSES = "us"
 SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
 SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
+LEAST_SIGMA = 1e-6  # fraction of the travel: exact beside outlines, and not lost in rounding
 MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
 READING_UNITS = (*LENGTH, *ANGLE, PULSES)
 # Units that tables are usually in, of motors that slide and that turn
 USUAL_UNITS = {False: ("m", "mm", "cm", "in"), True: ("rad", "deg", PULSES)}
 USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 # Fractions of the travel in use: in the stated unit, and in another that is certainly meant
-HARDLY_MOVES, SURELY_MOVES = 0.02, 0.5
+HARDLY_MOVES, SURELY_MOVES = 0.04, 0.5  # inches taken for mm use a 25th
 MIN_POSES = 5  # different poses: fewer are a check, perhaps close together
 
 
@@ -218,7 +219,9 @@ def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, flo
 
     It is the stated value of its motor, or else the usual one: *sigma_q* [m] for a sliding motor.
     """
-    return np.array([stated.get(str(leg.prismatic), usual_sigma(leg, sigma_q)) for leg in legs])
+    sigmas = [stated.get(str(leg.prismatic), usual_sigma(leg, sigma_q)) for leg in legs]
+    least = LEAST_SIGMA * np.ptp(np.reshape([leg.travel for leg in legs], (-1, 2)), axis=1)
+    return np.maximum(sigmas, np.where(np.isfinite(least), least, 0.0))
 
 
 def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:
@@ -401,7 +404,13 @@ def likely_cause(
     possible = [m for m in corrected if in_travel(m.q, legs).all()]
     if possible and len(values) > 1:
         best = max(possible, key=lambda m: float(m.used(legs).mean()))
-        return best.said(legs, name, in_dataset=in_dataset)
+        as_stated = float(Meaning(tuple(units), joint_values(values, units)).used(legs).max())
+        if best.used(legs).mean() >= HARDLY_MOVES or not HARDLY_MOVES <= as_stated <= 1.0:
+            return best.said(legs, name, in_dataset=in_dataset)
+        return (
+            "they move no further than the travel, and so look like readings from another zero: "
+            "shift them into it, or correct limits and offset of the model"
+        )
     low, high = USUAL_PULSES
     if turns and name != PULSES and np.all((values > low) & (values < high)):
         return "these look like pulses of servos in us: " + (

@@ -376,13 +376,7 @@ def read_description(
                 "Carriages slide along z of the base link, and joints on them are where they are "
                 "at reading 0: a table in YAML can say otherwise (actuators).",
             )
-        table["name"] = name or table["name"]
-        if not is_plain_name(table["name"]) and name is None:
-            raise ModelError(
-                f"{path}: the model could not be named after the file: found "
-                f"{describe(table['name'])}, needed letters, digits, '-', '_' and '.'; "
-                "give it a name with --name NAME."
-            )
+        table["name"] = name or _plain(table["name"]).strip("_-.") or "machine"
     else:
         table = read_yaml(path, FILE_KIND, ModelError)
         table = {key: value for key, value in table.items() if value is not None}

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -101,7 +102,7 @@ def dimensions_alone(kind: str, path: Path) -> ModelError:
 
 def what_a_dataset_is_for(path: Path) -> Problem:
     """Return the problem of a dataset given as a model, with the commands for datasets."""
-    folder = path.parent if path.name == DATASET_YAML else path
+    folder = shlex.quote(str(path.parent if path.name == DATASET_YAML else path))
     return Problem(
         "the mechanism could not be read: found a dataset, needed a model; give the model that it "
         f"names, or judge the dataset with: legcal identify {folder}, and calibrate it with: "

@@ -55,7 +55,6 @@ MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with t
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
 NO_OUTLINE = Rejection(Reason.OTHER, "no outline is used")
 
-MILLIMETRE = 1e-3  # [m]
 # Axes of cameras in other software, as columns the x, y and z of ours in them.
 _CAMERA_AXES = {
     "y up and z backward": np.diag([1.0, -1.0, -1.0]),
@@ -516,18 +515,9 @@ def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 
 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:
     """Yield common misinterpretations of T_base_camera, with the pose each would mean."""
-    t, R = hint.translation, hint.rotation
-    written = (
-        ("", t, R),
-        ("its xyz are millimetres", MILLIMETRE * t, R),
-        (
-            "its quaternion is in the order w, x, y, z",
-            t,
-            Rotation.from_quat(np.roll(R.as_quat(), -1)),
-        ),
-    )
-    for what, xyz, rotation in written:
-        pose = RigidTransform.from_components(xyz, rotation)
+    other = Rotation.from_quat(np.roll(hint.rotation.as_quat(), -1))
+    for what, R in (("", hint.rotation), ("its quaternion is in the order w, x, y, z", other)):
+        pose = RigidTransform.from_components(hint.translation, R)
         if what:
             yield what, pose
         both = f", and {what}" if what else ""

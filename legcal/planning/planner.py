@@ -528,7 +528,7 @@ class _Search:
         n = max(len(more.images), task.n_images + 1)
         places = f"{task.n_views} camera position{'s' * (task.n_views != 1)}"
         remedy = (
-            f"plan {n} --images or more"
+            f"give --images {n} or more"
             if more.value < limit
             else "plan more --cameras, or --board"
         )

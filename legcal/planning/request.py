@@ -300,7 +300,7 @@ def _counts(
     if n_images < n_views:
         raise UsageError(
             f"The plan could not be made: found {n_images} images for {n_views} cameras, needed "
-            f"one for each at least; give {n_views} --images or more, or fewer --cameras."
+            f"one for each at least; give --images {n_views} or more, or fewer --cameras."
         )
     return n_images, n_views
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -89,8 +90,10 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
             printable(f"written: {output}"),
             *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
             "photograph it, and calibrate:",
-            printable(f"  legcal shoot {output} --watch FOLDER"),
-            printable(f"  legcal calibrate {plan.given or output} -o OUT{option}"),
+            printable(f"  legcal shoot {shlex.quote(str(output))} --watch FOLDER"),
+            printable(
+                f"  legcal calibrate {shlex.quote(str(plan.given or output))} -o OUT{option}"
+            ),
         ],
     )  # fmt: skip
 

@@ -223,6 +223,16 @@ class CameraResiduals:
         error = _camera_error(self.state, _FOCAL, {})
         return self.changes(error * (np.arange(len(error)) == view)[:, None])
 
+    def errors_of_files(self, views: BoolArray) -> dict[Intrinsic, list[Array]]:
+        """Return unit errors (n_views, 5) of what camera files say of some views, by kind."""
+        found = dict[Intrinsic, list[Array]]()
+        for kind in _OF_CAMERAS:
+            units = [_camera_error(self.state, *unit) for unit in _TESTED[kind][1]]
+            known = self._known_views(np.sum(units, axis=0)) & views
+            if known.any():
+                found[kind] = [known[:, None] * unit for unit in units]
+        return found
+
     def contradicted(self) -> list[WrongIntrinsic]:
         """Return the intrinsics in camera files that contradict the measurements.
 
@@ -249,14 +259,11 @@ class CameraResiduals:
         are not tested. The problem includes common-mode biases and the covariance of camera files,
         so that these are not mistaken for a wrong file.
         """
-        kinds, errors, columns = list[Intrinsic](), list[Array](), list[IntArray]()
-        for kind in _OF_CAMERAS:
-            units = [_camera_error(self.state, *unit) for unit in _TESTED[kind][1]]
-            views = self._known_views(np.sum(units, axis=0)) & of_camera
-            if views.any():
-                kinds.append(kind)
-                columns.append(len(errors) + np.arange(len(units), dtype=np.intp))
-                errors += [views[:, None] * unit for unit in units]
+        of_kinds = self.errors_of_files(of_camera)
+        kinds, errors, columns = list(of_kinds), list[Array](), list[IntArray]()
+        for units in of_kinds.values():
+            columns.append(len(errors) + np.arange(len(units), dtype=np.intp))
+            errors += units
         selected = dict[int, float]()
         scores = given = self._scores(errors) if errors else None
         while given is not None and len(selected) < len(kinds):
