@@ -349,7 +349,7 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
     search = _search(_Made, made, np.array([made.posed(P) for P in spread]))
     monkeypatch.setattr(  # there are no images to measure outlines in
-        recognition, "_decided_by_outlines", lambda search, pictures, task: task[1]
+        recognition, "_decided_by_outlines", lambda search, group, pictures, one: one
     )
     for hint in (T, turned):
         placement = recognition.place_views(search, np.arange(4), [hint])
@@ -365,8 +365,14 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     T, made, poses = lp.camera(rng), lp.machine(6), [lp.platform(rng) for _ in range(4)]
     _Made.made[:] = lp.pictures(made, T, poses, rng, missing=1.1)
     search = _search(_Made, made, np.array([made.posed(P) for P in poses]))
-    monkeypatch.setattr(recognition, "_decided_by_outlines", lambda search, pictures, task: task[1])
-    monkeypatch.setattr(recognition, "_by_edges", lambda search, task: task.by_pairs)
+    monkeypatch.setattr(
+        recognition, "_decided_by_outlines", lambda search, group, pictures, one: one
+    )
+    monkeypatch.setattr(
+        recognition,
+        "_by_edges",
+        lambda search, group, pictures, known: recognition.place_camera([], 6),
+    )
     view = search.measurements.views[0]
     for is_placed in (False, True):
         views = (replace(view, is_placed=is_placed),)
