@@ -32,6 +32,7 @@ from legcal.perception.candidate_pairs import find_candidate_pairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     EdgeMaps,
+    LegSegments,
     PairMatches,
     Picture,
     Pictures,
@@ -76,15 +77,13 @@ def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> CameraPoses:
 
 def _matched(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Return the matches of one picture, without those of others."""
-    score, pair, visible = match_pairs(Pictures.of([picture]), poses, tolerance)
-    return PairMatches(score[0], pair[0], visible[0])
+    every = match_pairs(Pictures.of([picture]), poses, tolerance)
+    return PairMatches(every.score[0], every.pair[0], every.visible[0])
 
 
 def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
     (picture, *_), T = _scene(0)
-    doubled = replace(picture.targets, **{
-        name: np.concatenate([getattr(picture.targets, name)] * 2) for name in vars(picture.targets)
-    })  # fmt: skip
+    doubled = LegSegments.joined([picture.targets] * 2)
     n = len(picture.targets)
     doubled.ends[n:] += 1.5e-3  # as good a pose, but for these segments
     m = _matched(replace(picture, targets=doubled), _pose(T), 0.025)
@@ -236,7 +235,7 @@ def test_poses_are_moved_to_where_edges_run_along_legs_that_show_no_clean_pair()
     middle = np.array([0.0, 0.0, 0.2])
     away = (1.08 * T.apply(middle)) - np.einsum("nij,j->ni", R, middle)
     start = CameraPoses.rigid(R, away, 6)
-    assert not place_by_edges(seen, maps, 6, start.take(slice(0, 0))).is_convincing
+    assert not place_by_edges(seen, maps, 6, start.choose(slice(0, 0))).is_convincing
     placed = place_by_edges(seen, maps, 6, start)
     off = T_base_camera.inv() * placed.pose()
     assert np.degrees(off.rotation.magnitude()) < 3.0

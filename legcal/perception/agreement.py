@@ -139,7 +139,7 @@ def pairs_of_outlines(outlines: Outlines, measurements: Measurements) -> dict[in
             merit=length,
             pixel=1.0 / float(camera.K[0, 0]),
         )
-        found[row] = pairs_of_row.take(np.argsort(-length, kind="stable"))
+        found[row] = pairs_of_row.choose(np.argsort(-length, kind="stable"))
     return found
 
 

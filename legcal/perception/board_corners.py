@@ -19,6 +19,7 @@ from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements
 from legcal.errors import NotVisible
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.corner_lattice import (
     Print,
@@ -104,18 +105,13 @@ class SeenBoard:
 
 
 @dataclass(frozen=True, eq=False)
-class NumberedCorners:
+class NumberedCorners(Table):
     """Corners of a board in an image."""
 
     number: IntArray  # (k,) on the board, ascending
     px: Array  # (k, 2)
     sigma_px: Array  # (k,) of either coordinate [px]
     certain: bool  # whether the numbers could be no others
-
-    def choose(self, rows: IntArray) -> NumberedCorners:
-        """Return some of them."""
-        numbers, px, sigma_px = self.number[rows], self.px[rows], self.sigma_px[rows]
-        return NumberedCorners(numbers, px, sigma_px, self.certain)
 
 
 def find_corners(

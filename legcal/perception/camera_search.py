@@ -198,14 +198,14 @@ def place_camera(
         poses = refined(first, poses, SEARCHING[2:4], every.joint_error)
         some = Pictures.of(best_first[: max(SOME_PICTURES, done)])
         score = scores(some, poses, SEARCHING[3])
-        poses = poses.take(_distinct(poses, score, N_KEPT[2]))
+        poses = poses.choose(_distinct(poses, score, N_KEPT[2]))
         # From far a flat machine looks alike with near and far exchanged.
-        ahead, ends = poses.take(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
+        ahead, ends = poses.choose(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
         poses = CameraPoses.joined([poses, depth_reversed(ahead, ends) if len(ends) else ahead])
         poses = refined(some, poses, SEARCHING[3:], every.joint_error)
         score = scores(some, poses, SEARCHING[-1])
-        poses = poses.take(_best(score, N_KEPT[3]))
-        poses = CameraPoses.joined([poses, _polished(some.take(slice(N_POLISHING)), poses)])
+        poses = poses.choose(_best(score, N_KEPT[3]))
+        poses = CameraPoses.joined([poses, _polished(some.choose(slice(N_POLISHING)), poses)])
         best = _candidates(every, refined(every, poses, FITTING, every.joint_error))
     return best
 
@@ -235,8 +235,8 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
         around = refined(pictures, around, POLISH, pictures.joint_error)
         score = scores(pictures, around, POLISH[-1])
-        polished.append(around.take(_best(score, 1)))
-    return CameraPoses.joined([*polished, poses.take(np.zeros(0, dtype=np.intp))])
+        polished.append(around.choose(_best(score, 1)))
+    return CameraPoses.joined([*polished, poses.choose(np.zeros(0, dtype=np.intp))])
 
 
 def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
@@ -270,16 +270,16 @@ def place_by_edges(
         return _candidates(every, poses)
     coarse, rng = maps.halved(), np.random.default_rng(len(poses))
     few = slice(N_SUGGESTING)
-    score = coarse.take(few).blurred(EDGE_STEPS[0].blur).scores(every.take(few), poses)
-    poses = poses.take(_best(score, N_MOVED))
+    score = coarse.choose(few).blurred(EDGE_STEPS[0].blur).scores(every.choose(few), poses)
+    poses = poses.choose(_best(score, N_MOVED))
     for step in EDGE_STEPS:
         some = slice(None) if step.all_pictures else few
-        of_step = (maps if step.is_fine else coarse).take(some).blurred(step.blur)
-        poses, score = _moved_to_edges(of_step, every.take(some), poses, step, rng)
-        poses = poses.take(_distinct(poses, score, step.n_kept))
+        of_step = (maps if step.is_fine else coarse).choose(some).blurred(step.blur)
+        poses, score = _moved_to_edges(of_step, every.choose(some), poses, step, rng)
+        poses = poses.choose(_distinct(poses, score, step.n_kept))
     matches = match_pairs(every, poses, FITTING[-1])
     support, expected = (_by_legs(every, x).T for x in (matches.exclusive_score, matches.visible))
-    error = _leg_error(every, poses.take(slice(0, 1)))
+    error = _leg_error(every, poses.choose(slice(0, 1)))
     first = float(score.max()) / len(pictures)
     return PoseCandidates(poses, support, expected, support.sum(axis=1), error, along_edges=first)
 
@@ -300,7 +300,7 @@ def _moved_to_edges(
     parent = np.concatenate([np.arange(n), np.repeat(np.arange(n), N_TRIED)])
     order = np.lexsort([-score, parent])
     best = order[np.flatnonzero(np.diff(parent[order], prepend=-1))]
-    return tried.take(best), score[best]
+    return tried.choose(best), score[best]
 
 
 def place_near(
@@ -332,7 +332,7 @@ def with_first(
     order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
     return replace(
         placed,
-        poses=CameraPoses.joined([pose, placed.poses.take(order[1:])]),
+        poses=CameraPoses.joined([pose, placed.poses.choose(order[1:])]),
         support=placed.support[order],
         expected=placed.expected[order],
         score=placed.score[order],
@@ -353,9 +353,9 @@ def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
     score = support.sum(axis=1) - SHIFT_COST * cost
     order = _different(pictures, poses, matches, value >= MIN_MATCH_SCORE, score)
-    best = poses.take(order[:1])
+    best = poses.choose(order[:1])
     error = _leg_error(pictures, best)
-    return PoseCandidates(poses.take(order), support[order], expected[order], score[order], error)
+    return PoseCandidates(poses.choose(order), support[order], expected[order], score[order], error)
 
 
 def _by_legs(pictures: Pictures, value: Array) -> Array:
@@ -417,10 +417,10 @@ def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     if len(poses) == 0:
         return poses
     alone = Pictures.of([picture])
-    poses = poses.take(_best(scores(alone, poses, SEARCHING[0]), N_KEPT[0]))
+    poses = poses.choose(_best(scores(alone, poses, SEARCHING[0]), N_KEPT[0]))
     poses = refined(alone, poses, SEARCHING[:3])
     score = scores(alone, poses, SEARCHING[2])
-    return poses.take(_distinct(poses, score, N_KEPT[1]))
+    return poses.choose(_distinct(poses, score, N_KEPT[1]))
 
 
 def _suggested(picture: Picture, n_legs: int) -> CameraPoses:
@@ -542,7 +542,7 @@ class _FirstAssignments(NamedTuple):
 def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
     """Return camera poses that put two legs where two pairs of a picture are."""
     pairs, targets = (
-        picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
+        picture.pairs.choose(np.arange(min(N_SECOND, len(picture.pairs)))),
         picture.targets,
     )
     nothing = CameraPoses.none(n_legs)
@@ -631,7 +631,7 @@ def _turns(
 def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _FirstAssignments:
     """Take the best pairs for every segment, with all leans that their edges allow."""
     n = min(N_FIRST, len(pairs))
-    first = pairs.take(np.arange(n))
+    first = pairs.choose(np.arange(n))
     rays, planes = _rays(first), _planes(first)
     along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
     ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.perception.profiles import Samples
 from legcal.perception.tuning import EDGE_LENGTH, EDGE_SLOPE
@@ -58,17 +59,13 @@ DUPLICATE = 0.35, 0.2  # of a pair that repeats another: distance, difference of
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeSegments:
+class EdgeSegments(Table):
     """Straight edges on the sensor plane."""
 
     ends: Array  # (n, 2, 2) on the way from the first to the second the picture is brighter on the
     # left-hand side, as one sees it: in the direction (dy, -dx)
     covered: Array  # (n,) share of the length on which the edge was seen
     pixel: float  # size of a pixel of the reduced picture
-
-    def __len__(self) -> int:
-        """Return the number of edges."""
-        return len(self.ends)
 
 
 def reduction(camera: Camera, part: float) -> int:
@@ -370,7 +367,7 @@ def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array
 
 
 @dataclass(frozen=True, eq=False)
-class CandidatePairs:
+class CandidatePairs(Table):
     """Candidate cylinders of a picture, best first, on its sensor plane."""
 
     middle: Array  # (n, 2) of the axis
@@ -379,10 +376,6 @@ class CandidatePairs:
     width: Array  # (n, 2) distance of the edges at both ends; the first one is against ``along``
     merit: Array  # (n,) length on which both edges were seen
     pixel: float  # how well edges are known
-
-    def __len__(self) -> int:
-        """Return the number of pairs."""
-        return len(self.middle)
 
     @property
     def best_merit(self) -> float:
@@ -393,17 +386,6 @@ class CandidatePairs:
     def normal(self) -> Array:
         """Unit normals (n, 2) of the axes."""
         return np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
-
-    def take(self, chosen: IntArray | BoolArray) -> "CandidatePairs":
-        """Return some of the pairs."""
-        return CandidatePairs(
-            self.middle[chosen],
-            self.along[chosen],
-            self.half_length[chosen],
-            self.width[chosen],
-            self.merit[chosen],
-            self.pixel,
-        )
 
 
 def find_candidate_pairs(segments: EdgeSegments) -> CandidatePairs:

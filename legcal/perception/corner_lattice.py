@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.image_file import Grey
 
@@ -69,7 +70,7 @@ _LAGS = 2  # pixels over which residuals are correlated: mosaics of colour, JPEG
 
 
 @dataclass(frozen=True, eq=False)
-class Saddles:
+class Saddles(Table):
     """Crossings of two edges in an image."""
 
     px: Array  # (n, 2) where they are [px]
@@ -81,10 +82,6 @@ class Saddles:
     contrast: Array
     misfit: Array  # (n,) residual of the model (root mean square), over the contrast
     found: BoolArray  # (n,) whether the picture is a crossing at all; others have no numbers
-
-    def choose(self, rows: IntArray | BoolArray) -> Saddles:
-        """Return some of them."""
-        return Saddles(*(value[rows] for value in vars(self).values()))
 
     def moved_to(self, px: Array, scale: float) -> Saddles:
         """Return them where they are in an image, found in one that is scaled by a factor."""
@@ -707,14 +704,7 @@ def measured(
         _, axes = expected(board.xy(known), places, board.xy(beside), board.pitch)
         more = fit_saddles(grey, start, axes, board.length, board.band, blur)
         n = len(ij)
-        both = replace(
-            found,
-            **{
-                name: np.concatenate([value, getattr(more, name)])
-                for name, value in vars(found).items()
-            },
-        )
-        ij, found = _alike(board, known, both)
+        ij, found = _alike(board, known, Saddles.joined([found, more]))
         tried = (tried | set(map(tuple, beside.tolist()))) - set(map(tuple, ij.tolist()))
         if len(ij) <= n:
             break

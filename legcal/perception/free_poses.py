@@ -38,6 +38,7 @@ from legcal.estimation.solver import information
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import motions_of
 from legcal.geometry.rotations import rotation_matrices
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.leg import LegKind
@@ -145,19 +146,11 @@ class _Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class _Guesses:
+class _Guesses(Table):
     """Where the platform may be at a pose of the measurements, each with cameras that suit it."""
 
     poses: Array  # (n, 3, 4) T_base_platform
     cameras: Array  # (n, n_views, 3, 4) T_camera_base
-
-    def __len__(self) -> int:
-        """Return their number."""
-        return len(self.poses)
-
-    def take(self, chosen: IntArray | slice) -> _Guesses:
-        """Return some of them."""
-        return _Guesses(self.poses[chosen], self.cameras[chosen])
 
     @classmethod
     def before(cls, cameras: Array, poses: Array) -> _Guesses:
@@ -302,14 +295,14 @@ def _searched(scene: _Scene, cameras: Array, k: int) -> _Guesses:
         targets = _targets(scene.machine, guesses.poses)
     for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
         score = _scores(scene, cameras, k, guesses, targets, tolerance)
-        guesses = guesses.take(np.argsort(-score, kind="stable"))
+        guesses = guesses.choose(np.argsort(-score, kind="stable"))
         few = kept <= ALL_ALIKE
-        guesses = guesses.take(_apart(scene.machine, guesses.poses, kept) if few else slice(kept))
+        guesses = guesses.choose(_apart(scene.machine, guesses.poses, kept) if few else slice(kept))
         guesses = _stepped_often(scene, cameras, k, guesses, [tolerance] * (1 + few))
         targets = _targets(scene.machine, guesses.poses)
     score = _scores(scene, cameras, k, guesses, targets, TOLERANCES[-1])
-    guesses = guesses.take(np.argsort(-score, kind="stable"))
-    return guesses.take(_apart(scene.machine, guesses.poses, CHOICES))
+    guesses = guesses.choose(np.argsort(-score, kind="stable"))
+    return guesses.choose(_apart(scene.machine, guesses.poses, CHOICES))
 
 
 def _agreed(scene: _Scene, rough: Array, every: Mapping[int, _Guesses]) -> Array:

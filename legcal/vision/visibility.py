@@ -22,6 +22,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import moment
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm, main_cylinders
 from legcal.machine.rods import arms_at, ends_in_base, readings_of_rods
@@ -421,7 +422,7 @@ class Bodies:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Seen(Table):
     """The n visible segments of legs and arms in images of one camera."""
 
     image: IntArray  # (n,)
@@ -435,22 +436,8 @@ class Seen:
 
     def only(self, image: int) -> Seen:
         """Select the segments of one image."""
-        seen = self.chosen(self.image == image)
+        seen = self.choose(self.image == image)
         return replace(seen, image=np.zeros_like(seen.image))
-
-    def chosen(self, mask: BoolArray) -> Seen:
-        """Select some of the segments."""
-        selected = np.flatnonzero(mask)
-        return Seen(
-            self.image[selected],
-            self.leg[selected],
-            self.is_arm[selected],
-            tuple(self.part[i] for i in selected),
-            self.h[selected],
-            self.ends[selected],
-            self.span[selected],
-            self.length_px[selected],
-        )
 
     def visible_legs(self, n_images: int, n_legs: int) -> BoolArray:
         """Return a mask of the legs in each image, (n_images, n_legs)."""
