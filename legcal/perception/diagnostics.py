@@ -36,7 +36,6 @@ from legcal.perception.tuning import SEARCHING, SHARE_OF_OTHERS
 from legcal.workers import Run
 
 TOLERANCE = SEARCHING[-1]  # of an axis from its edge pair
-NOMINAL_TOLERANCE = 0.0375  # of a leg that nothing has moved from where the model has it
 # Share of the legs of another explanation of an image: at least, times that of its own reading,
 # and more than that.
 MIN_SHARE, MIN_GAIN, MIN_MORE = 0.35, 2.0, 0.15
@@ -49,7 +48,6 @@ _FLIPS = (
 )  # fmt: skip
 
 N_REFERENCES = 3  # good images that others are compared with
-MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
 GOOD_PERCENTILE = 75.0  # percentile of the shares that images show, for good images
 MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with them
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
@@ -123,7 +121,7 @@ def find_wrong_images(
         else:
             barely[row] = Cause("{}.", (said,))
     notes += _left_out_notes(search.measurements, left_out)
-    notes += _leg_notes(search, placement, outlines, counts, reasons)
+    notes += _leg_notes(search, outlines, counts, reasons)
     return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
 
@@ -241,16 +239,14 @@ def _most_common(rejections: Sequence[Rejection]) -> Rejection:
     return Rejection(reason, details.pop() if len(details) == 1 else "")
 
 
-def share_shown(
-    search: Search, placement: Placement, row: int, *, legs: IntArray | None = None
-) -> float:
+def share_shown(search: Search, placement: Placement, row: int) -> float:
     """Return the fraction of the predicted legs, by visible length, that an image shows.
 
-    By default of the legs stated for its view, which must have been placed.
+    Of the legs stated for its view, which must have been placed.
     """
     view = int(search.measurements.view[row])
-    picture = _picture(search, search.pairs(row, view), row, view, legs)
-    return _share(picture, placement, view, TOLERANCE if legs is None else NOMINAL_TOLERANCE)
+    picture = _picture(search, search.pairs(row, view), row, view)
+    return _share(picture, placement, view)
 
 
 def explain(
@@ -378,25 +374,21 @@ def _other_readings(search: Search, row: int) -> list[int]:
     return list(of_pose.values())
 
 
-def _picture(
-    search: Search, pairs: CandidatePairs, row: int, view: int, legs: IntArray | None = None
-) -> Picture:
+def _picture(search: Search, pairs: CandidatePairs, row: int, view: int) -> Picture:
     """Return pairs with what a view should show at the reading of a row."""
-    wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
+    wanted = np.flatnonzero(search.wanted[view])
     targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
     corners = sensor_extent(search.measurements.views[view].camera)
     return Picture(pairs, targets, corners, search.size, search.joint_error)
 
 
-def _share(
-    picture: Picture, placement: Placement, view: int, tolerance: float = TOLERANCE
-) -> float:
+def _share(picture: Picture, placement: Placement, view: int) -> float:
     """Return the share of the visible length of the legs on which a picture has their pairs."""
     T = placement.T_base_camera[view]
     if T is None or len(picture.targets) == 0:
         return 0.0
     pose = CameraPoses.one(T, placement.shift[view])
-    seen = match_pairs(Pictures.of([picture]), pose, tolerance)
+    seen = match_pairs(Pictures.of([picture]), pose, TOLERANCE)
     share = picture.targets.share
     visible = float(seen.visible[0, 0] @ share)
     return float(seen.exclusive_score[0, 0] @ share) / visible if visible > 0.0 else 0.0
@@ -459,12 +451,11 @@ def _references(
 
 def _leg_notes(
     search: Search,
-    placement: Placement,
     outlines: Outlines,
     counts: Mapping[int, OutlineCount],
     reasons: Mapping[int, Rejection],
 ) -> list[str]:
-    """Return notes on the legs listed for views."""
+    """Return notes on legs that views list and do not show."""
     measurements, names = search.measurements, search.leg_names
     notes = []
     for v, view in enumerate(measurements.views):
@@ -483,28 +474,7 @@ def _leg_notes(
                 f"outline of it ({why}); inspect them with legcal detect, or remove it from the "
                 "list."
             )
-        good = {row: counts[row] for row in rows}
-        notes += _left_out_legs(search, placement, v, _references(measurements, good, v))
     return notes
-
-
-def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[int]) -> list[str]:
-    """Return a note on legs that a view does not list although its images show them clearly."""
-    clear = [
-        name
-        for leg, name in enumerate(search.leg_names)
-        if not search.wanted[v, leg]
-        and search.cylinders[leg]
-        and all(
-            share_shown(search, placement, row, legs=np.array([leg])) >= MIN_VISIBLE for row in rows
-        )
-    ]
-    if not clear:
-        return []
-    return [
-        f"view {search.measurements.views[v].name} does not list {', '.join(clear)} (legs), which "
-        "its images show clearly; add them to use them."
-    ]
 
 
 def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
@@ -275,12 +274,8 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
         i: [name for name, fault in of_image.items() if fault.gain > _EXPLAINED]
         for i, of_image in faults.items()
     }
-    # The simplest fault wins; among equally simple ones, the most frequent.
     every = [name for names in candidates.values() for name in names]
-    likeliest = {
-        i: min(names, key=lambda name: (name in _FREE, -every.count(name)), default="")
-        for i, names in candidates.items()
-    }
+    likeliest = {i: max(names, key=every.count, default="") for i, names in candidates.items()}
     reasons = {}
     in_group = corners.px[group[corners.image]]
     for i, name in likeliest.items():
@@ -306,7 +301,9 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
                 "stabilisation or another crop"
             )
         elif name:
-            reasons[i] = _IN_WORDS[name]
+            reasons[i] = (
+                "another distortion of the lens than in the others, as where a program corrects it"
+            )
         else:
             rms = [adjusted.rms_px(mask) for mask in (corners.image == i, group[corners.image])]
             reasons[i] = (
@@ -326,11 +323,6 @@ def _is_outside(px: Array, others: Array) -> bool:
 
 _FREE = {"zoom": slice(0, 2), "shift": slice(2, 4), "lens": slice(4, 6)}  # of intrinsics
 _LIKE_A_LENS = ("", "zoom", "lens")  # faults like those of a wrong lens model
-_IN_WORDS = {
-    "turned": "turned by half a turn after it was taken",
-    "mirrored": "mirrored",
-    "lens": "another distortion of the lens than in the others, as where a program corrects it",
-}
 
 
 def _faults(
@@ -364,18 +356,6 @@ def _faults(
                 return
         faults[name] = _Fault((plain.cost - variant.cost) / excess, change)
 
-    # Undo the rotation or mirroring of the image; corner numbers are those of the mirrored board.
-    far = np.array([camera.width - 1.0, camera.height - 1.0])
-    for name, sides in (("turned", [-1.0, -1.0, 1.0]), ("mirrored", [-1.0, 1.0, 1.0])):
-        side = np.array(sides)
-        flip = np.array([side.prod(), 1.0, 1.0])
-        to_there = sheet.middle[0] * (1.0 - flip)
-        R = T.rotation.as_matrix()
-        t = side * (T.translation + R @ to_there)
-        pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
-        px = np.where(side[:2] < 0.0, far - image.px, image.px)
-        back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
-        add(name, adjust_board(camera, [pose], back, tolerance=tolerance))
     for name, free in _FREE.items():
         names = intrinsic_names(camera)[free]
         add(name, adjust_board(camera, [T], image, names, tolerance=tolerance))
