@@ -23,15 +23,13 @@ from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.motions import pose_distance
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
-from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     Picture,
     Pictures,
-    leg_segments,
     match_pairs,
 )
-from legcal.perception.placement import NotPlaced, Placement, Search, sensor_extent
+from legcal.perception.placement import NotPlaced, Placement, Search
 from legcal.perception.tuning import SEARCHING, SHARE_OF_OTHERS
 from legcal.workers import Run
 
@@ -245,7 +243,7 @@ def share_shown(search: Search, placement: Placement, row: int) -> float:
     Of the legs stated for its view, which must have been placed.
     """
     view = int(search.measurements.view[row])
-    picture = _picture(search, search.pairs(row, view), row, view)
+    picture = search.picture(row)
     return _share(picture, placement, view)
 
 
@@ -266,7 +264,7 @@ def explain(
     measurements = search.measurements
     view = int(measurements.view[row])
     pairs = search.pairs(row, view)
-    picture = _picture(search, pairs, row, view)
+    picture = search.picture(row, view, pairs)
     own = _share(picture, placement, view)
     others = [
         (
@@ -285,7 +283,7 @@ def explain(
     tried.append((share, Rejection(Reason.ZOOMED, Cause("{:.2f}", (zoom,))), _ORIGINAL))
     rows = _other_readings(search, row)
     readings = [
-        (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
+        (_share(search.picture(other, view, pairs), placement, view), other) for other in rows
     ]
     for share, other in _best(readings, suspects):
         tried.append((share, *_at_other_reading(search, row, other, other in suspects)))
@@ -297,7 +295,7 @@ def explain(
         seen = pairs if same else search.pairs(row, w)
         there = [row, *(other for other in rows if measurements.view[other] == w)]
         readings = [
-            (_share(_picture(search, seen, other, w), placement, w), other) for other in there
+            (_share(search.picture(other, w, seen), placement, w), other) for other in there
         ]
         for share, other in _best(readings, suspects):
             at = (
@@ -372,14 +370,6 @@ def _other_readings(search: Search, row: int) -> list[int]:
         ):
             of_pose[pose] = other
     return list(of_pose.values())
-
-
-def _picture(search: Search, pairs: CandidatePairs, row: int, view: int) -> Picture:
-    """Return pairs with what a view should show at the reading of a row."""
-    wanted = np.flatnonzero(search.wanted[view])
-    targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
-    corners = sensor_extent(search.measurements.views[view].camera)
-    return Picture(pairs, targets, corners, search.size, search.joint_error)
 
 
 def _share(picture: Picture, placement: Placement, view: int) -> float:

@@ -435,7 +435,8 @@ def _offsets_of(
     """
     lens = np.ascontiguousarray(metric.transpose(2, 3, 1, 0))
     points = np.ascontiguousarray(ends.T)
-    offset, by_leg, _ = outline_offsets(*X.transpose(1, 2, 0), radius, EPSILON[edge], points, lens)
+    A, B = X.transpose(1, 2, 0)
+    offset, by_leg, _ = outline_offsets(A, B, radius, EPSILON[edge], points, lens)
     if not np.isfinite(offset).all():
         raise NotVisible("The view could not be fitted: found a camera inside a leg, needed none.")
     return offset.T, by_leg[:6].reshape(2, 3, 2, -1).transpose(3, 2, 0, 1)
