@@ -7,7 +7,6 @@ from rendering import Bar, Light, render
 from legcal.geometry.types import Array
 from legcal.perception.candidate_pairs import (
     EdgeSegments,
-    find_segments,
     segments_of_reduced,
     still_picture,
 )
@@ -49,7 +48,7 @@ def _nearest(found: EdgeSegments, line: Array) -> int:
 @pytest.mark.parametrize("lens", [None, np.array([-0.3, 0.1, 0.001, -0.002, 0.0])])
 def test_outlines_are_found_on_the_sensor_plane_with_the_brighter_side(lens: Array | None) -> None:
     camera = _camera(lens)
-    found = find_segments(_picture(camera, BARS), camera)
+    found = segments_of_reduced(_picture(camera, BARS), camera, 1)
     assert found.pixel == pytest.approx(1.0 / F)
     for bar in BARS:
         axis = (bar.A + bar.B) / (bar.A + bar.B)[2]
@@ -95,7 +94,8 @@ def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_
     camera = _camera()
     across = Bar(np.array([-0.3, 0.02, 0.6]), np.array([0.3, -0.02, 0.6]), 0.03, 90.0)
     whole, crossed = (
-        find_segments(_picture(camera, bars), camera) for bars in (BARS[:1], [BARS[0], across])
+        segments_of_reduced(_picture(camera, bars), camera, 1)
+        for bars in (BARS[:1], [BARS[0], across])
     )
     for line in _lines(BARS[0]):
         i, j = _nearest(whole, line), _nearest(crossed, line)

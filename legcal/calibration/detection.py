@@ -89,7 +89,6 @@ from legcal.perception.overlays import (
     draw,
     marks_of_corners,
     marks_of_image,
-    marks_of_pairs,
 )
 from legcal.perception.photographs import (
     MeasuredImages,
@@ -608,7 +607,6 @@ class _Drawings:
     marks: tuple[tuple[PartMarks, ...], ...]
     corners: tuple[tuple[Mark, ...], ...]
     captions: tuple[str, ...]
-    unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     names: tuple[str, ...]
     photographs: bool  # whether the images are also written without marks
 
@@ -629,7 +627,6 @@ def draw_images(
         tuple(tuple(_marks(detection, row)) for row in rows),
         tuple(_corner_marks(detection, row) for row in rows),
         tuple(_caption(detection, row) for row in rows),
-        tuple(_unplaced_camera(detection, row) for row in rows),
         tuple(file.name for file in files),
         photographs,
     )
@@ -644,9 +641,8 @@ def draw_images(
 
 def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
     """Return the encoded overlay k, and optionally the plain photograph."""
-    image, camera = drawings.load(k), drawings.unplaced[k]
-    marks = [] if camera is None else [marks_of_pairs(camera, image)]
-    picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
+    image = drawings.load(k)
+    picture = draw(image, drawings.marks[k], drawings.captions[k], drawings.corners[k])
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     files = []
     for pixels in (picture, grey)[: 1 + drawings.photographs]:
@@ -671,12 +667,6 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
     )
 
 
-def _unplaced_camera(detection: Detection, row: int) -> Camera | None:
-    """Return the camera of a row if it could not be placed: edge pairs are drawn then."""
-    view = detection.dataset.measurements.views[int(detection.dataset.measurements.view[row])]
-    return view.camera if view.name in detection.unplaced else None
-
-
 def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
     corners = detection.corners
     return () if corners is None else marks_of_corners(corners.choose(corners.row == row))
@@ -688,9 +678,9 @@ def _caption(detection: Detection, row: int) -> str:
     used = outlines.used[(outlines.row == row) & ~are_of_bodies(outlines)]
     state = f"{np.count_nonzero(used)} of {len(used)} outlines used"
     if view in detection.unplaced:
-        state = "the camera could not be placed: edge pairs that were found"
+        state = "the camera could not be placed"
         if detection.T_base_camera[int(measurements.view[row])] is not None:
-            state += ", and legs where it was expected"
+            state += "; legs are where it was expected"
     text = f"{view}  {measurements.image[row]}  {state}"
     return text.encode("ascii", "replace").decode()
 

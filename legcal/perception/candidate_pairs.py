@@ -19,7 +19,7 @@ from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.perception.profiles import Samples
 from legcal.perception.tuning import EDGE_LENGTH, EDGE_SLOPE
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey, shrink
+from legcal.vision.image_file import Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
@@ -114,12 +114,6 @@ def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
     along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
     x, y = np.rint(np.clip(along, 0, np.array(picture.shape[::-1]) - 1)).astype(np.intp).T
     return np.asarray(differs[y, x].mean(axis=0) > MOVING_SHARE)
-
-
-def find_segments(grey: Grey, camera: Camera) -> EdgeSegments:
-    """Return the straight edges of a picture, which is reduced if it is large."""
-    factor = reduction(camera, 1.0)
-    return segments_of_reduced(shrink(grey, factor), camera, factor)
 
 
 def segments_of_reduced(

@@ -18,12 +18,10 @@ from legcal.data.corners import Corners
 from legcal.data.outlines import Outlines, are_of_bodies
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, Image
-from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg
 
-MarkKind = Literal["edge 1", "edge 2", "axis", "body", "rejected", "predicted", "pair", "corner"]
+MarkKind = Literal["edge 1", "edge 2", "axis", "body", "rejected", "predicted", "corner"]
 N_POINTS = 40  # of a curve
 
 Canvas = NDArray[np.uint8]
@@ -38,7 +36,6 @@ COLOURS: dict[MarkKind, tuple[int, int, int]] = {  # blue, green, red
     "body": (220, 220, 0),
     "rejected": (70, 70, 255),
     "predicted": (30, 150, 255),
-    "pair": (255, 120, 230),
     "corner": (255, 255, 0),
 }
 _MEANING: dict[MarkKind, str] = {
@@ -48,7 +45,6 @@ _MEANING: dict[MarkKind, str] = {
     "body": "edge of a body",
     "rejected": "rejected",
     "predicted": "expected here, not found",
-    "pair": "edge pair",
     "corner": "corner of a board",
 }
 _WHITE = (255, 255, 255)
@@ -123,20 +119,6 @@ def marks_of_image(
         for i in range(len(of_bodies))
     )
     return [*found, PartMarks("", "", edges)] if edges else found
-
-
-def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
-    """Return the edge pairs of an image, by which its camera is looked for."""
-    pairs = find_candidate_pairs(find_segments(image, camera))
-    marks = []
-    for k in range(len(pairs)):
-        steps = np.linspace(-1.0, 1.0, N_POINTS)[:, None]
-        axis = pairs.middle[k] + pairs.half_length[k] * steps * pairs.along[k]
-        width = pairs.width[k, 0] + 0.5 * (1.0 + steps) * (pairs.width[k, 1] - pairs.width[k, 0])
-        for side in (0.5, -0.5):
-            edge = axis + side * width * pairs.normal[k]
-            marks.append(Mark("pair", camera.distort(edge)))
-    return PartMarks("", "", tuple(marks))
 
 
 def _reason(pair: Outlines) -> str:
@@ -262,7 +244,7 @@ def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
             dashes.append(np.column_stack([np.interp(at, along, c) for c in mark.points.T]))
         for dash in dashes:
             _polyline(picture, dash, colour, width)
-    elif mark.kind in ("axis", "pair"):
+    elif mark.kind == "axis":
         _polyline(picture, mark.points, colour, max(1, width // 2))
     else:
         _polyline(picture, mark.points, colour, width)
@@ -322,7 +304,7 @@ def _legend(width: int, letter: float, line: int, caption: str, kinds: set[MarkK
     )
     x, y = letter, 2.9 * letter
     for kind, meaning in _MEANING.items():
-        if kind in ("body", "pair", "corner") and kind not in kinds:
+        if kind in ("body", "corner") and kind not in kinds:
             continue
         (w, _), _ = cv2.getTextSize(meaning, _FONT, _SMALLER * scale, thick)
         start = np.array([x, y - 0.3 * letter])
