@@ -88,11 +88,18 @@ class LegPart:
     leg: PredictedLeg
     segment: Segment
     band: Band  # the frame along the part
+    h: Array  # (2, 3) its outlines
     predicted: Array  # (2, 2) offsets of edge 1 and 2 at both ends of the band [px]
-    hidden: BoolArray  # (n_blocks,) which of the block_positions other legs hide
     window: float  # largest distance of an edge from its prediction, at either end [px]
     guided: bool  # whether a fit to other legs predicts it: one edge near there is enough
+    # (n_blocks,) which of the block_positions other legs hide; none before that is asked
+    hidden: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     pair: EdgePair | None = None
+
+    @property
+    def width(self) -> float:
+        """Predicted width in the middle [px]."""
+        return 0.5 * float((self.predicted[1] - self.predicted[0]).sum())
 
     @property
     def edges(self) -> EdgePair:
@@ -505,17 +512,6 @@ def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:
     return measure(search, together=False)
 
 
-class _Predicted(NamedTuple):
-    """A part of a leg where it is predicted."""
-
-    leg: PredictedLeg
-    segment: Segment
-    band: Band
-    h: Array  # (2, 3) its outlines
-    v: Array  # (2, 2) offsets of these at both ends of the band [px]
-    width: float  # [px], in the middle
-
-
 def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
     """Return outlines that are used as the same ones were before, if they are seen at all.
 
@@ -544,7 +540,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
         why = Rejection(reason, detail)
         rejected.append(PartLines(leg.leg, part, (why, why)))
 
-    searched: list[_Predicted] = []
+    searched: list[LegPart] = []
     for leg in search.legs:
         if math.isnan(search.window[leg.leg]):
             continue
@@ -553,26 +549,25 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
                 reject(leg, segment.link, Reason.OUTSIDE)
                 continue
             v = band.offsets(h[:, None, :], np.array([0.0, band.length]))
-            width = 0.5 * float((v[1] - v[0]).sum())
-            if width < MIN_WIDTH:
-                reject(leg, segment.link, Reason.NARROW, f"{width:.1f}")
-            elif band.length < least_length(width):
+            window = float(search.window[leg.leg])
+            part = LegPart(leg, segment, band, h, v, window, search.guided)
+            if part.width < MIN_WIDTH:
+                reject(leg, segment.link, Reason.NARROW, f"{part.width:.1f}")
+            elif band.length < least_length(part.width):
                 reject(leg, segment.link, Reason.SHORT, f"{band.length:.0f} px in the image")
             else:
-                searched.append(_Predicted(leg, segment, band, h, v, width))
+                guided = search.guided and window <= MAX_GUIDED_WINDOW * part.width
+                searched.append(replace(part, guided=guided))
     free_parts: list[LegPart] = []
     names = [*search.names, *(occluder.link for occluder in search.occluders.occluders)]
-    for predicted, front in zip(searched, _in_front(search, searched), strict=True):
-        leg, segment, band, _, v, width = predicted
+    for part, front in zip(searched, _in_front(search, searched), strict=True):
         hidden = np.any(front >= 0, axis=0)
-        if np.mean(~hidden) * band.length < least_length(width):
+        if np.mean(~hidden) * part.band.length < least_length(part.width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
             in_front = names[values[np.argmax(counts)]]
-            reject(leg, segment.link, Reason.HIDDEN, in_front)
+            reject(part.leg, part.segment.link, Reason.HIDDEN, in_front)
         else:
-            window = float(search.window[leg.leg])
-            guided = search.guided and window <= MAX_GUIDED_WINDOW * width
-            free_parts.append(LegPart(leg, segment, band, v, hidden, window, guided))
+            free_parts.append(replace(part, hidden=hidden))
     parts: list[LegPart] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
     for part, pair in zip(free_parts, pairs, strict=True):
@@ -635,7 +630,7 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     )
 
 
-def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntArray]:
+def _in_front(search: ImageSearch, searched: Sequence[LegPart]) -> list[IntArray]:
     """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free.
 
     Other solids of the machine count on from the legs and arms. Where the edge of one goes along
@@ -644,8 +639,9 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     if not searched:
         return []
     points = []
-    for leg, _, band, h, _, _ in searched:
-        s = leg.distance_along(band, block_positions(band))
+    for part in searched:
+        leg, h = part.leg, part.h
+        s = leg.distance_along(part.band, block_positions(part.band))
         axis = leg.A_camera + s[:, None] * leg.u
         radius = EPSILON * (h @ leg.A_camera)
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
@@ -673,14 +669,15 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     return hiding
 
 
-def _beside(part: _Predicted, edges: Array, window: float) -> BoolArray:
+def _beside(part: LegPart, edges: Array, window: float) -> BoolArray:
     """Return which blocks (2, n_blocks) of a part have an edge of a solid near an outline.
 
     It is one of the edges (n, 2, 2) on the sensor plane that are as good as parallel to the part
     and within the window, where an outline cannot be told from it.
     """
     at = block_positions(part.band)
-    outlines = part.v[:, :1] + (part.v[:, 1:] - part.v[:, :1]) * at / part.band.length
+    v0, v1 = part.predicted[:, :1], part.predicted[:, 1:]
+    outlines = v0 + (v1 - v0) * at / part.band.length
     t, v = part.band.coordinates(edges)
     along, across = np.diff(t, axis=1), np.diff(v, axis=1)  # (n, 1)
     is_parallel = np.abs(across) < SKEW * np.abs(along)
