@@ -301,22 +301,12 @@ MIN_SHIFT_PX = 0.15  # by which corners must shift together where the board move
 SIGNIFICANCE = 1e-6  # of a motion, for each pair of images
 
 
-@dataclass(frozen=True, eq=False)
-class PlanePose:
-    """A pose that explains the points of a plane."""
-
-    T_camera_plane: RigidTransform
-    cost: float  # half the sum of squares of whitened residuals, large ones by Huber's loss
-    residual_px: Array  # (n, 2) pixels less where the points should be seen [px]
-    information: Array  # (6, 6) of a rotation vector [rad] and a displacement [m] of the plane
-
-
 def plane_poses(
     camera: Camera,
     points: Array,  # (n, 3) four points or more of the plane z = 0, not all on a line [m]
     px: Array,  # (n, 2) where they are seen [px]
     sigma_px: Array,  # (n,) standard deviations of either coordinate [px]
-) -> list[PlanePose]:
+) -> list[AdjustedBoard]:
     """Return the poses of a plane that explain where its points are seen, the better one first."""
     xy = camera.undistort(px)
     starts = list(closed_form_poses(points, xy, cv2.SOLVEPNP_IPPE))
@@ -327,29 +317,24 @@ def plane_poses(
 
 def _refine(
     camera: Camera, points: Array, px: Array, sigma_px: Array, start: RigidTransform
-) -> PlanePose | None:
+) -> AdjustedBoard | None:
     """Return the pose of least cost near a start; None if it puts points behind the camera."""
     one = BoardImages(np.zeros(len(px), dtype=np.intp), points, px, sigma_px)
-    adjusted = adjust_board(camera, [start], one)
-    if adjusted is None:
-        return None
-    return PlanePose(
-        adjusted.T_camera_board[0], adjusted.cost, adjusted.residual, adjusted.information[0]
-    )
+    return adjust_board(camera, [start], one)
 
 
-def _distinct(poses: list[PlanePose], angle: float) -> list[PlanePose]:
+def _distinct(poses: list[AdjustedBoard], angle: float) -> list[AdjustedBoard]:
     """Return the poses that differ by more than an angle, the first ones of each kind."""
-    kept: list[PlanePose] = []
+    kept: list[AdjustedBoard] = []
     for pose in poses:
         if all(_angle(pose, other) > angle for other in kept):
             kept.append(pose)
     return kept
 
 
-def _angle(one: PlanePose, other: PlanePose) -> float:
+def _angle(one: AdjustedBoard, other: AdjustedBoard) -> float:
     """Return the angle between two poses [rad]."""
-    turn = one.T_camera_plane.rotation * other.T_camera_plane.rotation.inv()
+    turn = one.T_camera_board[0].rotation * other.T_camera_board[0].rotation.inv()
     return float(turn.magnitude())
 
 
@@ -390,7 +375,7 @@ def camera_poses_by_board(
                         name=view.name,
                     )
                 )
-        T_board_camera.append(None if pose is None else pose.T_camera_plane.inv())
+        T_board_camera.append(None if pose is None else pose.T_camera_board[0].inv())
         if pose is not None:
             corners = _without_outliers(corners, here, pose)
     for kind, of_kind in problems.items():
@@ -424,17 +409,17 @@ def board_poses_in_images(
             corners = corners.reject(of_place, Reason.NO_BOARD_POSE)
             continue
         if pose is not None:
-            T_camera_board |= dict.fromkeys(rows, pose.T_camera_plane)
+            T_camera_board |= dict.fromkeys(rows, pose.T_camera_board[0])
             corners = _without_outliers(corners, here, pose)
     if len(wrong) > len(T_camera_board):
         raise DatasetError(wrong)
     return T_camera_board, corners
 
 
-def _without_outliers(corners: Corners, here: IntArray, pose: PlanePose) -> Corners:
+def _without_outliers(corners: Corners, here: IntArray, pose: AdjustedBoard) -> Corners:
     """Return corners, those among *here* rejected that are far from where a pose puts them."""
     off = np.zeros(len(corners))
-    off[here] = np.linalg.norm(pose.residual_px, axis=1)
+    off[here] = np.linalg.norm(pose.residual, axis=1)
     outlier = np.zeros(len(corners), dtype=np.bool_)
     outlier[here] = _outliers(pose, corners.choose(here))
     why = [Rejection(Reason.CORNER_OFF, f"{px:.2g}") for px in off]
@@ -443,12 +428,12 @@ def _without_outliers(corners: Corners, here: IntArray, pose: PlanePose) -> Corn
 
 def _joint_pose(
     name: str, corners: Corners, board: Board, measurements: Measurements
-) -> PlanePose | None:
+) -> AdjustedBoard | None:
     """Return the pose that images share; None if none of them shows enough corners."""
     if not len(corners):
         return None
     camera = measurements.views[measurements.view[corners.row[0]]].camera
-    of_row: dict[int, list[PlanePose]] = {}
+    of_row: dict[int, list[AdjustedBoard]] = {}
     for row in np.unique(corners.row).tolist():
         here = corners.row == row
         points = board.points[corners.corner[here]]
@@ -460,7 +445,7 @@ def _joint_pose(
     if not candidates:
         raise DatasetError(_another_board(name, board, "no pose of", "showing them there"))
     everything = board.points[corners.corner], corners.px, corners.sigma_px
-    refined = [_refine(camera, *everything, start.T_camera_plane) for start in candidates]
+    refined = [_refine(camera, *everything, start.T_camera_board[0]) for start in candidates]
     joint = sorted((pose for pose in refined if pose is not None), key=lambda pose: pose.cost)
     joint = _distinct(joint, SIMILAR_ANGLE)
     if not joint:
@@ -471,7 +456,7 @@ def _joint_pose(
     scale = _scale(best, corners)
     lead = MIN_CHI2_LEAD * scale**2
 
-    def is_ambiguous(poses: list[PlanePose]) -> bool:
+    def is_ambiguous(poses: list[AdjustedBoard]) -> bool:
         return len(poses) > 1 and 2.0 * (poses[1].cost - poses[0].cost) < lead
 
     single = {  # of two poses that both explain an image that near the view's
@@ -481,7 +466,7 @@ def _joint_pose(
     }
     _require_still(name, single, scale, board, camera, row_names(measurements))
     # Corners that no pose of this board explains.
-    off = np.linalg.norm(best.residual_px, axis=1)
+    off = np.linalg.norm(best.residual, axis=1)
     rms = float(np.median(off)) / np.sqrt(2.0 * np.log(2.0))  # as of one coordinate
     limit = max(MAX_RESIDUAL_PX, MAX_RESIDUAL_SIGMA * float(np.median(corners.sigma_px)))
     if rms > limit:
@@ -497,16 +482,16 @@ def _joint_pose(
     return best
 
 
-def _outliers(pose: PlanePose, corners: Corners) -> BoolArray:
+def _outliers(pose: AdjustedBoard, corners: Corners) -> BoolArray:
     """Return the mask of corners that are outliers of a pose."""
-    off = np.linalg.norm(pose.residual_px, axis=1)
+    off = np.linalg.norm(pose.residual, axis=1)
     scaled = OUTLIER_SIGMA * _scale(pose, corners) * corners.sigma_px
     return np.asarray(off > np.maximum(OUTLIER_PX, scaled))
 
 
-def _scale(pose: PlanePose, corners: Corners) -> float:
+def _scale(pose: AdjustedBoard, corners: Corners) -> float:
     """Return by how much residuals exceed the standard deviations of corners, at least one."""
-    t = np.linalg.norm(pose.residual_px, axis=1) / corners.sigma_px
+    t = np.linalg.norm(pose.residual, axis=1) / corners.sigma_px
     return max(1.0, float(np.median(t)) / float(np.sqrt(2.0 * np.log(2.0))))
 
 
@@ -520,7 +505,7 @@ def _span_plane(points: Array) -> bool:
 
 def _require_still(
     name: str,
-    single: Mapping[int, PlanePose],
+    single: Mapping[int, AdjustedBoard],
     scale: float,
     board: Board,
     camera: Camera,
@@ -536,7 +521,8 @@ def _require_still(
         return
     limit = float(chdtri(6, SIGNIFICANCE / len(rows))) * scale**2
     px = {
-        row: camera.project(pose.T_camera_plane.apply(board.points)) for row, pose in single.items()
+        row: camera.project(pose.T_camera_board[0].apply(board.points))
+        for row, pose in single.items()
     }
     together = np.array(
         [[_agree(single[a], single[b], px[a] - px[b], limit) for b in rows] for a in rows]
@@ -545,11 +531,10 @@ def _require_still(
     others = [row for row, same in zip(rows, together[most], strict=True) if not same]
     if not others:
         return
-    reference = single[rows[most]].T_camera_plane
-    moves = [reference.inv() * single[row].T_camera_plane for row in others]
+    moves = [T[rows[most]].inv() * T[row] for row in others]
     middle = board.points.mean(axis=0)
-    far = max(float(np.linalg.norm(T.apply(middle) - middle)) for T in moves)
-    turn = max(float(T.rotation.magnitude()) for T in moves)
+    far = max(float(np.linalg.norm(move.apply(middle) - middle)) for move in moves)
+    turn = max(float(move.rotation.magnitude()) for move in moves)
     raise DatasetError(
         f"view {name}: its camera could not be placed: found the board elsewhere in "
         f"{few([names[row] for row in others])} than in {names[rows[most]]}, by up to "
@@ -559,14 +544,14 @@ def _require_still(
     )
 
 
-def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> bool:
+def _agree(one: AdjustedBoard, other: AdjustedBoard, shift_px: Array, limit: float) -> bool:
     """Return whether two poses of the board agree, by their covariances."""
     if float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1)))) < MIN_SHIFT_PX:
         return True
-    a, b = one.T_camera_plane, other.T_camera_plane
+    a, b = one.T_camera_board[0], other.T_camera_board[0]
     turn = (b.rotation * a.rotation.inv()).as_rotvec()
     d = np.concatenate([turn, b.translation - a.translation])
-    covariance = np.linalg.inv(one.information) + np.linalg.inv(other.information)
+    covariance = np.linalg.inv(one.information[0]) + np.linalg.inv(other.information[0])
     return bool(d @ np.linalg.solve(covariance, d) < limit)
 
 

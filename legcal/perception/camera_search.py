@@ -184,7 +184,8 @@ def place_camera(
     """
     best_first = sorted(pictures, key=lambda picture: -picture.pairs.best_merit)
     every = Pictures.of(pictures)
-    best = _candidates(every, _near_known(every, known, n_legs))
+    near = CameraPoses.of(known, n_legs)
+    best = _candidates(every, _approached(every, near) if known else near)
     done = 0
     for n in starts if best.share < HINTED_SUPPORT else ():
         if done >= len(pictures) or (done and best.is_clear):
@@ -208,14 +209,6 @@ def place_camera(
         poses = CameraPoses.joined([poses, _polished(some.choose(slice(N_POLISHING)), poses)])
         best = _candidates(every, refined(every, poses, FITTING, every.joint_error))
     return best
-
-
-def _near_known(pictures: Pictures, known: Sequence[RigidTransform], n_legs: int) -> CameraPoses:
-    """Return poses after steps from T_base_camera that are known."""
-    T = [one.inv() for one in known]
-    R = np.array([one.rotation.as_matrix() for one in T]).reshape(-1, 3, 3)
-    poses = CameraPoses.rigid(R, np.array([one.translation for one in T]).reshape(-1, 3), n_legs)
-    return _approached(pictures, poses) if known else poses
 
 
 def _approached(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
@@ -307,10 +300,10 @@ def place_near(
     pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
 ) -> PoseCandidates:
     """Return the camera pose near a rough one on which the pictures of a view agree."""
-    T = T_base_camera.inv()
+    rough = CameraPoses.of([T_base_camera], n_legs)
     turns = NEAR_TURN * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
-    poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
+    R = Rotation.from_rotvec(turns).as_matrix() @ rough.R
+    poses = CameraPoses.rigid(R, np.repeat(rough.t, len(R), axis=0), n_legs)
     every = Pictures.of(pictures)
     candidates = _candidates(every, _approached(every, poses))
     return replace(candidates, hinted=True)
@@ -320,9 +313,8 @@ def place_at(
     pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
 ) -> PoseCandidates:
     """Return a camera pose that clicks give, as it is: pictures hardly show the legs."""
-    T = T_base_camera.inv()
-    pose = CameraPoses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
-    return replace(_candidates(Pictures.of(pictures), pose), hinted=True, is_given=True)
+    candidates = _candidates(Pictures.of(pictures), CameraPoses.of([T_base_camera], n_legs))
+    return replace(candidates, hinted=True, is_given=True)
 
 
 def with_first(

@@ -431,7 +431,6 @@ class Lattice:
 
     ij: IntArray  # (k, 2) their columns and rows; the first ones are 0
     px: Array  # (k, 2) where they are [px]; x, y and the line of sight are right-handed
-    black: IntArray  # (k,) 1 where the square at greater column and row is black, else -1
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -444,7 +443,7 @@ def find_lattice(grey: Grey) -> Lattice:
     """Return the largest lattice of crossings in an image (height, width), maybe of none."""
     places, angles, contrast = _candidates(grey)
     near, ray = _neighbours(grey, places, angles, contrast)
-    return _largest(places, angles, contrast, near, ray)
+    return _largest(places, near, ray)
 
 
 def _candidates(grey: Grey) -> tuple[Array, Array, Array]:
@@ -574,10 +573,9 @@ def _wrapped(angle: Array) -> Array:
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _largest(px: Array, angles: Array, contrast: Array, near: IntArray, back: IntArray) -> Lattice:
+def _largest(px: Array, near: IntArray, back: IntArray) -> Lattice:
     """Return the largest set of candidates that are neighbours of each other, as a lattice."""
     n = len(px)
-    none = Lattice(np.zeros((0, 2), np.intp), np.zeros((0, 2)), np.zeros(0, np.intp))
     turn = np.full(n, -1, dtype=np.intp)  # quarter turns of the lattice against each one's rays
     best: list[tuple[int, tuple[int, int]]] = []
     links, arrivals = near.tolist(), back.tolist()
@@ -606,14 +604,11 @@ def _largest(px: Array, angles: Array, contrast: Array, near: IntArray, back: In
         if len(place) > len(best):
             best = list(place.items())
     if len(best) < _MIN_LATTICE:
-        return none
+        return Lattice(np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)))
     members = np.array([k for k, _ in best], dtype=np.intp)
     ij = np.array([at for _, at in best], dtype=np.intp)
     # Rays turn from x to y of the image, and so do the steps of the lattice: it is right-handed.
-    # Bright after ray 0; the square at greater column and row follows the ray of step (1, 0).
-    follows = (-turn[members]) % 2 == 0
-    bright = np.where(follows, contrast[members], -contrast[members]) > 0.0
-    return Lattice(ij - ij.min(axis=0), px[members], np.where(bright, -1, 1).astype(np.intp))
+    return Lattice(ij - ij.min(axis=0), px[members])
 
 
 _NEAR = 1.5  # pitches within which corners give how the board lies around a place

@@ -105,10 +105,16 @@ class CameraPoses(Table):
         return cls.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
 
     @classmethod
+    def of(cls, T_base_camera: Sequence[RigidTransform], n_legs: int) -> CameraPoses:
+        """Return poses the other way round, at which legs are where the model has them."""
+        T = [one.inv() for one in T_base_camera]
+        R = np.array([one.rotation.as_matrix() for one in T]).reshape(-1, 3, 3)
+        return cls.rigid(R, np.array([one.translation for one in T]).reshape(-1, 3), n_legs)
+
+    @classmethod
     def one(cls, T_base_camera: RigidTransform, shift: Array) -> CameraPoses:
         """Return one pose, with shifts (n_legs, 2, 3)."""
-        T = T_base_camera.inv()
-        return cls(T.rotation.as_matrix()[None], T.translation[None], shift[None])
+        return replace(cls.of([T_base_camera], len(shift)), shift=shift[None])
 
     def T_base_camera(self, i: int = 0) -> RigidTransform:
         """Return a pose the other way round."""
