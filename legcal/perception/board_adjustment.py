@@ -520,10 +520,8 @@ def _require_still(
     if len(rows) < 2:
         return
     limit = float(chdtri(6, SIGNIFICANCE / len(rows))) * scale**2
-    px = {
-        row: camera.project(pose.T_camera_board[0].apply(board.points))
-        for row, pose in single.items()
-    }
+    T = {row: pose.T_camera_board[0] for row, pose in single.items()}
+    px = {row: camera.project(T[row].apply(board.points)) for row in rows}
     together = np.array(
         [[_agree(single[a], single[b], px[a] - px[b], limit) for b in rows] for a in rows]
     )

@@ -232,7 +232,8 @@ def place_and_measure(
         defects |= doubtful
         usable = np.setdiff1d(usable, list(doubtful))
     search = photographs.search(nominal, pairs, rough)
-    placement = _placed(photographs, search, usable, hints, report, joined)
+    counted = _counted(report, "Recognising legs", len(usable))
+    placement = place_views(search, usable, hints, joined, run=photographs.run, progress=counted)
     outlines, blur = _measured(photographs, search, placement, report, method=method)
     if not free_poses:  # which would follow wrong radii, and these wrong poses
         photographs, search, outlines, notes = _with_other_radii(
@@ -400,7 +401,7 @@ def _decided_by_outlines(
     hints = nominal.T_base_camera
     for _ in range(CHOICE_ROUNDS):
         search = photographs.search(nominal)
-        placement = _placed(photographs, search, rows, hints, report, joined)
+        placement = place_views(search, rows, hints, joined, run=photographs.run)
         most = dict.fromkeys(choices, -1)
         chosen = dict[int, int]()
         for n in range(max(map(len, choices.values()))):
@@ -485,19 +486,6 @@ def _radii_of_outlines(
                 *_, before = radii.get((j, cylinder.radius), (0.0,))  # of a part as thick
                 radii[j, cylinder.radius] = float(np.mean(of_edges)), row, max(share, before)
     return radii
-
-
-def _placed(
-    photographs: Photographs,
-    search: Search,
-    rows: IntArray,
-    hints: Sequence[RigidTransform | None],
-    report: Report,
-    joined: Joined,
-) -> Placement:
-    """Return the placement of views by the legs in some images."""
-    progress = _counted(report, "Recognising legs", len(rows))
-    return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)
 
 
 def _measured(

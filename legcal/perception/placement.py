@@ -301,6 +301,16 @@ class Group:
     hint: RigidTransform | None  # T_base_group, roughly
     is_placed: bool = False  # by clicks: the hint is its camera where its images show too little
 
+    def cameras(self, T_base_group: RigidTransform) -> dict[int, RigidTransform | None]:
+        """Return T_base_camera of its views."""
+        return {v: T_base_group * self.T_group_camera[v] for v in self.views}
+
+    def not_placed(self, measurements: Measurements, why: Cause) -> dict[str, NotPlaced]:
+        """Return why its views have no camera, by their names."""
+        names = [measurements.views[v].name for v in self.views]
+        name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+        return dict.fromkeys(names, NotPlaced(name, why))
+
     def pictures(self, of_row: Mapping[int, Picture], rows: Sequence[int]) -> list[Picture]:
         """Return the pictures of some rows, in the frame of the group."""
         pictures_of_rows = []

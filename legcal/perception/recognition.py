@@ -43,7 +43,7 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.tuning import EVIDENCE_RATIO
-from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
+from legcal.perception.view_fit import ViewFit, fit_view, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
 MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
@@ -100,23 +100,20 @@ def place_views(
         _Task(group, {row: pictures[row] for row in group.rows if row in pictures}, one)
         for group, one in zip(groups, found, strict=True)
     ]
-    views = search.measurements.views
-    T, unplaced = list(hints), dict[str, NotPlaced]()
-    shift = np.zeros((len(views), n_legs, 2, 3))
-    error: Array = np.full((len(views), n_legs), search.joint_error)
+    T, unplaced = dict(enumerate(hints)), dict[str, NotPlaced]()
+    shift = np.zeros((len(T), n_legs, 2, 3))
+    error: Array = np.full((len(T), n_legs), search.joint_error)
     for group, (one, swapped) in zip(groups, run(partial(_placed, search), tasks), strict=True):
         if swapped or not one.is_convincing:
-            names = [views[v].name for v in group.views]
             cause = _why_not_placed(one, group.hint is not None, is_mirrored=swapped)
-            unplaced |= dict.fromkeys(names, NotPlaced(group_name(names), cause))
-            for v in group.views:
-                T[v] = None
+            unplaced |= group.not_placed(search.measurements, cause)
+            T |= dict.fromkeys(group.views)
             continue
-        for v in group.views:
-            T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
-            seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, search.joint_error)
-    placement = Placement(search.A_base, search.B_base, tuple(T), error)
+        T |= group.cameras(one.pose())
+        seen, leg_error = np.isfinite(one.leg_error), MIN_ERROR + ERROR_SIGMAS * one.leg_error
+        shift[group.views] = one.poses.shift[0]
+        error[group.views] = np.where(seen, leg_error, search.joint_error)
+    placement = Placement(search.A_base, search.B_base, tuple(T.values()), error)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 
 
@@ -252,11 +249,9 @@ class _Trial:
 def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int) -> _Trial:
     """Measure outlines at a pose, and fit it to them."""
     shift, n_views = candidates.poses.shift[i], len(search.measurements.views)
-    T: list[RigidTransform | None] = [None] * n_views
-    for v in group.views:
-        T[v] = candidates.pose(i) * group.T_group_camera[v]
+    T = dict.fromkeys(range(n_views)) | group.cameras(candidates.pose(i))
     error = min(POSE_JOINT_ERROR, search.joint_error)
-    placement = Placement(search.A_base, search.B_base, tuple(T), error)
+    placement = Placement(search.A_base, search.B_base, tuple(T.values()), error)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
