@@ -51,7 +51,7 @@ from legcal.vision.camera import (
     project_with_derivatives,
     with_intrinsics,
 )
-from legcal.vision.point_pose import closed_form_poses
+from legcal.vision.point_pose import closed_form_poses, on_a_line
 
 _MAX_ITERATIONS = 60
 _RIM = 16  # points of a circle by which its image is known
@@ -160,7 +160,17 @@ def adjust_board(
         return None
     moving = problem
     if held:
-        moving = replace(problem, variables=tuple(map(_held, problem.variables)))
+        still = (
+            replace(
+                block,
+                unknown=fixed_at_start(*block.unknown.shape),
+                labels=(),
+                units=(),
+                prior=NO_PRIOR,
+            )
+            for block in problem.variables
+        )
+        moving = replace(problem, variables=tuple(still))
     minimum = minimise(
         moving,
         state,
@@ -246,12 +256,6 @@ def _intrinsics(camera: Camera, names: tuple[str, ...]) -> Variables:
         lambda camera: intrinsic_values(camera)[where],
         prior=prior,
     )
-
-
-def _held(block: Variables) -> Variables:
-    """Return a block that does not move."""
-    unknown = fixed_at_start(*block.unknown.shape)
-    return replace(block, unknown=unknown, labels=(), units=(), prior=NO_PRIOR)
 
 
 def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residuals:
@@ -418,10 +422,11 @@ def board_poses_in_images(
 
 def _without_outliers(corners: Corners, here: IntArray, pose: AdjustedBoard) -> Corners:
     """Return corners, those among *here* rejected that are far from where a pose puts them."""
-    off = np.zeros(len(corners))
+    off, some = np.zeros(len(corners)), corners.choose(here)
     off[here] = np.linalg.norm(pose.residual, axis=1)
     outlier = np.zeros(len(corners), dtype=np.bool_)
-    outlier[here] = _outliers(pose, corners.choose(here))
+    scaled = OUTLIER_SIGMA * _scale(pose, some) * some.sigma_px
+    outlier[here] = off[here] > np.maximum(OUTLIER_PX, scaled)
     why = [Rejection(Reason.CORNER_OFF, f"{px:.2g}") for px in off]
     return corners.reject(outlier, why)
 
@@ -437,7 +442,7 @@ def _joint_pose(
     for row in np.unique(corners.row).tolist():
         here = corners.row == row
         points = board.points[corners.corner[here]]
-        if _span_plane(points):
+        if len(points) >= MIN_CORNERS and not on_a_line(points):
             of_row[row] = plane_poses(camera, points, corners.px[here], corners.sigma_px[here])
     if not of_row:
         return None
@@ -482,25 +487,10 @@ def _joint_pose(
     return best
 
 
-def _outliers(pose: AdjustedBoard, corners: Corners) -> BoolArray:
-    """Return the mask of corners that are outliers of a pose."""
-    off = np.linalg.norm(pose.residual, axis=1)
-    scaled = OUTLIER_SIGMA * _scale(pose, corners) * corners.sigma_px
-    return np.asarray(off > np.maximum(OUTLIER_PX, scaled))
-
-
 def _scale(pose: AdjustedBoard, corners: Corners) -> float:
     """Return by how much residuals exceed the standard deviations of corners, at least one."""
     t = np.linalg.norm(pose.residual, axis=1) / corners.sigma_px
     return max(1.0, float(np.median(t)) / float(np.sqrt(2.0 * np.log(2.0))))
-
-
-def _span_plane(points: Array) -> bool:
-    """Return whether points are enough, and not all on a line."""
-    if len(points) < MIN_CORNERS:
-        return False
-    size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(size[1] > 1e-3 * size[0])
 
 
 def _require_still(

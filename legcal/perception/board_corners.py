@@ -207,7 +207,8 @@ def _measured_twice(
     small = rescaled(grey, scale)
     both = np.array(small.shape[::-1]) / grey.shape[::-1]  # of columns and rows, which are whole
     ij, saddles = measured(small, board, ij, (px + 0.5) * both - 0.5, _MEASURED_BLUR)
-    return ij, saddles.moved_to((saddles.px + 0.5) / both - 0.5, scale)
+    px, sigma_px = (saddles.px + 0.5) / both - 0.5, saddles.sigma_px / scale
+    return ij, replace(saddles, px=px, sigma_px=sigma_px, blur_px=saddles.blur_px / scale)
 
 
 def _usual_blur(saddles: Saddles) -> float:

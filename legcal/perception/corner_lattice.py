@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -82,10 +82,6 @@ class Saddles(Table):
     contrast: Array
     misfit: Array  # (n,) residual of the model (root mean square), over the contrast
     found: BoolArray  # (n,) whether the picture is a crossing at all; others have no numbers
-
-    def moved_to(self, px: Array, scale: float) -> Saddles:
-        """Return them where they are in an image, found in one that is scaled by a factor."""
-        return replace(self, px=px, sigma_px=self.sigma_px / scale, blur_px=self.blur_px / scale)
 
 
 def fit_saddles(

@@ -421,26 +421,22 @@ Method = Callable[[ImageSearch], tuple[Outlines, float]]
 """Finds the outlines of all parts in one image, and the blur of the image [px] or NaN."""
 
 
-class OutlineLine(NamedTuple):
-    """The line of an outline in the band of its part."""
+class PartVerdict(NamedTuple):
+    """Which outlines of a part are used."""
 
-    v: Array  # (2,) offsets at both ends of the band [px]
-    place: (
-        Array | tuple[float, float]
-    )  # where the used piece begins and ends, as fractions of the band
-    covariance: Array  # (2, 2) of the offsets there [px^2]
-    # contrast, length, residual, by_gamma, polish of Outlines
-    quality: Sequence[float] = (math.nan,) * 5
+    reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
+    bias: float = 0.0  # how far used ones may be off besides their covariance [px]
+    weight: float = 1.0  # of used ones, whose covariance is larger by its inverse
 
 
-class PartLines(NamedTuple):
-    """Both outlines of a part, with the reasons of rejected ones."""
+class JudgedPart(NamedTuple):
+    """Both outlines of a part of a leg as the table has them."""
 
     leg: int
     part: str
-    reasons: tuple[Rejection, Rejection]  # why each outline is rejected
-    lines: Sequence[OutlineLine | None] = (None, None)
-    band: Band | None = None  # the frame of the lines
+    verdict: PartVerdict
+    edges: Sequence[MeasuredEdge | LostEdge] = ()  # none where it was not measured
+    band: Band | None = None  # their frame
 
 
 def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, float]:
@@ -529,16 +525,16 @@ def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
     return replace(outlines, used=used, reason=reason)
 
 
-def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
+def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[JudgedPart]]:
     """Find the edges of all parts in one image to about a pixel.
 
     Return the parts to measure, and the others with the reasons why their outlines are rejected.
     """
-    rejected: list[PartLines] = []
+    rejected: list[JudgedPart] = []
 
     def reject(leg: PredictedLeg, part: str, reason: Reason, detail: str = "") -> None:
         why = Rejection(reason, detail)
-        rejected.append(PartLines(leg.leg, part, (why, why)))
+        rejected.append(JudgedPart(leg.leg, part, PartVerdict((why, why))))
 
     searched: list[LegPart] = []
     for leg in search.legs:
@@ -578,7 +574,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     return parts, rejected
 
 
-def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
+def outline_table(search: ImageSearch, parts: Sequence[JudgedPart]) -> Outlines:
     """Return both outlines of all parts of an image, NaN where there is no line."""
     parts = [part._replace(leg=search.leg_of(part.leg)) for part in parts]
     parts.sort(key=lambda part: (part.leg, part.part))
@@ -586,15 +582,23 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     h, ends, quality = np.full((n, 3), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 5), np.nan)
     covariance = np.full((n, 2, 2), np.nan)
     seen = [
-        (2 * i + edge, part.band, line)
+        (2 * i + k, part.band, edge, part.verdict)
         for i, part in enumerate(parts)
-        for edge, line in enumerate(part.lines)
-        if part.band is not None and line is not None
+        for k, edge in enumerate(part.edges)
+        if part.band is not None and isinstance(edge, MeasuredEdge)
     ]
     if seen:
-        at, bands, lines = zip(*seen, strict=True)
+        at, bands, edges, verdicts = zip(*seen, strict=True)
         has = list(at)
-        v, place, covariance[has], quality[has] = (np.array(x) for x in zip(*lines, strict=True))
+        v, place = (
+            np.array(x)
+            for x in zip(*((e.v, (e.line.first, e.line.last)) for e in edges), strict=True)
+        )
+        covariance[has] = [
+            edge.covariance / judged.weight + judged.bias**2
+            for edge, judged in zip(edges, verdicts, strict=True)
+        ]
+        quality[has] = [_quality(e, band.length) for e, band in zip(edges, bands, strict=True)]
         origin, along, normal = (
             np.array(x) for x in zip(*((b.origin, b.along, b.normal) for b in bands), strict=True)
         )
@@ -609,7 +613,7 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
         xy = first[:, None] + place[..., None] * step[:, None]
         ends[has] = search.camera.distort(xy)
     gamma = np.where(np.isnan(quality[:, 3]), np.nan, search.camera.gamma)
-    reasons = tuple(reason for part in parts for reason in part.reasons)
+    reasons = tuple(reason for part in parts for reason in part.verdict.reasons)
     return Outlines(
         row=np.full(n, search.row, dtype=np.intp),
         leg=np.repeat(np.array([part.leg for part in parts], dtype=np.intp), 2),
@@ -692,41 +696,24 @@ def _with_verdict(
     measured: tuple[MeasuredEdge | LostEdge, MeasuredEdge | LostEdge],
     *,
     near_fit: bool,
-) -> PartLines:
+) -> JudgedPart:
     """Return the measured edges of a part with verdicts and how well they were seen."""
     length, window = part.band.length, part.window if part.guided else None
     judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
-    lines: list[OutlineLine | None] = []
-    for edge in measured:
-        if isinstance(edge, LostEdge):
-            lines.append(None)
-            continue
-        line = edge.line
-        position = sorted(line.position.tolist())
-        # Hidden and wrong blocks leave gaps between the others.
-        spacing = min(after - before for before, after in pairwise(position))
-        visible = (len(position) - 1) * spacing * length
-        quality = (
-            round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4),
-            edge.by_gamma, round(edge.polish, 2),
-        )  # fmt: skip
-        lines.append(
-            OutlineLine(
-                edge.v,
-                (line.first, line.last),
-                edge.covariance / judged.weight + judged.bias**2,
-                quality,
-            )
-        )
-    return PartLines(part.leg.leg, part.segment.link, judged.reasons, lines, part.band)
+    return JudgedPart(part.leg.leg, part.segment.link, judged, measured, part.band)
 
 
-class PartVerdict(NamedTuple):
-    """Which outlines of a part are used."""
-
-    reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
-    bias: float = 0.0  # how far used ones may be off besides their covariance [px]
-    weight: float = 1.0  # of used ones, whose covariance is larger by its inverse
+def _quality(edge: MeasuredEdge, length: float) -> tuple[float, ...]:
+    """Return contrast, length, residual, by_gamma and polish of Outlines; a band's length [px]."""
+    line = edge.line
+    position = sorted(line.position.tolist())
+    # Hidden and wrong blocks leave gaps between the others.
+    spacing = min(after - before for before, after in pairwise(position))
+    visible = (len(position) - 1) * spacing * length
+    return (
+        round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4),
+        edge.by_gamma, round(edge.polish, 2),
+    )  # fmt: skip
 
 
 def verdict(
@@ -933,11 +920,9 @@ def _of_image(
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}
     why = Rejection(Reason.NOT_PLACED if T is None else Reason.OUTSIDE)
-    others = [PartLines(j, _longest(search, j), (why, why)) for j in wanted if j not in seen]
+    # The longest part stands for a leg that is not looked for.
+    longest = {j: max(search.cylinders[j], key=lambda c: (c.end - c.start, c.link)) for j in wanted}
+    others = [
+        JudgedPart(j, longest[j].link, PartVerdict((why, why))) for j in wanted if j not in seen
+    ]
     return join_outlines([found, outline_table(one, others)]) if others else found, blur
-
-
-def _longest(search: Search, leg: int) -> str:
-    """Return the part of a leg that stands for it where it is not looked for."""
-    of_leg = search.cylinders[leg]
-    return max(of_leg, key=lambda cylinder: (cylinder.end - cylinder.start, cylinder.link)).link
