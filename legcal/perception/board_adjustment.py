@@ -41,6 +41,7 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.solver import COST_TOLERANCE, minimise, normal_equations
 from legcal.geometry.lines import cross
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.board import Board
 from legcal.vision.camera import (
@@ -63,7 +64,7 @@ SIGMA_PRINT_RATIO = 0.005  # printers scale both directions differently
 
 
 @dataclass(frozen=True, eq=False)
-class BoardImages:
+class BoardImages(Table):
     """The corners of the board in some images, n of them."""
 
     image: IntArray  # (n,) of each corner, rising, from 0 to n_images - 1

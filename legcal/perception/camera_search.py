@@ -305,8 +305,7 @@ def place_near(
     R = Rotation.from_rotvec(turns).as_matrix() @ rough.R
     poses = CameraPoses.rigid(R, np.repeat(rough.t, len(R), axis=0), n_legs)
     every = Pictures.of(pictures)
-    candidates = _candidates(every, _approached(every, poses))
-    return replace(candidates, hinted=True)
+    return replace(_candidates(every, _approached(every, poses)), hinted=True)
 
 
 def place_at(

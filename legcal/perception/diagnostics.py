@@ -23,6 +23,7 @@ from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.motions import pose_distance
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk
+from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     Picture,
@@ -40,7 +41,9 @@ MIN_SHARE, MIN_GAIN, MIN_MORE = 0.35, 2.0, 0.15
 AMBIGUOUS = 0.85  # part of the best explanation from which on another one is about as good
 LONE_READING = 3.0  # how many times more than any other one it differs, if it alone is wrong
 ZOOMS = 1.02 ** np.setdiff1d(np.arange(-12, 36), 0)  # of images cut out and scaled
-_ORIGINAL = "replace it by the original"  # a remedy
+# Remedies
+_ORIGINAL = "replace it by the original"
+_CHECK_ROWS = "check which image belongs to which row"
 _FLIPS = (
     (LEFT_RIGHT, Reason.MIRRORED), (UP_DOWN, Reason.MIRRORED), (UPSIDE_DOWN, Reason.UPSIDE_DOWN)
 )  # fmt: skip
@@ -266,51 +269,36 @@ def explain(
     pairs = search.pairs(row, view)
     picture = search.picture(row, view, pairs)
     own = _share(picture, placement, view)
-    others = [
-        (
-            _share(replace(picture, pairs=flipped(pairs, picture.corners, flip)), placement, view),
-            Rejection(reason),
-        )
+
+    def as_if(changed: CandidatePairs) -> float:
+        return _share(replace(picture, pairs=changed), placement, view)
+
+    def best_reading(rows: Sequence[int], v: int, seen: CandidatePairs) -> list[tuple[float, int]]:
+        readings = [(_share(search.picture(r, v, seen), placement, v), r) for r in rows]
+        return _best(readings, suspects)
+
+    tried = [
+        (as_if(flipped(pairs, picture.corners, flip)), Rejection(reason), _ORIGINAL)
         for flip, reason in _FLIPS
     ]
-    tried = [(share, why, _ORIGINAL) for share, why in others]
-    zooms = [
-        (_share(replace(picture, pairs=shrunk(pairs, picture.corners, z)), placement, view), z)
-        for z in ZOOMS
-    ]
-    share = max(share for share, _ in zooms)
-    zoom = float(np.median([z for own, z in zooms if own == share]))
-    tried.append((share, Rejection(Reason.ZOOMED, Cause("{:.2f}", (zoom,))), _ORIGINAL))
+    zooms = np.array([as_if(shrunk(pairs, picture.corners, zoom)) for zoom in ZOOMS.tolist()])
+    zoom = float(np.median(ZOOMS[zooms == zooms.max()]))
+    zoomed = Rejection(Reason.ZOOMED, Cause("{:.2f}", (zoom,)))
+    tried.append((float(zooms.max()), zoomed, _ORIGINAL))
     rows = _other_readings(search, row)
-    readings = [
-        (_share(search.picture(other, view, pairs), placement, view), other) for other in rows
-    ]
-    for share, other in _best(readings, suspects):
+    for share, other in best_reading(rows, view, pairs):
         tried.append((share, *_at_other_reading(search, row, other, other in suspects)))
     for w, other_view in enumerate(measurements.views):
         sizes = [(c.width, c.height) for c in (measurements.views[view].camera, other_view.camera)]
         if w == view or placement.T_base_camera[w] is None or sizes[0] != sizes[1]:
             continue
         same = other_view.camera is measurements.views[view].camera
-        seen = pairs if same else search.pairs(row, w)
         there = [row, *(other for other in rows if measurements.view[other] == w)]
-        readings = [
-            (_share(search.picture(other, w, seen), placement, w), other) for other in there
-        ]
-        for share, other in _best(readings, suspects):
-            at = (
-                ""
-                if other == row
-                else f" at the reading given for image {measurements.image[other]}"
-            )
+        for share, other in best_reading(there, w, pairs if same else search.pairs(row, w)):
+            image = measurements.image[other]
+            at = "" if other == row else f" at the reading given for image {image}"
             shown = f"it was taken by the camera of view {other_view.name}{at}"
-            tried.append(
-                (
-                    share,
-                    Rejection(Reason.OTHER_VIEW, shown),
-                    "check which image belongs to which row",
-                )
-            )
+            tried.append((share, Rejection(Reason.OTHER_VIEW, shown), _CHECK_ROWS))
     share, why, remedy = max(tried, key=lambda one: one[0])
     # Clearly more of the legs than the reading's own, and enough of them
     of_others = SHARE_OF_OTHERS * usual.get(view, 0.0)
@@ -327,7 +315,7 @@ def _at_other_reading(
     one wrong digit in this reading makes the difference.
     """
     measurements = search.measurements
-    image, remedy = measurements.image[other], "check which image belongs to which row"
+    image, remedy = measurements.image[other], _CHECK_ROWS
     if exchanged:
         shown = f"it shows the reading given for image {image}"
         return Rejection(Reason.OTHER_READING, shown), remedy

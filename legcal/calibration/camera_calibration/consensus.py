@@ -57,20 +57,17 @@ _LEAST_SCATTER_PX = 1e-4  # standard deviation of exact corners
 _MIN_INLIERS = 0.6  # smallest share of inlier corners in a used image
 
 
-@dataclass(frozen=True, eq=False)
-class _Agreement:
-    adjusted: AdjustedBoard  # camera fitted to these; poses and residuals of all images
-    left_out: dict[int, str]  # the other images with their faults
-    rival: tuple[int, ...]  # other images that agree among themselves
-
-
 def _agreeing_images(
     corners: BoardImages,
     size: ImageSize,
     model: DistortionModel,
     first: AdjustedBoard | None = None,  # adjustment to all images, if there is one
-) -> _Agreement | None:
-    """Return the largest group of images that agree on a camera; None if no fit succeeds."""
+) -> tuple[AdjustedBoard, dict[int, str], tuple[int, ...]] | None:
+    """Return the largest group of images that agree on a camera; None if no fit succeeds.
+
+    The camera fitted to these, with poses and residuals of all images; the other images with their
+    faults; those of them that agree among themselves.
+    """
     n = int(corners.image[-1]) + 1
     largest = _largest(corners, size, model, first)
     if largest is None:
@@ -78,14 +75,14 @@ def _agreeing_images(
     adjusted, group = largest
     others = np.flatnonzero(~group)
     if not len(others):
-        return _Agreement(adjusted, {}, ())
+        return adjusted, {}, ()
     rival: tuple[int, ...] = ()
     if len(others) >= _RIVAL:
         part, numbers = part_of(corners, np.isin(corners.image, others), n)
         second = _largest(part, size, model)
         if second is not None and np.count_nonzero(second[1]) >= _RIVAL:
             rival = tuple(np.array(numbers)[second[1]].tolist())
-    return _Agreement(adjusted, _reasons(adjusted, corners, group), rival)
+    return adjusted, _reasons(adjusted, corners, group), rival
 
 
 def _largest(
@@ -332,13 +329,7 @@ def _faults(
     camera, T, of_image = adjusted.camera, adjusted.T_camera_board[i], corners.image == i
     points, sheet = corners.points[of_image], adjusted.sheet or Sheet.flat(corners.points)
     only = np.zeros(len(points), dtype=np.intp)
-    image = BoardImages(
-        only,
-        sheet.placed(points)[0],
-        corners.px[of_image],
-        corners.sigma_px[of_image],
-        corners.radius,
-    )
+    image = replace(corners.choose(of_image), image=only, points=sheet.placed(points)[0])
     plain = adjust_board(camera, [T], image)
     if plain is None:
         return {}
@@ -403,7 +394,7 @@ def robust_fit(
     agreed = _agreeing_images(corners, size, model, first)
     if agreed is None:
         return None
-    adjusted, left_out = agreed.adjusted, dict(agreed.left_out)
+    adjusted, left_out, rival = agreed
     poses = list(adjusted.T_camera_board)
     is_kept = ~np.isin(corners.image, list(left_out))
     for _ in range(_MOST_ROUNDS):
@@ -444,7 +435,7 @@ def robust_fit(
         part,
         images,
         left_out,
-        agreed.rival,
+        rival,
         int(np.count_nonzero(~is_kept & others)),
         ratio,
         adjusted.clusters.covariance(ratio),

@@ -16,7 +16,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from legcal.brief import brief
 from legcal.calibration.camera_calibration.diagnostics import Repeats, coverage, covered
-from legcal.calibration.camera_calibration.projection import GRID, finite, grid, projection_sigma
+from legcal.calibration.camera_calibration.projection import GRID, finite, projection_sigma
 from legcal.files.folder import OutputFile
 from legcal.files.schema import Document
 from legcal.geometry.types import Array
@@ -278,7 +278,7 @@ def _picture(calibration: CameraCalibration) -> NDArray[np.uint8]:
             for p in (middle - scale * mean[drawn], middle + scale * mean[drawn])
         )
         cv2.arrowedLine(canvas, start, end, _RESIDUAL, 2, cv2.LINE_AA, tipLength=0.3)
-    places = grid(camera).reshape(*GRID[::-1], 2)[::_LABELLED, ::_LABELLED].reshape(-1, 2)
+    places = camera.grid(*GRID).reshape(*GRID[::-1], 2)[::_LABELLED, ::_LABELLED].reshape(-1, 2)
     sigmas = calibration.projection_sigma[::_LABELLED, ::_LABELLED].ravel()
     for place, sigma in zip(places, sigmas.tolist(), strict=True):
         label = f"{sigma:.2g}"
