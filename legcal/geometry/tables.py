@@ -1,4 +1,7 @@
-"""Tables of arrays: rows chosen, and tables joined, by one way for all of them."""
+"""Tables of arrays: rows chosen, and tables joined, by one way for all of them.
+
+Of candidates, the best first, :func:`first_apart` leaves out those that are near better ones.
+"""
 
 from __future__ import annotations
 
@@ -53,3 +56,17 @@ class Table:
             for name, values in columns[0].items()
         }
         return replace(parts[0], **joined)
+
+
+def first_apart(near: BoolArray, most: int | None = None) -> IntArray:
+    """Return the first rows (k,) that are not near an earlier one of these, at most so many.
+
+    ``near[i, j]`` of near (n, n) says whether row i counts as near row j.
+    """
+    kept = list[int]()
+    for i in range(len(near)):
+        if len(kept) == most:
+            break
+        if not near[i, kept].any():
+            kept.append(i)
+    return np.array(kept, dtype=np.intp)

@@ -41,7 +41,7 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.solver import COST_TOLERANCE, minimise, normal_equations
 from legcal.geometry.lines import cross
-from legcal.geometry.tables import Table
+from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.board import Board
 from legcal.vision.camera import (
@@ -330,11 +330,8 @@ def _refine(
 
 def _distinct(poses: list[AdjustedBoard], angle: float) -> list[AdjustedBoard]:
     """Return the poses that differ by more than an angle, the first ones of each kind."""
-    kept: list[AdjustedBoard] = []
-    for pose in poses:
-        if all(_angle(pose, other) > angle for other in kept):
-            kept.append(pose)
-    return kept
+    near = np.array([[_angle(one, other) <= angle for other in poses] for one in poses], np.bool_)
+    return [poses[i] for i in first_apart(near).tolist()]
 
 
 def _angle(one: AdjustedBoard, other: AdjustedBoard) -> float:

@@ -32,6 +32,7 @@ from legcal.data.outlines import (
 )
 from legcal.data.reasons import USED
 from legcal.geometry.lines import cross
+from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
@@ -360,12 +361,9 @@ def _fitted(
 
 def _apart(lines: Sequence[tuple[BlockLine, float]]) -> list[tuple[BlockLine, float]]:
     """Return the lines that are not another one before them."""
-    kept: list[tuple[BlockLine, float]] = []
-    for line, contrast in lines:
-        middle = float(np.mean(line.ends))
-        if all(abs(middle - float(np.mean(other.ends))) >= APART for other, _ in kept):
-            kept.append((line, contrast))
-    return kept
+    middle = np.array([np.mean(line.ends) for line, _ in lines])
+    near = np.abs(middle[:, None] - middle) < APART
+    return [lines[i] for i in first_apart(near).tolist()]
 
 
 def _of_one_direction(lines: Sequence[tuple[BlockLine, float]]) -> list[tuple[BlockLine, float]]:

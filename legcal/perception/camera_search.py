@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
@@ -367,13 +368,10 @@ def _different(
         for pairs, pair, match in zip(pictures.pairs, matches.pair, matched, strict=True):
             same = _one_leg(pairs)[pair[:, None], pair[None]]
             common += np.sum(same & match[:, None] & match[None], axis=2)
-    least = np.maximum(np.diag(common), 1.0)
-    kept: list[int] = []
-    for i in np.argsort(-score, kind="stable").tolist():
-        alike = common[i, kept] / least[i] >= SAME_MATCHES
-        if not np.any(alike & _near(poses, kept, i, *OTHER_POSE)):
-            kept.append(i)
-    return np.array(kept, dtype=np.intp)
+    alike = common / np.maximum(np.diag(common), 1.0)[:, None] >= SAME_MATCHES
+    order = _best(score, len(score))
+    near = _near(poses.choose(order), *OTHER_POSE) & alike[order][:, order]
+    return order[first_apart(near)]
 
 
 def _one_leg(pairs: Array) -> BoolArray:
@@ -446,23 +444,18 @@ def _best(score: Array, n: int) -> IntArray:
 
 def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
     """Return the best poses that differ from better ones."""
-    kept: list[int] = []
-    for i in np.argsort(-score, kind="stable").tolist():
-        if len(kept) == n:
-            break
-        if not np.any(_near(poses, kept, i, *SAME_POSE)):
-            kept.append(i)
-    return np.array(kept, dtype=np.intp)
+    order = _best(score, len(score))
+    return order[first_apart(_near(poses.choose(order), *SAME_POSE), n)]
 
 
-def _near(poses: CameraPoses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
-    """Return the mask of poses within an angle and a part of the distance of pose i."""
-    trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
+def _near(poses: CameraPoses, angle: float, part: float) -> BoolArray:
+    """Return which poses (n, n) are within an angle and a part of the distance of others."""
+    trace = np.einsum("iab,kab->ik", poses.R, poses.R)
     turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
-    # Where the camera stands in the base link.
-    at = -np.einsum("kij,ki->kj", poses.R[some], poses.t[some])
-    apart = np.linalg.norm(at + poses.R[i].T @ poses.t[i], axis=1)
-    return np.asarray((turn < angle) & (apart < part * np.linalg.norm(poses.t[i])))
+    at = -np.einsum("kij,ki->kj", poses.R, poses.t)  # where the camera stands in the base link
+    apart = np.linalg.norm(at[:, None] - at, axis=2)
+    reach = part * np.linalg.norm(poses.t, axis=1)
+    return np.asarray((turn < angle) & (apart < reach[:, None]))
 
 
 def flipped(pairs: CandidatePairs, corners: Array, flip: Array) -> CandidatePairs:

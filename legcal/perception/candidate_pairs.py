@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.geometry.tables import Table
+from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.perception.profiles import Samples
 from legcal.perception.tuning import EDGE_LENGTH, EDGE_SLOPE
@@ -425,7 +425,7 @@ def find_candidate_pairs(segments: EdgeSegments) -> CandidatePairs:
         for t, v in ((first, centre[0]), (last, centre[1]))
     )
     chosen = _best(np.where(good, merit, 0.0), i, j, len(ends))
-    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:MAX_PAIRS]
+    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])]
     start, stop = start[chosen], stop[chosen]
     full = np.linalg.norm(stop - start, axis=1)
     return CandidatePairs(
@@ -453,8 +453,8 @@ def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int) -> IntArray:
     return np.array(chosen, dtype=np.intp)
 
 
-def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
-    """Return the mask of pairs (n,), best first, not within better ones of the same width."""
+def _distinct(start: Array, stop: Array, width: Array) -> IntArray:
+    """Return the pairs, best first, that are not within better ones of the same width."""
     along = stop - start
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]
@@ -466,8 +466,4 @@ def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
     alike = np.abs(offset).max(axis=2) <= DUPLICATE[0] * width[:, None]
     alike &= (middle > 0.0) & (middle < length[:, None])
     alike &= np.abs(width[None, :] - width[:, None]) <= DUPLICATE[1] * width[:, None]
-    kept = np.ones(len(start), dtype=np.bool_)
-    for i in range(len(start)):
-        if kept[i]:
-            kept[i + 1 :] &= ~alike[i, i + 1 :]
-    return kept
+    return first_apart(alike.T, MAX_PAIRS)

@@ -38,7 +38,7 @@ from legcal.estimation.solver import information
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import motions_of
 from legcal.geometry.rotations import rotation_matrices
-from legcal.geometry.tables import Table
+from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.leg import LegKind
@@ -307,11 +307,7 @@ def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
     ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     off = np.linalg.norm(ends[:, None] - ends, axis=3)
     near = np.sqrt(np.mean(off**2, axis=2)) < APART * machine.size
-    kept = list[int]()
-    for i in range(len(poses)):
-        if len(kept) < n and not near[i, kept].any():
-            kept.append(i)
-    return np.array(kept, dtype=np.intp)
+    return first_apart(near, n)
 
 
 def _stepped_often(
