@@ -230,10 +230,6 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
             "if its quaternion is in the order w, x, y, z:",
         ),
         (
-            lambda T: _pose(T.inv().translation, _w_first(T.inv().rotation)),
-            "if it is T_camera_base, the inverse, and its quaternion is in the order w, x, y, z:",
-        ),
-        (
             lambda T: T * _pose(np.zeros(3), Rotation.from_euler("x", 180, degrees=True)),
             "if its camera axes are y up and z backward:",
         ),

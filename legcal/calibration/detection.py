@@ -36,7 +36,7 @@ from legcal.calibration.documents import (
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
-from legcal.data.corners import Corners, write_corners
+from legcal.data.corners import Corners, join_corners, write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, ImageReader
 from legcal.data.image_tables import inverse
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
@@ -622,10 +622,11 @@ def draw_images(
     )
     for file in (*files, *bare):
         file.parent.mkdir(parents=True, exist_ok=True)
+    corners = join_corners([]) if detection.corners is None else detection.corners
     drawings = _Drawings(
         detection.dataset.image_reader(rows),
         tuple(tuple(_marks(detection, row)) for row in rows),
-        tuple(_corner_marks(detection, row) for row in rows),
+        tuple(marks_of_corners(corners.choose(corners.row == row)) for row in rows),
         tuple(_caption(detection, row) for row in rows),
         tuple(file.name for file in files),
         photographs,
@@ -665,11 +666,6 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
         detection.predicted(row),
         detection.dataset.machine.leg_names,
     )
-
-
-def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
-    corners = detection.corners
-    return () if corners is None else marks_of_corners(corners.choose(corners.row == row))
 
 
 def _caption(detection: Detection, row: int) -> str:

@@ -465,24 +465,14 @@ def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:
     """Yield common misinterpretations of T_base_camera, with the pose each would mean."""
     t, R = hint.translation, hint.rotation
-    written = (
-        ("", t, R),
-        ("its xyz are millimetres", MILLIMETRE * t, R),
-        (
-            "its quaternion is in the order w, x, y, z",
-            t,
-            Rotation.from_quat(np.roll(R.as_quat(), -1)),
-        ),
-    )
-    for what, xyz, rotation in written:
-        pose = RigidTransform.from_components(xyz, rotation)
-        if what:
-            yield what, pose
-        both = f", and {what}" if what else ""
-        yield f"it is T_camera_base, the inverse{both}", pose.inv()
-        for axes, R_axes in _CAMERA_AXES.items():
-            turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
-            yield f"its camera axes are {axes}{both}", pose * turned
+    yield "it is T_camera_base, the inverse", hint.inv()
+    yield "its xyz are millimetres", RigidTransform.from_components(MILLIMETRE * t, R)
+    w_first = Rotation.from_quat(np.roll(R.as_quat(), -1))
+    order = "its quaternion is in the order w, x, y, z"
+    yield order, RigidTransform.from_components(t, w_first)
+    for axes, R_axes in _CAMERA_AXES.items():
+        turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
+        yield f"its camera axes are {axes}", hint * turned
 
 
 def far_from_hints(
