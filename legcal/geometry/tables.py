@@ -13,6 +13,8 @@ import numpy as np
 
 from legcal.geometry.types import BoolArray, IntArray
 
+_COLUMN = np.ndarray, tuple
+
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -29,8 +31,12 @@ class Table:
 
     def columns(self) -> dict[str, Any]:
         """Return the fields with one entry a row, by name."""
-        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in self.common}
-        return {name: x for name, x in named.items() if isinstance(x, np.ndarray | tuple)}
+        return {
+            field.name: values
+            for field in fields(self)
+            if isinstance(values := getattr(self, field.name), _COLUMN)
+            and field.name not in self.common
+        }
 
     def choose(self, rows: BoolArray | IntArray | slice) -> Self:
         """Return the rows of a mask, of a slice, or of indices in a new order."""

@@ -450,7 +450,8 @@ def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
 
 def _near(poses: CameraPoses, angle: float, part: float) -> BoolArray:
     """Return which poses (n, n) are within an angle and a part of the distance of others."""
-    trace = np.einsum("iab,kab->ik", poses.R, poses.R)
+    flat = poses.R.reshape(len(poses), 9)
+    trace = flat @ flat.T
     turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
     at = -np.einsum("kij,ki->kj", poses.R, poses.t)  # where the camera stands in the base link
     apart = np.linalg.norm(at[:, None] - at, axis=2)
