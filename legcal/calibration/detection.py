@@ -491,16 +491,11 @@ class Examination:
             left_out = left_out_blocks(of_rows, detection.left_out)
             if self.is_written:
                 overlays = overlay_blocks(of_rows, detection.overlay_files)
-        return ExaminationDocument(
+        return ExaminationDocument.describing(
+            self,
             legcal_doctor=1,
-            dataset=self.dataset,
-            mechanism=self.mechanism,
             ready=self.is_ready,
             usable=self.is_usable,
-            checks=list(self.checks),
-            findings=list(self.findings),
-            encoders=list(self.encoders),
-            views=list(self.views),
             images=sum(view.images for view in self.views),
             outlines=sum(view.outlines or 0 for view in self.views),
             used=self.n_used,

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
 from pydantic import (
@@ -124,6 +124,12 @@ class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
+
+    @classmethod
+    def describing(cls, source: object, **others: Any) -> Self:
+        """Return the document of an object: its attributes, and other fields that are stated."""
+        same = {name: getattr(source, name) for name in cls.model_fields if name not in others}
+        return cls(**same, **others)
 
     def document(self) -> dict[str, Any]:
         """Return the document for ``--json``."""

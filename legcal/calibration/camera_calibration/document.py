@@ -125,24 +125,14 @@ class CameraCalibration:
         """Return the output of ``--json``."""
         sheet = zip(SHEET, self.sheet.tolist(), self.sheet_sigma.tolist(), strict=True)
         numbers = zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True)
-        return CameraDocument(
+        return CameraDocument.describing(
+            self,
             legcal_camera=1,
             model=self.camera.model,
             width=self.camera.width,
             height=self.camera.height,
             intrinsics=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in numbers],
             covariance=self.covariance.tolist(),
-            rms_px=self.rms_px,
-            noise_px=self.noise_px,
-            noise_length_px=self.noise_length_px,
-            effective_corners=self.effective_corners,
-            repeats=self.repeats,
-            coverage=self.coverage,
-            images=list(self.images),
-            warnings=list(self.warnings),
-            lens=self.lens,
-            validated_px=self.validated_px,
-            error_ratio=self.error_ratio,
             projection_sigma_px=[finite(row) for row in self.projection_sigma],
             sheet=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in sheet],
         ).document()
