@@ -529,7 +529,7 @@ def _inspect_images(
         count(row)
     defects = defects_of(measurements, exposures)
     photographs.still.update(_still_pictures(measurements, small, defects))
-    pairs_of = partial(_pairs_of_reduced, photographs.search(nominal))
+    pairs_of = photographs.search(nominal).pairs_of_reduced
     seen_by = [(picture, int(measurements.view[row])) for row, picture in small.items()]
     pairs = dict(zip(small, photographs.run(pairs_of, seen_by), strict=True))
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
@@ -545,11 +545,6 @@ def _still_pictures(
             of_view.setdefault(int(measurements.view[row]), []).append(picture)
     still = {view: still_picture(pictures) for view, pictures in of_view.items()}
     return {view: picture for view, picture in still.items() if picture is not None}
-
-
-def _pairs_of_reduced(search: Search, seen_by: tuple[Grey, int]) -> CandidatePairs:
-    """Return the candidate pairs of a reduced image and the view of it."""
-    return search.pairs_of_reduced(*seen_by)
 
 
 def defects_of(
