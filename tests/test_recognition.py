@@ -28,7 +28,7 @@ from legcal.perception.camera_search import (
     place_camera,
     place_near,
 )
-from legcal.perception.candidate_pairs import find_candidate_pairs
+from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     EdgeMaps,
@@ -314,7 +314,9 @@ class _Made(Search):
 
     made: ClassVar[list[Picture]] = []
 
-    def picture(self, row: int) -> Picture:
+    def picture(
+        self, row: int, view: int | None = None, pairs: CandidatePairs | None = None
+    ) -> Picture:
         return self.made[row]
 
 
