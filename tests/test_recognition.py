@@ -372,7 +372,7 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     monkeypatch.setattr(
         recognition,
         "_by_edges",
-        lambda search, group, pictures, known: recognition.place_camera([], 6),
+        lambda search, group, pictures, known: place_camera([], 6),
     )
     view = search.measurements.views[0]
     for is_placed in (False, True):
