@@ -25,15 +25,6 @@ def cross(a: Array, b: Array) -> Array:
     return product
 
 
-def cross_first(a: Array, b: Array) -> Array:
-    """Return vector products a x b along the first axis, (3, ...)."""
-    product = np.empty((3, *np.broadcast(a[0], b[0]).shape))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(a[j], b[k], out=product[i])
-        product[i] -= a[k] * b[j]
-    return product
-
-
 def moment(
     u: Array,  # (..., 3) unit directions
     M: Array,  # (..., 3) any point of each line [m]

@@ -46,7 +46,7 @@ from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_revers
 from legcal.perception.placement import Group, Placement, Search
 from legcal.perception.tuning import EVIDENCE, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON, outline_offsets
+from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import Run, in_turn
 
 # Lengths are parts of the mean leg length.
@@ -433,13 +433,21 @@ def _offsets_of(
     the frame of the camera [m] and radii (n,), at two points (n, 2, 2) of the sensor plane with
     their :func:`_metric_of`.
     """
-    lens = np.ascontiguousarray(metric.transpose(2, 3, 1, 0))
-    points = np.ascontiguousarray(ends.T)
-    A, B = X.transpose(1, 2, 0)
-    offset, by_leg, _ = outline_offsets(A, B, radius, EPSILON[edge], points, lens)
-    if not np.isfinite(offset).all():
-        raise NotVisible("The view could not be fitted: found a camera inside a leg, needed none.")
-    return offset.T, by_leg[:6].reshape(2, 3, 2, -1).transpose(3, 2, 0, 1)
+    A, B = X[:, 0], X[:, 1]
+    u = B - A
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    h = outlines_of_axis(u, A, radius)[np.arange(len(X)), edge]  # (n, 3)
+    value = np.einsum("nx,nex->ne", h[:, :2], ends) + h[:, 2:]
+    normal = np.einsum("nexy,ny->nex", metric, h[:, :2])
+    length = np.linalg.norm(normal, axis=-1)
+    offset = value / length
+    by_h = np.ones((len(X), 2, 3))
+    by_h[..., :2] = ends - (offset / length)[..., None] * np.einsum("nexy,nex->ney", metric, normal)
+    # A unit h with h.A = h.B = epsilon R stays one: dh = -(h.dA) a - (h.dB) b.
+    dual = np.stack([cross(B, h), cross(h, A)], axis=2)
+    dual /= np.sum(A * dual[..., 0], axis=1)[:, None, None]
+    along = (by_h @ dual) / length[..., None]  # (n, 2 points, A and B)
+    return offset, -along[..., None] * h[:, None, None]
 
 
 def _metric_of(camera: Camera, ends: Array) -> Array:

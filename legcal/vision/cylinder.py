@@ -9,7 +9,7 @@ theta far better than psi.
 import numpy as np
 
 from legcal.errors import NotVisible
-from legcal.geometry.lines import cross, cross_first, moment, nearest_point_to_origin
+from legcal.geometry.lines import cross, moment, nearest_point_to_origin
 from legcal.geometry.types import Array
 
 EPSILON = np.array([1.0, -1.0])
@@ -51,62 +51,6 @@ def steps_to_outlines(
     By (5), h . M = epsilon R on the axis, and zero where the cylinder touches the plane of h.
     """
     return np.asarray(-EPSILON[:, None] * np.asarray(radius)[..., None, None] * h)
-
-
-def outline_offsets(
-    A: Array, B: Array, radius: Array, epsilon: Array, xy: Array, lens: Array
-) -> tuple[Array, Array, Array]:
-    """Return the signed distances of points from predicted outlines of legs, and derivatives.
-
-    With n = A x B and D = B - A, the outline of the cylinder about AB seen from the origin, eqs (1)
-    and (3), is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to scale. The distance is
-    h . (x, y, 1) / |J^-T (h1, h2)|, as in :meth:`legcal.vision.camera.Camera.line_offset` for a
-    constant derivative J of the lens.
-
-    Parameters
-    ----------
-    A, B : (3, n) array
-        Both ends in the camera frame [m].
-    radius, epsilon : (n,) array
-        Radii [m], and +1 or -1 of eq (5).
-    xy : (2, 2, n) array
-        Both points on the sensor plane, by coordinate and point.
-    lens : (2, 2, 2, n) array
-        J^-T at these points [1/px], by row, column and point.
-
-    Returns
-    -------
-    offset : (2, n) array
-        Distance of both points [px]; NaN where the origin is inside the cylinder.
-    by_leg : (7, 2, n) array
-        Derivatives by A, B and radius.
-    by_xy : (2, 2, n) array
-        Derivatives by the coordinates of the point.
-    """
-    D, n = B - A, cross_first(A, B)
-    squared = np.einsum("in,in->n", D, D)
-    across, signed = cross_first(D, n), epsilon * radius
-    with np.errstate(invalid="ignore", divide="ignore"):
-        depth = np.sqrt(np.einsum("in,in->n", n, n) - radius * radius * squared)
-        h = signed * across - depth * n
-        normal = np.einsum("ijen,jn->ien", lens, h[:2])
-        size = np.sqrt(np.einsum("ien,ien->en", normal, normal))
-        offset = (h[0] * xy[0] + h[1] * xy[1] + h[2]) / size
-        by_h = np.empty((3, *offset.shape))
-        np.divide(1.0, size, out=by_h[2])
-        by_xy = h[:2, None] * by_h[2]
-        turned = np.einsum("ijen,ien->jen", lens, normal)
-        by_h[:2] = (xy - (offset * by_h[2]) * turned) * by_h[2]
-        along = np.einsum("ien,in->en", by_h, n) / depth
-    n, D = n[:, None], D[:, None]
-    by_n = signed * cross_first(by_h, D) - depth * by_h - along * n
-    by_D = signed * cross_first(n, by_h) + (along * (radius * radius)) * D
-    by_leg = np.empty((7, *offset.shape))
-    np.subtract(cross_first(B[:, None], by_n), by_D, out=by_leg[:3])
-    np.add(cross_first(by_n, A[:, None]), by_D, out=by_leg[3:6])
-    np.einsum("ien,in->en", by_h, epsilon * across, out=by_leg[6])
-    by_leg[6] += along * (radius * squared)
-    return offset, by_leg, by_xy
 
 
 def axis_of_outlines(

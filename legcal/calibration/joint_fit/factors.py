@@ -26,14 +26,14 @@ from legcal.data.outlines import Outlines, no_outlines, polished_parts
 from legcal.errors import Code, DatasetError, Problem
 from legcal.estimation.problem import Factor, Residuals, Touch
 from legcal.geometry.covariances import whitener
-from legcal.geometry.lines import cross, cross_first
+from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import LINKS, LegColumns, LegKind, Link
 from legcal.machine.rods import actuator_index, first_rods
 from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
-from legcal.vision.cylinder import EPSILON, outline_offsets
+from legcal.vision.cylinder import EPSILON
 
 _SAME_GAMMA = 1e-6  # relative difference of equal gammas
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
@@ -594,7 +594,7 @@ class Readings:
             b, J = by_length[3:6], np.zeros((n_kept + 6 + n_q, *by_length.shape[1:]))
             J[:3], J[6:n_kept], J[n_kept + 3 : n_kept + 6] = by_length[:3], by_length[6:n_kept], b
             np.einsum("jin,jqn->iqn", R_pose, b, out=J[3:6])
-            J[n_kept : n_kept + 3] = cross_first(arm[:, None], b)
+            J[n_kept : n_kept + 3] = _cross(arm[:, None], b)
             J[n_kept + 6 :] = by_length[n_kept:]
             return J[:n_kept].T, J[n_kept:].T
 
@@ -837,6 +837,62 @@ def _corners_on(
 # ------------------------------------------------------------------------------------ residuals
 
 
+def outline_offsets(
+    A: Array, B: Array, radius: Array, epsilon: Array, xy: Array, lens: Array
+) -> tuple[Array, Array, Array]:
+    """Return the signed distances of points from predicted outlines of legs, and derivatives.
+
+    With n = A x B and D = B - A, the outline of the cylinder about AB seen from the origin, eqs (1)
+    and (3), is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to scale. The distance is
+    h . (x, y, 1) / |J^-T (h1, h2)|, as in :meth:`legcal.vision.camera.Camera.line_offset` for a
+    constant derivative J of the lens.
+
+    Parameters
+    ----------
+    A, B : (3, n) array
+        Both ends in the camera frame [m].
+    radius, epsilon : (n,) array
+        Radii [m], and +1 or -1 of eq (5).
+    xy : (2, 2, n) array
+        Both points on the sensor plane, by coordinate and point.
+    lens : (2, 2, 2, n) array
+        J^-T at these points [1/px], by row, column and point.
+
+    Returns
+    -------
+    offset : (2, n) array
+        Distance of both points [px]; NaN where the origin is inside the cylinder.
+    by_leg : (7, 2, n) array
+        Derivatives by A, B and radius.
+    by_xy : (2, 2, n) array
+        Derivatives by the coordinates of the point.
+    """
+    D, n = B - A, _cross(A, B)
+    squared = np.einsum("in,in->n", D, D)
+    across, signed = _cross(D, n), epsilon * radius
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = np.sqrt(np.einsum("in,in->n", n, n) - radius * radius * squared)
+        h = signed * across - depth * n
+        normal = np.einsum("ijen,jn->ien", lens, h[:2])
+        size = np.sqrt(np.einsum("ien,ien->en", normal, normal))
+        offset = (h[0] * xy[0] + h[1] * xy[1] + h[2]) / size
+        by_h = np.empty((3, *offset.shape))
+        np.divide(1.0, size, out=by_h[2])
+        by_xy = h[:2, None] * by_h[2]
+        turned = np.einsum("ijen,ien->jen", lens, normal)
+        by_h[:2] = (xy - (offset * by_h[2]) * turned) * by_h[2]
+        along = np.einsum("ien,in->en", by_h, n) / depth
+    n, D = n[:, None], D[:, None]
+    by_n = signed * _cross(by_h, D) - depth * by_h - along * n
+    by_D = signed * _cross(n, by_h) + (along * (radius * radius)) * D
+    by_leg = np.empty((7, *offset.shape))
+    np.subtract(_cross(B[:, None], by_n), by_D, out=by_leg[:3])
+    np.add(_cross(by_n, A[:, None]), by_D, out=by_leg[3:6])
+    np.einsum("ien,in->en", by_h, epsilon * across, out=by_leg[6])
+    by_leg[6] += along * (radius * squared)
+    return offset, by_leg, by_xy
+
+
 def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Array]:
     """Return the distances of points from lines to vanishing points, and derivatives.
 
@@ -862,14 +918,14 @@ def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Ar
         Derivatives by the coordinates of the points.
     """
     first, second = (np.concatenate([xy[:, k], np.ones((1, xy.shape[2]))]) for k in (0, 1))
-    h = cross_first(first, along)
+    h = _cross(first, along)
     normal = np.einsum("ijn,jn->in", lens, h[:2])
     size = np.sqrt(np.einsum("in,in->n", normal, normal))
     offset = np.einsum("in,in->n", h, second) / size
     by_h = second / size
     by_h[:2] -= (offset / size**2) * np.einsum("ijn,in->jn", lens, normal)
-    by_xy = np.stack([cross_first(along, by_h)[:2], h[:2] / size], axis=1)
-    return offset, cross_first(by_h, first), by_xy
+    by_xy = np.stack([_cross(along, by_h)[:2], h[:2] / size], axis=1)
+    return offset, _cross(by_h, first), by_xy
 
 
 # ----------------------------------------------------------------------------------- chain rule
@@ -935,11 +991,11 @@ class _EndsInCamera:
             J[m + 6 :, :, moved.arms] += np.einsum("jin,jqn->iqn", moved.far_q, of_arms)
             b[:, :, moved.arms] = 0.0  # arms do not depend on the platform
         np.einsum("jin,jqn->iqn", self.R_pose, b, out=J[3:6])
-        J[6:9] = cross_first(self.A_turned[:, None], by_A)
-        J[6:9] += cross_first(self.B_turned[:, None], by_B)
+        J[6:9] = _cross(self.A_turned[:, None], by_A)
+        J[6:9] += _cross(self.B_turned[:, None], by_B)
         np.add(by_A, by_B, out=J[9:12])
         J[12:n_leg_columns] = by_ends[6:]
-        J[m : m + 3] = cross_first(self.arm[:, None], b)
+        J[m : m + 3] = _cross(self.arm[:, None], b)
         return J[:m].T, J[m:].T
 
 
@@ -1039,6 +1095,15 @@ def _ends_in_camera(
 def _by_measurement(R: Array, which: IntArray) -> Array:
     """Gather matrices (k, 3, 3) by measurement, (3, 3, n)."""
     return np.ascontiguousarray(R.transpose(1, 2, 0))[..., which]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Vector product along the first axis."""
+    product = np.empty((3, *np.broadcast(a[0], b[0]).shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[j], b[k], out=product[i])
+        product[i] -= a[k] * b[j]
+    return product
 
 
 def _matvec(R: Array, v: Array) -> Array:
