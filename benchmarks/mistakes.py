@@ -42,7 +42,7 @@ from legcal.data.dataset import Dataset
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
-from legcal.perception.agreement import as_if, pairs_of_images
+from legcal.perception.agreement import as_if
 from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.placement import Placement, sensor_extent
@@ -373,7 +373,7 @@ def session(model: str, seed: int, keep: Path, pool: Run) -> Session:
         n, m = data.measurements.n_rows, data.measurements
         nowhere = np.full((n, data.machine.n_legs, 3), np.nan)
         search = data.photographs.search(Placement(nowhere, nowhere, (None,) * len(m.views)))
-        found = pairs_of_images(search, range(n), pool)
+        found = dict(zip(range(n), pool(search.pairs, range(n)), strict=True))
         kept.write_bytes(pickle.dumps({m.image[row]: one for row, one in found.items()}))
     if seed % 2:
         m = dataset.measurements

@@ -64,8 +64,8 @@ def main() -> None:
 
     from legcal.calibration.camera_calibration.consensus import robust_fit
     from legcal.calibration.camera_calibration.projection import (
+        GRID,
         compare_cameras,
-        grid,
         projection_sigma,
     )
     from legcal.vision.camera import Camera
@@ -87,7 +87,7 @@ def main() -> None:
             [seen.px, np.ones(len(seen.px))]
         )
         boards.append(board)
-    question = pickle.dumps(((SIZE.width, SIZE.height), BOARD.side, grid(truth), boards))
+    question = pickle.dumps(((SIZE.width, SIZE.height), BOARD.side, truth.grid(*GRID), boards))
     command = [options.python, "-c", _FIT]
     answer = subprocess.run(command, input=question, capture_output=True, check=True).stdout
     print(

@@ -35,7 +35,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.perception.camera_search import place_camera, refined, scores
-from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs, find_segments
+from legcal.perception.candidate_pairs import (
+    CandidatePairs,
+    find_candidate_pairs,
+    segments_of_reduced,
+)
 from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
@@ -246,7 +250,7 @@ def look(seed: int, folder: Path) -> dict[str, Any]:
     given, truth = scene.given, scene.truth
     for row, image in enumerate(given.images):
         picture = _eight_bits(image)
-        pairs = find_candidate_pairs(find_segments(grey_levels(image), given.camera))
+        pairs = find_candidate_pairs(segments_of_reduced(grey_levels(image), given.camera, 1))
         for middle, along, half in zip(pairs.middle, pairs.along, pairs.half_length, strict=True):
             ends = np.stack([middle - half * along, middle + half * along])
             _line(picture, given.camera.distort(ends), (150, 150, 150), 1)

@@ -400,7 +400,8 @@ def with_boards(
         return BoardCorners((fixed,), corners), start
     start = replace(start, T_Rb_board=place_of_board(session) * _WRONG)
     on_base = corners_of(session, seed=seed)
-    return BoardCorners((FixedBoard(BOARD, "base"), fixed), on_base.join([corners])), start
+    boards = FixedBoard(BOARD, "base"), fixed
+    return BoardCorners(boards, Corners.joined([on_base, corners])), start
 
 
 # The same pixels otherwise, and edges of bodies

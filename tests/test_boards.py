@@ -324,9 +324,9 @@ def test_errors_are_as_large_as_the_information_says_and_images_add_up() -> None
         corners = _corners(CHARUCO, [T] * 4, seed)
         one = corners.choose(corners.row == 0)
         best = plane_poses(LENS, CHARUCO.points[one.corner], one.px, one.sigma_px)[0]
-        turn = (best.T_camera_plane.rotation * truth.rotation.inv()).as_rotvec()
-        d = np.concatenate([turn, best.T_camera_plane.translation - truth.translation])
-        squares.append(d @ best.information @ d / 6.0)
+        turn = (best.T_camera_board[0].rotation * truth.rotation.inv()).as_rotvec()
+        d = np.concatenate([turn, best.T_camera_board[0].translation - truth.translation])
+        squares.append(d @ best.information[0] @ d / 6.0)
         pose = camera_poses_by_board(corners, CHARUCO, _measurements((4,)))[0][0]
         joint.append((float(np.linalg.norm(turn)), _turn(pose, T)))
     assert 0.6 < np.mean(squares) < 1.5

@@ -232,7 +232,7 @@ def corrected(seen: BoardImages) -> BoardImages:
 
 OTHERS: dict[str, Callable[[], BoardImages]] = {
     "focal length about 4 % longer": lambda: five(ZOOMED),
-    "mirrored": lambda: mirrored(five()),
+    "px off (rms) before the camera of the others": lambda: mirrored(five()),
     "another distortion of the lens": lambda: corrected(five()),
     "beside that of the others": lambda: shifted(five()),
 }

@@ -7,7 +7,6 @@ from rendering import Bar, Light, render
 from legcal.geometry.types import Array
 from legcal.perception.candidate_pairs import (
     EdgeSegments,
-    find_segments,
     segments_of_reduced,
     still_picture,
 )
@@ -49,7 +48,7 @@ def _nearest(found: EdgeSegments, line: Array) -> int:
 @pytest.mark.parametrize("lens", [None, np.array([-0.3, 0.1, 0.001, -0.002, 0.0])])
 def test_outlines_are_found_on_the_sensor_plane_with_the_brighter_side(lens: Array | None) -> None:
     camera = _camera(lens)
-    found = find_segments(_picture(camera, BARS), camera)
+    found = segments_of_reduced(_picture(camera, BARS), camera, 1)
     assert found.pixel == pytest.approx(1.0 / F)
     for bar in BARS:
         axis = (bar.A + bar.B) / (bar.A + bar.B)[2]

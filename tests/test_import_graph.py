@@ -13,7 +13,7 @@ BESIDE = "simulation"  # it knows the truth
 # The rooms, from below to above, and the modules of each that other rooms use; all others are its
 # own affair.
 LISTED = """
-geometry: covariances lines motions rotations types
+geometry: covariances lines motions rotations tables types
 files: folder motions quantity reading schema table
 pages: document svg
 machine: actuator closing configurations equations files formats home inspection

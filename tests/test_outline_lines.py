@@ -110,6 +110,15 @@ def single(value: float, n: int) -> Array:
     return np.full(n, value)
 
 
+def blocks_of(d: Samples, light: Samples, weight: Samples, position: Array) -> Blocks:
+    """Return blocks of an outline of a matte part that were not fitted."""
+    n = len(d)
+    window, clipped = (weight > 0.0).astype(np.float32), np.full(n, -np.inf, dtype=np.float32)
+    bounds, matte = np.array([0, n]), np.zeros(1, dtype=np.intp)
+    at = np.ones(n), bounds, position, np.array([HALF_WIDTH]), matte
+    return Blocks(d, light, weight, window, *at, clipped)
+
+
 def outline(
     amplitude: Array,
     shift: tuple[float, float],
@@ -130,10 +139,7 @@ def outline(
     grey = np.einsum("nmp,kp,nk->nm", powers(at / blur)[0], values[0], of_block)
     grey = grey + noise * rng.standard_normal(grey.shape)
     one: Samples = np.ones(d.shape, dtype=np.float32)
-    read = Blocks.of_pixels(
-        d.astype(np.float32), grey.astype(np.float32), one, np.array([0, n]), position,
-        np.array([HALF_WIDTH]),
-    )  # fmt: skip
+    read = blocks_of(d.astype(np.float32), grey.astype(np.float32), one, position)
     read.noise[:] = max(noise, 0.3) ** 2  # as the blocks by themselves show it
     return read
 
@@ -174,8 +180,7 @@ def read_with(blocks: Blocks, gamma: float) -> Blocks:
     seen = np.maximum(blocks.light + blocks.level[0], 0.0)
     encoded = (255.0 * (seen / 255.0) ** (1.0 / 2.2)).astype(np.float32)
     light, weight = to_light(encoded, blocks.window, gamma)
-    at = blocks.bounds, blocks.position, blocks.half_width
-    read = Blocks.of_pixels(blocks.d, light, weight, *at)
+    read = blocks_of(blocks.d, light, weight, blocks.position)
     read.noise[:] = blocks.noise
     return read
 

@@ -26,10 +26,11 @@ from legcal.perception.camera_search import (
     place_camera,
     place_near,
 )
-from legcal.perception.candidate_pairs import find_candidate_pairs
+from legcal.perception.candidate_pairs import CandidatePairs, find_candidate_pairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     EdgeMaps,
+    LegSegments,
     PairMatches,
     Picture,
     Pictures,
@@ -70,15 +71,13 @@ def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> CameraPoses:
 
 def _matched(picture: Picture, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Return the matches of one picture, without those of others."""
-    score, pair, visible = match_pairs(Pictures.of([picture]), poses, tolerance)
-    return PairMatches(score[0], pair[0], visible[0])
+    every = match_pairs(Pictures.of([picture]), poses, tolerance)
+    return PairMatches(every.score[0], every.pair[0], every.visible[0])
 
 
 def test_a_pair_counts_for_the_segment_that_it_suits_best() -> None:
     (picture, *_), T = _scene(0)
-    doubled = replace(picture.targets, **{
-        name: np.concatenate([getattr(picture.targets, name)] * 2) for name in vars(picture.targets)
-    })  # fmt: skip
+    doubled = LegSegments.joined([picture.targets] * 2)
     n = len(picture.targets)
     doubled.ends[n:] += 1.5e-3  # as good a pose, but for these segments
     m = _matched(replace(picture, targets=doubled), _pose(T), 0.025)
@@ -230,7 +229,7 @@ def test_poses_are_moved_to_where_edges_run_along_legs_that_show_no_clean_pair()
     middle = np.array([0.0, 0.0, 0.2])
     away = (1.08 * T.apply(middle)) - np.einsum("nij,j->ni", R, middle)
     start = CameraPoses.rigid(R, away, 6)
-    assert not place_by_edges(seen, maps, 6, start.take(slice(0, 0))).is_convincing
+    assert not place_by_edges(seen, maps, 6, start.choose(slice(0, 0))).is_convincing
     placed = place_by_edges(seen, maps, 6, start)
     off = T_base_camera.inv() * placed.pose()
     assert np.degrees(off.rotation.magnitude()) < 3.0
@@ -309,7 +308,9 @@ class _Made(Search):
 
     made: ClassVar[list[Picture]] = []
 
-    def picture(self, row: int) -> Picture:
+    def picture(
+        self, row: int, view: int | None = None, pairs: CandidatePairs | None = None
+    ) -> Picture:
         return self.made[row]
 
 
@@ -343,7 +344,7 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
     search = _search(_Made, made, np.array([made.posed(P) for P in spread]))
     monkeypatch.setattr(  # there are no images to measure outlines in
-        recognition, "_decided_by_outlines", lambda search, pictures, task: task[1]
+        recognition, "_decided_by_outlines", lambda search, group, pictures, one: one
     )
     for hint in (T, turned):
         placement = recognition.place_views(search, np.arange(4), [hint])
@@ -359,8 +360,14 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     T, made, poses = lp.camera(rng), lp.machine(6), [lp.platform(rng) for _ in range(4)]
     _Made.made[:] = lp.pictures(made, T, poses, rng, missing=1.1)
     search = _search(_Made, made, np.array([made.posed(P) for P in poses]))
-    monkeypatch.setattr(recognition, "_decided_by_outlines", lambda search, pictures, task: task[1])
-    monkeypatch.setattr(recognition, "_by_edges", lambda search, task: task.by_pairs)
+    monkeypatch.setattr(
+        recognition, "_decided_by_outlines", lambda search, group, pictures, one: one
+    )
+    monkeypatch.setattr(
+        recognition,
+        "_by_edges",
+        lambda search, group, pictures, known: place_camera([], 6),
+    )
     view = search.measurements.views[0]
     for is_placed in (False, True):
         views = (replace(view, is_placed=is_placed),)

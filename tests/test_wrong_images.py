@@ -157,9 +157,7 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
     bad: Spoiled, detected: Detection
 ) -> None:
     notes = [note for note in detected.notes if not note.startswith(WITHOUT_GAMMA)]
-    assert len(notes) == len(CHANGED) - 1 + 2 * len(SWAPPED) + 1  # both blurred ones are one
-    legs = "view c3 does not list leg2 (legs), which its images show clearly; add them to use"
-    assert [note.startswith(legs) for note in notes if "(legs)" in note] == [True]
+    assert len(notes) == len(CHANGED) - 1 + 2 * len(SWAPPED)  # both blurred ones are one
     assert detected.unplaced == {}
     named = "".join(detected.notes)
     for k, row in enumerate(bad.rows):
@@ -223,10 +221,6 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
         (
             lambda T: _pose(T.translation, _w_first(T.rotation)),
             "if its quaternion is in the order w, x, y, z:",
-        ),
-        (
-            lambda T: _pose(T.inv().translation, _w_first(T.inv().rotation)),
-            "if it is T_camera_base, the inverse, and its quaternion is in the order w, x, y, z:",
         ),
         (
             lambda T: T * _pose(np.zeros(3), Rotation.from_euler("x", 180, degrees=True)),

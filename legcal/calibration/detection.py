@@ -36,7 +36,7 @@ from legcal.calibration.documents import (
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
-from legcal.data.corners import Corners, write_corners
+from legcal.data.corners import Corners, join_corners, write_corners
 from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, ImageReader
 from legcal.data.image_tables import inverse
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
@@ -89,7 +89,6 @@ from legcal.perception.overlays import (
     draw,
     marks_of_corners,
     marks_of_image,
-    marks_of_pairs,
 )
 from legcal.perception.photographs import (
     MeasuredImages,
@@ -492,16 +491,11 @@ class Examination:
             left_out = left_out_blocks(of_rows, detection.left_out)
             if self.is_written:
                 overlays = overlay_blocks(of_rows, detection.overlay_files)
-        return ExaminationDocument(
+        return ExaminationDocument.describing(
+            self,
             legcal_doctor=1,
-            dataset=self.dataset,
-            mechanism=self.mechanism,
             ready=self.is_ready,
             usable=self.is_usable,
-            checks=list(self.checks),
-            findings=list(self.findings),
-            encoders=list(self.encoders),
-            views=list(self.views),
             images=sum(view.images for view in self.views),
             outlines=sum(view.outlines or 0 for view in self.views),
             used=self.n_used,
@@ -608,7 +602,6 @@ class _Drawings:
     marks: tuple[tuple[PartMarks, ...], ...]
     corners: tuple[tuple[Mark, ...], ...]
     captions: tuple[str, ...]
-    unplaced: tuple[Camera | None, ...]  # cameras that could not be placed
     names: tuple[str, ...]
     photographs: bool  # whether the images are also written without marks
 
@@ -624,12 +617,12 @@ def draw_images(
     )
     for file in (*files, *bare):
         file.parent.mkdir(parents=True, exist_ok=True)
+    corners = join_corners([]) if detection.corners is None else detection.corners
     drawings = _Drawings(
         detection.dataset.image_reader(rows),
         tuple(tuple(_marks(detection, row)) for row in rows),
-        tuple(_corner_marks(detection, row) for row in rows),
+        tuple(marks_of_corners(corners.choose(corners.row == row)) for row in rows),
         tuple(_caption(detection, row) for row in rows),
-        tuple(_unplaced_camera(detection, row) for row in rows),
         tuple(file.name for file in files),
         photographs,
     )
@@ -644,9 +637,8 @@ def draw_images(
 
 def _overlay(drawings: _Drawings, k: int) -> list[bytes]:
     """Return the encoded overlay k, and optionally the plain photograph."""
-    image, camera = drawings.load(k), drawings.unplaced[k]
-    marks = [] if camera is None else [marks_of_pairs(camera, image)]
-    picture = draw(image, [*drawings.marks[k], *marks], drawings.captions[k], drawings.corners[k])
+    image = drawings.load(k)
+    picture = draw(image, drawings.marks[k], drawings.captions[k], drawings.corners[k])
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     files = []
     for pixels in (picture, grey)[: 1 + drawings.photographs]:
@@ -671,26 +663,15 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
     )
 
 
-def _unplaced_camera(detection: Detection, row: int) -> Camera | None:
-    """Return the camera of a row if it could not be placed: edge pairs are drawn then."""
-    view = detection.dataset.measurements.views[int(detection.dataset.measurements.view[row])]
-    return view.camera if view.name in detection.unplaced else None
-
-
-def _corner_marks(detection: Detection, row: int) -> tuple[Mark, ...]:
-    corners = detection.corners
-    return () if corners is None else marks_of_corners(corners.choose(corners.row == row))
-
-
 def _caption(detection: Detection, row: int) -> str:
     view, outlines = detection.view_of(row), detection.outlines
     measurements = detection.dataset.measurements
     used = outlines.used[(outlines.row == row) & ~are_of_bodies(outlines)]
     state = f"{np.count_nonzero(used)} of {len(used)} outlines used"
     if view in detection.unplaced:
-        state = "the camera could not be placed: edge pairs that were found"
+        state = "the camera could not be placed"
         if detection.T_base_camera[int(measurements.view[row])] is not None:
-            state += ", and legs where it was expected"
+            state += "; legs are where it was expected"
     text = f"{view}  {measurements.image[row]}  {state}"
     return text.encode("ascii", "replace").decode()
 

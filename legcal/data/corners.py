@@ -63,7 +63,8 @@ def found_corners(row: IntArray, corner: IntArray, px: Array, sigma_px: Array) -
 def join_corners(tables: Sequence[Corners]) -> Corners:
     """Concatenate tables of corners."""
     none = np.zeros(0, dtype=np.intp)
-    return found_corners(none, none, np.zeros((0, 2)), np.zeros(0)).join(tables)
+    nothing = found_corners(none, none, np.zeros((0, 2)), np.zeros(0))
+    return Corners.joined([nothing, *tables])
 
 
 def write_corners(path: Path, corners: Corners, measurements: Measurements) -> None:

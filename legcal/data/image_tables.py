@@ -7,51 +7,27 @@ results do not depend on the order of files.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from legcal.data.measurements import Measurements
 from legcal.data.reasons import Reason, Rejection, have_reason
+from legcal.geometry.tables import Table
 from legcal.geometry.types import BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class ImageTable:
+class ImageTable(Table):
     """A table whose fields are arrays or tuples with one entry a row."""
 
     row: IntArray  # (n,) of the measurements
 
-    def __len__(self) -> int:
-        return len(self.row)
-
     def row_keys(self) -> list[tuple[Any, ...]]:
         """Return the key that identifies each row and sorts tables."""
         raise NotImplementedError
-
-    def choose(self, chosen: BoolArray | IntArray) -> Self:
-        """Return the rows of a mask, or of indices in a new order."""
-        index = np.arange(len(self))[chosen]
-        some: dict[str, Any] = {
-            name: tuple(map(values.__getitem__, index.tolist()))
-            if isinstance(values, tuple)
-            else values[index]
-            for name, values in self._fields().items()
-        }
-        return replace(self, **some)
-
-    def join(self, others: Iterable[Self]) -> Self:
-        """Return the rows of this table and of others, concatenated."""
-        parts = [self._fields(), *(table._fields() for table in others)]
-        all_of_them: dict[str, Any] = {
-            name: tuple(entry for part in parts for entry in part[name])
-            if isinstance(values, tuple)
-            else np.concatenate([part[name] for part in parts])
-            for name, values in parts[0].items()
-        }
-        return replace(self, **all_of_them)
 
     def sort(self) -> Self:
         """Return the rows sorted by their keys."""
@@ -70,7 +46,7 @@ class ImageTable:
 
         *why* is one reason for all, or a rejection for each.
         """
-        table = self._fields()
+        table = self.columns()
         out = table["used"] & wrong
         reasons = (Rejection(why),) * len(self) if isinstance(why, Reason) else why
         changed: dict[str, Any] = {
@@ -84,10 +60,7 @@ class ImageTable:
 
     def rejected_for(self, *reasons: Reason) -> BoolArray:
         """Return a mask (n,) of the observations rejected for any of some reasons."""
-        return have_reason(self._fields()["reason"], *reasons)
-
-    def _fields(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return have_reason(self.columns()["reason"], *reasons)
 
 
 _Table = TypeVar("_Table", bound=ImageTable)

@@ -184,7 +184,7 @@ def no_outlines() -> Outlines:
 
 def join_outlines(tables: Sequence[Outlines]) -> Outlines:
     """Return the rows of several tables, sorted by image row, leg, part and edge."""
-    return no_outlines().join(tables).sort()
+    return Outlines.joined([no_outlines(), *tables]).sort()
 
 
 def are_of_bodies(outlines: Outlines) -> BoolArray:

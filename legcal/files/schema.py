@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
 from pydantic import (
@@ -131,6 +131,12 @@ class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
+
+    @classmethod
+    def describing(cls, source: object, **others: Any) -> Self:
+        """Return the document of an object: its attributes, and other fields that are stated."""
+        same = {name: getattr(source, name) for name in cls.model_fields if name not in others}
+        return cls(**same, **others)
 
     def document(self) -> dict[str, Any]:
         """Return the document for ``--json``."""

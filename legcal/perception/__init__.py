@@ -13,11 +13,11 @@ out. :func:`measure_photographs` measures again near any Placement, as that of a
       | free_poses        platform poses, where readings do not give them
       | recognition       which pair is which leg, where the camera of a view stands
       |   camera_search   poses that pairs suggest, judged and refined by pair_matching,
-      |                   or by all edges (edge_maps) where pairs are unclear
+      |                   or by all edges (EdgeMaps there) where pairs are unclear
       v
     recognised Placement
-      | outline           each image: where parts should be, what hides them, verdicts
-      |   part_edges      both edges of a part, to a pixel
+      | outline           each image: where parts should be, what hides them, both edges of a
+      |                   part to a pixel, verdicts
       |   subpixel_edges  their lines: pixels and sums over them (profiles), a limb model (limb),
       |                   pieces fitted one by one (blocks), all together (pooled_fit)
       v
@@ -27,7 +27,7 @@ out. :func:`measure_photographs` measures again near any Placement, as that of a
       v
     Placement, Outlines, rejections -> joint fit -> Placement -> outline, once more
 
-Beside them: corners of calibration boards (``board_corners`` by ``corner_lattice`` and ``saddles``)
+Beside them: corners of calibration boards (``board_corners`` by ``corner_lattice``)
 and where boards stand (``board_adjustment``), ``agreement`` of images with assumptions on a
 session, ``overlays``. ``tuning`` has the numbers on which most depends.
 """

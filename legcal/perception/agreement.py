@@ -6,7 +6,6 @@ many legs they show there. Nothing is measured, so that many assumptions can be 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -17,7 +16,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.camera_search import flipped, place_camera
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import Picture
-from legcal.perception.placement import Group, Search, sensor_extent
+from legcal.perception.placement import Group, Search
 from legcal.workers import Run
 
 AGREES = 0.5  # of the legs that an image should show, from which on it agrees
@@ -98,16 +97,6 @@ class Assumption:
     known: Sequence[RigidTransform] = ()  # T_base_group that are tried first
 
 
-def pairs_of_images(search: Search, rows: Sequence[int], run: Run) -> dict[int, CandidatePairs]:
-    """Return the edge pairs of images by row, which hold whatever is assumed."""
-    return dict(zip(rows, run(partial(_pairs_of_image, search), rows), strict=True))
-
-
-def _pairs_of_image(search: Search, row: int) -> CandidatePairs:
-    """Return the edge pairs of the image of a row."""
-    return search.pairs(row, int(search.measurements.view[row]))
-
-
 def pairs_of_outlines(outlines: Outlines, measurements: Measurements) -> dict[int, CandidatePairs]:
     """Return the edge pairs by row that both used outlines of a part make, whatever leg they name.
 
@@ -139,7 +128,7 @@ def pairs_of_outlines(outlines: Outlines, measurements: Measurements) -> dict[in
             merit=length,
             pixel=1.0 / float(camera.K[0, 0]),
         )
-        found[row] = pairs_of_row.take(np.argsort(-length, kind="stable"))
+        found[row] = pairs_of_row.choose(np.argsort(-length, kind="stable"))
     return found
 
 
@@ -165,42 +154,20 @@ def compare_assumptions(assumptions: Iterable[Assumption], run: Run) -> list[Agr
 
     Rows at which the legs are not known (NaN) agree with nothing.
     """
-    return list(run(_agreement, [_task(one) for one in assumptions]))
+    return list(run(_agreement, assumptions))
 
 
-_Task = tuple[list[Picture], list[int], Sequence[int], int, Sequence[int], Sequence[RigidTransform]]
-
-
-def _task(one: Assumption) -> _Task:
-    """Return what a process needs: pictures, their rows, all rows, number of legs, starts, known.
-
-    Pictures are of rows at which the legs are known.
-    """
-    known = [r for r in one.rows if np.isfinite(one.search.B_base[r]).all()]
-    pictures = one.group.pictures({row: _picture(one, row) for row in known}, known)
-    return pictures, known, one.rows, one.search.n_legs, one.starts, one.known
-
-
-def _picture(one: Assumption, row: int) -> Picture:
-    """Return the edge pairs and predicted legs of an image under a hypothesis."""
-    search = one.search
-    view = int(search.measurements.view[row])
-    corners = sensor_extent(search.measurements.views[view].camera)
-    pairs = as_if(search.edge_pairs[row], corners, one.flip[row], one.focal)
-    return Picture(
-        pairs, search.targets(row, view), corners / one.focal, search.size, search.joint_error
-    )
-
-
-def _agreement(task: _Task) -> Agreement:
-    """Return the agreement of the images of a group."""
-    pictures, known_rows, rows, n_legs, starts, known = task
+def _agreement(one: Assumption) -> Agreement:
+    """Return the agreement of the images of a group with a hypothesis."""
+    search, rows, n_legs = one.search, one.rows, one.search.n_legs
+    known_rows = [row for row in rows if np.isfinite(search.B_base[row]).all()]
+    pictures = one.group.pictures({row: _picture(one, row) for row in known_rows}, known_rows)
     row = np.array(rows, dtype=np.intp)
     support, expected = np.zeros(len(row)), np.full(len(row), float(n_legs))
     nothing = Agreement(row, support, expected, (None,))
     if not known_rows:
         return nothing
-    placed = place_camera(pictures, n_legs, starts, known)
+    placed = place_camera(pictures, n_legs, one.starts, one.known)
     if len(placed.poses) == 0:
         return nothing
     is_known = np.isin(row, known_rows)
@@ -208,3 +175,10 @@ def _agreement(task: _Task) -> Agreement:
     support[is_known] = np.maximum(placed.support[0] - cost, 0.0)
     expected[is_known] = placed.expected[0]
     return Agreement(row, support, expected, (placed.pose(),))
+
+
+def _picture(one: Assumption, row: int) -> Picture:
+    """Return the edge pairs and predicted legs of an image under a hypothesis."""
+    picture = one.search.picture(row)
+    pairs = as_if(picture.pairs, picture.corners, one.flip[row], one.focal)
+    return replace(picture, pairs=pairs, corners=picture.corners / one.focal)

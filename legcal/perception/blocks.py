@@ -69,7 +69,7 @@ class Blocks:
     """The blocks of all edges of an image, and how far their lines have moved."""
 
     d: Samples  # (n, m) from the lines at which they were read
-    light: Samples  # (n, m) less the mean of the edge
+    light: Samples  # (n, m) from which the mean of the edge is taken
     weight: Samples  # (n, m) by their noise and window
     window: Samples  # (n, m) 1 but where the used range ends
     gain: Array  # (n,)
@@ -77,54 +77,24 @@ class Blocks:
     position: Array  # (n,) as fractions of the bands
     half_width: Array  # (n_edges,)
     finish: IntArray  # (n_edges,) of surfaces, as limb.py numbers them
-    level: Array  # (n_edges,) mean light of each edge
     clipped: Samples  # (n,) up to where the background saturates the picture [px], or -inf
-    moved: Array  # (n,) [px]
-    contrast: Array  # (n,) step to the leg [grey levels]
-    sharp: Array  # (n,) how clearly it is a step and not a bend of the shading [chi^2]
-    noise: Array  # (n,) mean square residual [grey levels^2]
-    lines: list["BlockLine | None"]
-    last: tuple[float, Array, PixelBins] | None = None  # blur and moved of the last bins
 
-    @classmethod
-    def of_pixels(
-        cls,
-        d: Samples,
-        light: Samples,
-        weight: Samples,
-        bounds: IntArray,
-        position: Array,
-        half_width: Array,
-        gain: Array | None = None,
-        clipped: Samples | None = None,
-        window: Samples | None = None,
-        finish: IntArray | None = None,
-    ) -> "Blocks":
-        """Return blocks of pixels that have not been fitted."""
-        n, n_edges = len(d), len(bounds) - 1
-        total, weights = (np.zeros(n_edges) for _ in range(2))
-        edge = np.repeat(np.arange(n_edges), np.diff(bounds))
-        for sums, values in ((total, light * weight), (weights, weight)):
-            np.add.at(sums, edge, values.sum(axis=1))
-        level = total / np.maximum(weights, 1e-9)
-        return cls(
-            d,
-            light - level.astype(np.float32)[edge][:, None],
-            weight,
-            (weight > 0.0).astype(np.float32) if window is None else window,
-            np.ones(n) if gain is None else gain,
-            bounds,
-            position,
-            half_width,
-            np.zeros(n_edges, dtype=np.intp) if finish is None else finish,
-            level,
-            np.full(n, -np.inf, dtype=np.float32) if clipped is None else clipped,
-            np.zeros(n),
-            np.zeros(n),
-            np.zeros(n),
-            np.zeros(n),
-            [None] * n_edges,
+    def __post_init__(self) -> None:
+        """Begin where the lines were read; nothing has been fitted."""
+        n, n_edges = len(self.d), len(self.half_width)
+        total, weights = (
+            np.bincount(self.edge, values.sum(axis=1), n_edges)
+            for values in (self.light * self.weight, self.weight)
         )
+        self.level: Array = total / np.maximum(weights, 1e-9)  # (n_edges,) mean light of each edge
+        self.light = self.light - self.level.astype(np.float32)[self.edge][:, None]
+        self.moved: Array = np.zeros(n)  # [px]
+        self.contrast: Array = np.zeros(n)  # step to the leg [grey levels]
+        self.sharp: Array = np.zeros(n)  # how clearly it is one, and no bend of the shading [chi^2]
+        self.noise: Array = np.zeros(n)  # mean square residual [grey levels^2]
+        self.lines: list[BlockLine | None] = [None] * n_edges
+        # Blur and moved of the last bins
+        self.last: tuple[float, Array, PixelBins] | None = None
 
     @classmethod
     def read(
@@ -150,17 +120,17 @@ class Blocks:
             # Too few pixels of a sharp step are left in short blocks.
             read = read_profiles(grey, camera, edges, v, depths, MIN_ROWS_CLIPPED, most)
         light, weight = to_light(read.grey, read.window, camera.gamma)
-        return cls.of_pixels(
+        return cls(
             read.d,
             light,
             weight,
+            read.window,
+            read.gain,
             read.bounds,
             read.position,
             half_width,
-            read.gain,
-            read.clipped,
-            read.window,
             np.array([edge.polished for edge in edges], dtype=np.intp),
+            read.clipped,
         )
 
     @property

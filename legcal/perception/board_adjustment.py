@@ -41,6 +41,7 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.solver import COST_TOLERANCE, minimise, normal_equations
 from legcal.geometry.lines import cross
+from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.board import Board
 from legcal.vision.camera import (
@@ -51,7 +52,7 @@ from legcal.vision.camera import (
     project_with_derivatives,
     with_intrinsics,
 )
-from legcal.vision.point_pose import closed_form_poses
+from legcal.vision.point_pose import closed_form_poses, on_a_line
 
 _MAX_ITERATIONS = 60
 _RIM = 16  # points of a circle by which its image is known
@@ -63,7 +64,7 @@ SIGMA_PRINT_RATIO = 0.005  # printers scale both directions differently
 
 
 @dataclass(frozen=True, eq=False)
-class BoardImages:
+class BoardImages(Table):
     """The corners of the board in some images, n of them."""
 
     image: IntArray  # (n,) of each corner, rising, from 0 to n_images - 1
@@ -160,7 +161,17 @@ def adjust_board(
         return None
     moving = problem
     if held:
-        moving = replace(problem, variables=tuple(map(_held, problem.variables)))
+        still = (
+            replace(
+                block,
+                unknown=fixed_at_start(*block.unknown.shape),
+                labels=(),
+                units=(),
+                prior=NO_PRIOR,
+            )
+            for block in problem.variables
+        )
+        moving = replace(problem, variables=tuple(still))
     minimum = minimise(
         moving,
         state,
@@ -248,12 +259,6 @@ def _intrinsics(camera: Camera, names: tuple[str, ...]) -> Variables:
     )
 
 
-def _held(block: Variables) -> Variables:
-    """Return a block that does not move."""
-    unknown = fixed_at_start(*block.unknown.shape)
-    return replace(block, unknown=unknown, labels=(), units=(), prior=NO_PRIOR)
-
-
 def _corners(state: _State, seen: BoardImages, names: Sequence[str]) -> Residuals:
     """Return predicted less measured corners [px]; not finite where one is behind the camera."""
     camera, R = state.camera, state.board_pose.R[seen.image]
@@ -301,22 +306,12 @@ MIN_SHIFT_PX = 0.15  # by which corners must shift together where the board move
 SIGNIFICANCE = 1e-6  # of a motion, for each pair of images
 
 
-@dataclass(frozen=True, eq=False)
-class PlanePose:
-    """A pose that explains the points of a plane."""
-
-    T_camera_plane: RigidTransform
-    cost: float  # half the sum of squares of whitened residuals, large ones by Huber's loss
-    residual_px: Array  # (n, 2) pixels less where the points should be seen [px]
-    information: Array  # (6, 6) of a rotation vector [rad] and a displacement [m] of the plane
-
-
 def plane_poses(
     camera: Camera,
     points: Array,  # (n, 3) four points or more of the plane z = 0, not all on a line [m]
     px: Array,  # (n, 2) where they are seen [px]
     sigma_px: Array,  # (n,) standard deviations of either coordinate [px]
-) -> list[PlanePose]:
+) -> list[AdjustedBoard]:
     """Return the poses of a plane that explain where its points are seen, the better one first."""
     xy = camera.undistort(px)
     starts = list(closed_form_poses(points, xy, cv2.SOLVEPNP_IPPE))
@@ -327,29 +322,21 @@ def plane_poses(
 
 def _refine(
     camera: Camera, points: Array, px: Array, sigma_px: Array, start: RigidTransform
-) -> PlanePose | None:
+) -> AdjustedBoard | None:
     """Return the pose of least cost near a start; None if it puts points behind the camera."""
     one = BoardImages(np.zeros(len(px), dtype=np.intp), points, px, sigma_px)
-    adjusted = adjust_board(camera, [start], one)
-    if adjusted is None:
-        return None
-    return PlanePose(
-        adjusted.T_camera_board[0], adjusted.cost, adjusted.residual, adjusted.information[0]
-    )
+    return adjust_board(camera, [start], one)
 
 
-def _distinct(poses: list[PlanePose], angle: float) -> list[PlanePose]:
+def _distinct(poses: list[AdjustedBoard], angle: float) -> list[AdjustedBoard]:
     """Return the poses that differ by more than an angle, the first ones of each kind."""
-    kept: list[PlanePose] = []
-    for pose in poses:
-        if all(_angle(pose, other) > angle for other in kept):
-            kept.append(pose)
-    return kept
+    near = np.array([[_angle(one, other) <= angle for other in poses] for one in poses], np.bool_)
+    return [poses[i] for i in first_apart(near).tolist()]
 
 
-def _angle(one: PlanePose, other: PlanePose) -> float:
+def _angle(one: AdjustedBoard, other: AdjustedBoard) -> float:
     """Return the angle between two poses [rad]."""
-    turn = one.T_camera_plane.rotation * other.T_camera_plane.rotation.inv()
+    turn = one.T_camera_board[0].rotation * other.T_camera_board[0].rotation.inv()
     return float(turn.magnitude())
 
 
@@ -390,7 +377,7 @@ def camera_poses_by_board(
                         name=view.name,
                     )
                 )
-        T_board_camera.append(None if pose is None else pose.T_camera_plane.inv())
+        T_board_camera.append(None if pose is None else pose.T_camera_board[0].inv())
         if pose is not None:
             corners = _without_outliers(corners, here, pose)
     for kind, of_kind in problems.items():
@@ -424,35 +411,36 @@ def board_poses_in_images(
             corners = corners.reject(of_place, Reason.NO_BOARD_POSE)
             continue
         if pose is not None:
-            T_camera_board |= dict.fromkeys(rows, pose.T_camera_plane)
+            T_camera_board |= dict.fromkeys(rows, pose.T_camera_board[0])
             corners = _without_outliers(corners, here, pose)
     if len(wrong) > len(T_camera_board):
         raise DatasetError(wrong)
     return T_camera_board, corners
 
 
-def _without_outliers(corners: Corners, here: IntArray, pose: PlanePose) -> Corners:
+def _without_outliers(corners: Corners, here: IntArray, pose: AdjustedBoard) -> Corners:
     """Return corners, those among *here* rejected that are far from where a pose puts them."""
-    off = np.zeros(len(corners))
-    off[here] = np.linalg.norm(pose.residual_px, axis=1)
+    off, some = np.zeros(len(corners)), corners.choose(here)
+    off[here] = np.linalg.norm(pose.residual, axis=1)
     outlier = np.zeros(len(corners), dtype=np.bool_)
-    outlier[here] = _outliers(pose, corners.choose(here))
+    scaled = OUTLIER_SIGMA * _scale(pose, some) * some.sigma_px
+    outlier[here] = off[here] > np.maximum(OUTLIER_PX, scaled)
     why = [Rejection(Reason.CORNER_OFF, f"{px:.2g}") for px in off]
     return corners.reject(outlier, why)
 
 
 def _joint_pose(
     name: str, corners: Corners, board: Board, measurements: Measurements
-) -> PlanePose | None:
+) -> AdjustedBoard | None:
     """Return the pose that images share; None if none of them shows enough corners."""
     if not len(corners):
         return None
     camera = measurements.views[measurements.view[corners.row[0]]].camera
-    of_row: dict[int, list[PlanePose]] = {}
+    of_row: dict[int, list[AdjustedBoard]] = {}
     for row in np.unique(corners.row).tolist():
         here = corners.row == row
         points = board.points[corners.corner[here]]
-        if _span_plane(points):
+        if len(points) >= MIN_CORNERS and not on_a_line(points):
             of_row[row] = plane_poses(camera, points, corners.px[here], corners.sigma_px[here])
     if not of_row:
         return None
@@ -460,7 +448,7 @@ def _joint_pose(
     if not candidates:
         raise DatasetError(_another_board(name, board, "no pose of", "showing them there"))
     everything = board.points[corners.corner], corners.px, corners.sigma_px
-    refined = [_refine(camera, *everything, start.T_camera_plane) for start in candidates]
+    refined = [_refine(camera, *everything, start.T_camera_board[0]) for start in candidates]
     joint = sorted((pose for pose in refined if pose is not None), key=lambda pose: pose.cost)
     joint = _distinct(joint, SIMILAR_ANGLE)
     if not joint:
@@ -471,7 +459,7 @@ def _joint_pose(
     scale = _scale(best, corners)
     lead = MIN_CHI2_LEAD * scale**2
 
-    def is_ambiguous(poses: list[PlanePose]) -> bool:
+    def is_ambiguous(poses: list[AdjustedBoard]) -> bool:
         return len(poses) > 1 and 2.0 * (poses[1].cost - poses[0].cost) < lead
 
     single = {  # of two poses that both explain an image that near the view's
@@ -481,7 +469,7 @@ def _joint_pose(
     }
     _require_still(name, single, scale, board, camera, row_names(measurements))
     # Corners that no pose of this board explains.
-    off = np.linalg.norm(best.residual_px, axis=1)
+    off = np.linalg.norm(best.residual, axis=1)
     rms = float(np.median(off)) / np.sqrt(2.0 * np.log(2.0))  # as of one coordinate
     limit = max(MAX_RESIDUAL_PX, MAX_RESIDUAL_SIGMA * float(np.median(corners.sigma_px)))
     if rms > limit:
@@ -497,30 +485,15 @@ def _joint_pose(
     return best
 
 
-def _outliers(pose: PlanePose, corners: Corners) -> BoolArray:
-    """Return the mask of corners that are outliers of a pose."""
-    off = np.linalg.norm(pose.residual_px, axis=1)
-    scaled = OUTLIER_SIGMA * _scale(pose, corners) * corners.sigma_px
-    return np.asarray(off > np.maximum(OUTLIER_PX, scaled))
-
-
-def _scale(pose: PlanePose, corners: Corners) -> float:
+def _scale(pose: AdjustedBoard, corners: Corners) -> float:
     """Return by how much residuals exceed the standard deviations of corners, at least one."""
-    t = np.linalg.norm(pose.residual_px, axis=1) / corners.sigma_px
+    t = np.linalg.norm(pose.residual, axis=1) / corners.sigma_px
     return max(1.0, float(np.median(t)) / float(np.sqrt(2.0 * np.log(2.0))))
-
-
-def _span_plane(points: Array) -> bool:
-    """Return whether points are enough, and not all on a line."""
-    if len(points) < MIN_CORNERS:
-        return False
-    size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(size[1] > 1e-3 * size[0])
 
 
 def _require_still(
     name: str,
-    single: Mapping[int, PlanePose],
+    single: Mapping[int, AdjustedBoard],
     scale: float,
     board: Board,
     camera: Camera,
@@ -535,9 +508,8 @@ def _require_still(
     if len(rows) < 2:
         return
     limit = float(chdtri(6, SIGNIFICANCE / len(rows))) * scale**2
-    px = {
-        row: camera.project(pose.T_camera_plane.apply(board.points)) for row, pose in single.items()
-    }
+    T = {row: pose.T_camera_board[0] for row, pose in single.items()}
+    px = {row: camera.project(T[row].apply(board.points)) for row in rows}
     together = np.array(
         [[_agree(single[a], single[b], px[a] - px[b], limit) for b in rows] for a in rows]
     )
@@ -545,11 +517,10 @@ def _require_still(
     others = [row for row, same in zip(rows, together[most], strict=True) if not same]
     if not others:
         return
-    reference = single[rows[most]].T_camera_plane
-    moves = [reference.inv() * single[row].T_camera_plane for row in others]
+    moves = [T[rows[most]].inv() * T[row] for row in others]
     middle = board.points.mean(axis=0)
-    far = max(float(np.linalg.norm(T.apply(middle) - middle)) for T in moves)
-    turn = max(float(T.rotation.magnitude()) for T in moves)
+    far = max(float(np.linalg.norm(move.apply(middle) - middle)) for move in moves)
+    turn = max(float(move.rotation.magnitude()) for move in moves)
     raise DatasetError(
         f"view {name}: its camera could not be placed: found the board elsewhere in "
         f"{few([names[row] for row in others])} than in {names[rows[most]]}, by up to "
@@ -559,14 +530,14 @@ def _require_still(
     )
 
 
-def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> bool:
+def _agree(one: AdjustedBoard, other: AdjustedBoard, shift_px: Array, limit: float) -> bool:
     """Return whether two poses of the board agree, by their covariances."""
     if float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1)))) < MIN_SHIFT_PX:
         return True
-    a, b = one.T_camera_plane, other.T_camera_plane
+    a, b = one.T_camera_board[0], other.T_camera_board[0]
     turn = (b.rotation * a.rotation.inv()).as_rotvec()
     d = np.concatenate([turn, b.translation - a.translation])
-    covariance = np.linalg.inv(one.information) + np.linalg.inv(other.information)
+    covariance = np.linalg.inv(one.information[0]) + np.linalg.inv(other.information[0])
     return bool(d @ np.linalg.solve(covariance, d) < limit)
 
 

@@ -19,6 +19,7 @@ from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements
 from legcal.errors import NotVisible
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.corner_lattice import (
     Print,
@@ -104,18 +105,13 @@ class SeenBoard:
 
 
 @dataclass(frozen=True, eq=False)
-class NumberedCorners:
+class NumberedCorners(Table):
     """Corners of a board in an image."""
 
     number: IntArray  # (k,) on the board, ascending
     px: Array  # (k, 2)
     sigma_px: Array  # (k,) of either coordinate [px]
     certain: bool  # whether the numbers could be no others
-
-    def choose(self, rows: IntArray) -> NumberedCorners:
-        """Return some of them."""
-        numbers, px, sigma_px = self.number[rows], self.px[rows], self.sigma_px[rows]
-        return NumberedCorners(numbers, px, sigma_px, self.certain)
 
 
 def find_corners(
@@ -129,7 +125,12 @@ def find_corners(
 
     Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
     """
-    detection = search_board(board, image).numbered(board)
+    return certain_corners(board, search_board(board, image))
+
+
+def certain_corners(board: Board, seen: SeenBoard) -> tuple[IntArray, Array, Array]:
+    """Return the corners of a seen board if their numbers are certain, as :func:`find_corners`."""
+    detection = seen.numbered(board)
     if not detection.certain or len(detection.number) < MIN_CORNERS:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0)
     return detection.number, detection.px, detection.sigma_px
@@ -211,7 +212,8 @@ def _measured_twice(
     small = rescaled(grey, scale)
     both = np.array(small.shape[::-1]) / grey.shape[::-1]  # of columns and rows, which are whole
     ij, saddles = measured(small, board, ij, (px + 0.5) * both - 0.5, _MEASURED_BLUR)
-    return ij, saddles.moved_to((saddles.px + 0.5) / both - 0.5, scale)
+    px, sigma_px = (saddles.px + 0.5) / both - 0.5, saddles.sigma_px / scale
+    return ij, replace(saddles, px=px, sigma_px=sigma_px, blur_px=saddles.blur_px / scale)
 
 
 def _usual_blur(saddles: Saddles) -> float:
@@ -405,13 +407,28 @@ def detect_corners(
 
     ``load`` returns the image of a row and can travel to another process.
     """
-    report(STAGE, 0, len(rows))
     tables = []
-    search = partial(_search, board, load)
-    for k, (row, (corner, px, sigma)) in enumerate(zip(rows, run(search, rows), strict=True)):
+    for row, seen in zip(rows, search_images(board, load, rows, run, report), strict=True):
+        corner, px, sigma = certain_corners(board, seen)
         tables.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
-        report(STAGE, k + 1, len(rows))
     return join_corners(tables)
+
+
+def search_images(
+    board: Board, load: Load, rows: Sequence[int], run: Run, report: Report
+) -> list[SeenBoard]:
+    """Detect a board in images, as :func:`detect_corners` does."""
+    report(STAGE, 0, len(rows))
+    found = list[SeenBoard]()
+    for seen in run(partial(_search, board, load), rows):
+        found.append(seen)
+        report(STAGE, len(found), len(rows))
+    return found
+
+
+def _search(board: Board, load: Load, row: int) -> SeenBoard:
+    """Detect a board in the image of a row."""
+    return search_board(board, load(row))
 
 
 def require_board(
@@ -447,20 +464,19 @@ def require_board(
         raise NotVisible(problems)
 
 
-_GRIDS = {"circles": "a grid", "asymmetric_circles": "an asymmetric grid"}
+_IN_WORDS = {
+    "chessboard": ("a chessboard", "squares"),
+    "charuco": ("a ChArUco board", "squares"),
+    "aprilgrid": ("an AprilGrid", "tags"),
+    "circles": ("a grid", "circles"),
+    "asymmetric_circles": ("an asymmetric grid", "circles"),
+}
 
 
 def board_in_words(board: Board) -> str:
     """Return a board in words."""
-    what = _things(board) if board.kind in ("aprilgrid", *_GRIDS) else "squares"
-    name = {"chessboard": "a chessboard", "charuco": "a ChArUco board", "aprilgrid": "an AprilGrid"}
-    name |= _GRIDS
-    return f"{name[board.kind]} of {board.columns} x {board.rows} {what}"
-
-
-def _search(board: Board, load: Load, row: int) -> tuple[IntArray, Array, Array]:
-    """Return the corners, their pixels and sigmas in the image of a row."""
-    return find_corners(board, load(row))
+    name, what = _IN_WORDS[board.kind]
+    return f"{name} of {board.columns} x {board.rows} {what}"
 
 
 _MIN_MARKERS = 3  # of another dictionary that are no chance

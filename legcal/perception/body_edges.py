@@ -32,6 +32,7 @@ from legcal.data.outlines import (
 )
 from legcal.data.reasons import USED
 from legcal.geometry.lines import cross
+from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
@@ -246,7 +247,9 @@ def edges_of_body(grey: Grey, camera: Camera, body_in_view: BodyInView) -> list[
     middle = A + 0.5 * (along[0] + along[-1]) * u
     beside = cross(u, middle)
     beside /= np.linalg.norm(beside)
-    pixel = _pixel_size(camera, middle, beside)
+    step = middle + np.array([[-0.5], [0.5]]) * 1e-3 * beside
+    ends = camera.distort(step[:, :2] / step[:, 2:])
+    pixel = 1e-3 / float(np.linalg.norm(ends[1] - ends[0]))  # across the body at its middle [m]
     n_side = int(np.ceil((REACH * body.radius / pixel + WINDOW) / STEP))
     across = np.arange(-n_side, n_side + 1, dtype=np.float64) * STEP  # [px] at the middle
 
@@ -294,13 +297,6 @@ def _distance(along: Array, t: Array) -> Array:
     """Return the distances along the body at fractions of its rows, as fractions."""
     s = np.interp(t * len(along) - 0.5, np.arange(len(along)), along)
     return np.asarray((s - along[0]) / (along[-1] - along[0]))
-
-
-def _pixel_size(camera: Camera, middle: Array, beside: Array) -> float:
-    """Return the length of a pixel across a body at its middle [m]."""
-    X = middle + np.array([[-0.5], [0.5]]) * 1e-3 * beside
-    ends = camera.distort(X[:, :2] / X[:, 2:])
-    return 1e-3 / float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def _steep_places(light: Samples, seen: BoolArray, across: Array) -> tuple[IntArray, Array, Array]:
@@ -365,12 +361,9 @@ def _fitted(
 
 def _apart(lines: Sequence[tuple[BlockLine, float]]) -> list[tuple[BlockLine, float]]:
     """Return the lines that are not another one before them."""
-    kept: list[tuple[BlockLine, float]] = []
-    for line, contrast in lines:
-        middle = float(np.mean(line.ends))
-        if all(abs(middle - float(np.mean(other.ends))) >= APART for other, _ in kept):
-            kept.append((line, contrast))
-    return kept
+    middle = np.array([np.mean(line.ends) for line, _ in lines])
+    near = np.abs(middle[:, None] - middle) < APART
+    return [lines[i] for i in first_apart(near).tolist()]
 
 
 def _of_one_direction(lines: Sequence[tuple[BlockLine, float]]) -> list[tuple[BlockLine, float]]:

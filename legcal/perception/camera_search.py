@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
@@ -184,7 +185,8 @@ def place_camera(
     """
     best_first = sorted(pictures, key=lambda picture: -picture.pairs.best_merit)
     every = Pictures.of(pictures)
-    best = _candidates(every, _near_known(every, known, n_legs))
+    near = CameraPoses.of(known, n_legs)
+    best = _candidates(every, _approached(every, near) if known else near)
     done = 0
     for n in starts if best.share < HINTED_SUPPORT else ():
         if done >= len(pictures) or (done and best.is_clear):
@@ -198,24 +200,16 @@ def place_camera(
         poses = refined(first, poses, SEARCHING[2:4], every.joint_error)
         some = Pictures.of(best_first[: max(SOME_PICTURES, done)])
         score = scores(some, poses, SEARCHING[3])
-        poses = poses.take(_distinct(poses, score, N_KEPT[2]))
+        poses = poses.choose(_distinct(poses, score, N_KEPT[2]))
         # From far a flat machine looks alike with near and far exchanged.
-        ahead, ends = poses.take(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
+        ahead, ends = poses.choose(np.arange(min(N_REVERSED, len(poses)))), some.all_ends
         poses = CameraPoses.joined([poses, depth_reversed(ahead, ends) if len(ends) else ahead])
         poses = refined(some, poses, SEARCHING[3:], every.joint_error)
         score = scores(some, poses, SEARCHING[-1])
-        poses = poses.take(_best(score, N_KEPT[3]))
-        poses = CameraPoses.joined([poses, _polished(some.take(slice(N_POLISHING)), poses)])
+        poses = poses.choose(_best(score, N_KEPT[3]))
+        poses = CameraPoses.joined([poses, _polished(some.choose(slice(N_POLISHING)), poses)])
         best = _candidates(every, refined(every, poses, FITTING, every.joint_error))
     return best
-
-
-def _near_known(pictures: Pictures, known: Sequence[RigidTransform], n_legs: int) -> CameraPoses:
-    """Return poses after steps from T_base_camera that are known."""
-    T = [one.inv() for one in known]
-    R = np.array([one.rotation.as_matrix() for one in T]).reshape(-1, 3, 3)
-    poses = CameraPoses.rigid(R, np.array([one.translation for one in T]).reshape(-1, 3), n_legs)
-    return _approached(pictures, poses) if known else poses
 
 
 def _approached(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
@@ -235,8 +229,8 @@ def _polished(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
         around = refined(pictures, around, POLISH, pictures.joint_error)
         score = scores(pictures, around, POLISH[-1])
-        polished.append(around.take(_best(score, 1)))
-    return CameraPoses.joined([*polished, poses.take(np.zeros(0, dtype=np.intp))])
+        polished.append(around.choose(_best(score, 1)))
+    return CameraPoses.joined([*polished, poses.choose(np.zeros(0, dtype=np.intp))])
 
 
 def _around(pictures: Pictures, R: Array, t: Array, n_legs: int) -> CameraPoses:
@@ -270,16 +264,16 @@ def place_by_edges(
         return _candidates(every, poses)
     coarse, rng = maps.halved(), np.random.default_rng(len(poses))
     few = slice(N_SUGGESTING)
-    score = coarse.take(few).blurred(EDGE_STEPS[0].blur).scores(every.take(few), poses)
-    poses = poses.take(_best(score, N_MOVED))
+    score = coarse.choose(few).blurred(EDGE_STEPS[0].blur).scores(every.choose(few), poses)
+    poses = poses.choose(_best(score, N_MOVED))
     for step in EDGE_STEPS:
         some = slice(None) if step.all_pictures else few
-        of_step = (maps if step.is_fine else coarse).take(some).blurred(step.blur)
-        poses, score = _moved_to_edges(of_step, every.take(some), poses, step, rng)
-        poses = poses.take(_distinct(poses, score, step.n_kept))
+        of_step = (maps if step.is_fine else coarse).choose(some).blurred(step.blur)
+        poses, score = _moved_to_edges(of_step, every.choose(some), poses, step, rng)
+        poses = poses.choose(_distinct(poses, score, step.n_kept))
     matches = match_pairs(every, poses, FITTING[-1])
     support, expected = (_by_legs(every, x).T for x in (matches.exclusive_score, matches.visible))
-    error = _leg_error(every, poses.take(slice(0, 1)))
+    error = _leg_error(every, poses.choose(slice(0, 1)))
     first = float(score.max()) / len(pictures)
     return PoseCandidates(poses, support, expected, support.sum(axis=1), error, along_edges=first)
 
@@ -300,29 +294,27 @@ def _moved_to_edges(
     parent = np.concatenate([np.arange(n), np.repeat(np.arange(n), N_TRIED)])
     order = np.lexsort([-score, parent])
     best = order[np.flatnonzero(np.diff(parent[order], prepend=-1))]
-    return tried.take(best), score[best]
+    return tried.choose(best), score[best]
 
 
 def place_near(
     pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
 ) -> PoseCandidates:
     """Return the camera pose near a rough one on which the pictures of a view agree."""
-    T = T_base_camera.inv()
+    rough = CameraPoses.of([T_base_camera], n_legs)
     turns = NEAR_TURN * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
-    poses = CameraPoses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
+    R = Rotation.from_rotvec(turns).as_matrix() @ rough.R
+    poses = CameraPoses.rigid(R, np.repeat(rough.t, len(R), axis=0), n_legs)
     every = Pictures.of(pictures)
-    candidates = _candidates(every, _approached(every, poses))
-    return replace(candidates, hinted=True)
+    return replace(_candidates(every, _approached(every, poses)), hinted=True)
 
 
 def place_at(
     pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
 ) -> PoseCandidates:
     """Return a camera pose that clicks give, as it is: pictures hardly show the legs."""
-    T = T_base_camera.inv()
-    pose = CameraPoses.rigid(T.rotation.as_matrix()[None], T.translation[None], n_legs)
-    return replace(_candidates(Pictures.of(pictures), pose), hinted=True, is_given=True)
+    candidates = _candidates(Pictures.of(pictures), CameraPoses.of([T_base_camera], n_legs))
+    return replace(candidates, hinted=True, is_given=True)
 
 
 def with_first(
@@ -332,7 +324,7 @@ def with_first(
     order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
     return replace(
         placed,
-        poses=CameraPoses.joined([pose, placed.poses.take(order[1:])]),
+        poses=CameraPoses.joined([pose, placed.poses.choose(order[1:])]),
         support=placed.support[order],
         expected=placed.expected[order],
         score=placed.score[order],
@@ -353,9 +345,9 @@ def _candidates(pictures: Pictures, poses: CameraPoses) -> PoseCandidates:
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / joint_error**2
     score = support.sum(axis=1) - SHIFT_COST * cost
     order = _different(pictures, poses, matches, value >= MIN_MATCH_SCORE, score)
-    best = poses.take(order[:1])
+    best = poses.choose(order[:1])
     error = _leg_error(pictures, best)
-    return PoseCandidates(poses.take(order), support[order], expected[order], score[order], error)
+    return PoseCandidates(poses.choose(order), support[order], expected[order], score[order], error)
 
 
 def _by_legs(pictures: Pictures, value: Array) -> Array:
@@ -376,13 +368,10 @@ def _different(
         for pairs, pair, match in zip(pictures.pairs, matches.pair, matched, strict=True):
             same = _one_leg(pairs)[pair[:, None], pair[None]]
             common += np.sum(same & match[:, None] & match[None], axis=2)
-    least = np.maximum(np.diag(common), 1.0)
-    kept: list[int] = []
-    for i in np.argsort(-score, kind="stable").tolist():
-        alike = common[i, kept] / least[i] >= SAME_MATCHES
-        if not np.any(alike & _near(poses, kept, i, *OTHER_POSE)):
-            kept.append(i)
-    return np.array(kept, dtype=np.intp)
+    alike = common / np.maximum(np.diag(common), 1.0)[:, None] >= SAME_MATCHES
+    order = _best(score, len(score))
+    near = _near(poses.choose(order), *OTHER_POSE) & alike[order][:, order]
+    return order[first_apart(near)]
 
 
 def _one_leg(pairs: Array) -> BoolArray:
@@ -417,10 +406,10 @@ def _starts(picture: Picture, n_legs: int) -> CameraPoses:
     if len(poses) == 0:
         return poses
     alone = Pictures.of([picture])
-    poses = poses.take(_best(scores(alone, poses, SEARCHING[0]), N_KEPT[0]))
+    poses = poses.choose(_best(scores(alone, poses, SEARCHING[0]), N_KEPT[0]))
     poses = refined(alone, poses, SEARCHING[:3])
     score = scores(alone, poses, SEARCHING[2])
-    return poses.take(_distinct(poses, score, N_KEPT[1]))
+    return poses.choose(_distinct(poses, score, N_KEPT[1]))
 
 
 def _suggested(picture: Picture, n_legs: int) -> CameraPoses:
@@ -455,23 +444,19 @@ def _best(score: Array, n: int) -> IntArray:
 
 def _distinct(poses: CameraPoses, score: Array, n: int) -> IntArray:
     """Return the best poses that differ from better ones."""
-    kept: list[int] = []
-    for i in np.argsort(-score, kind="stable").tolist():
-        if len(kept) == n:
-            break
-        if not np.any(_near(poses, kept, i, *SAME_POSE)):
-            kept.append(i)
-    return np.array(kept, dtype=np.intp)
+    order = _best(score, len(score))
+    return order[first_apart(_near(poses.choose(order), *SAME_POSE), n)]
 
 
-def _near(poses: CameraPoses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
-    """Return the mask of poses within an angle and a part of the distance of pose i."""
-    trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
+def _near(poses: CameraPoses, angle: float, part: float) -> BoolArray:
+    """Return which poses (n, n) are within an angle and a part of the distance of others."""
+    flat = poses.R.reshape(len(poses), 9)
+    trace = flat @ flat.T
     turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
-    # Where the camera stands in the base link.
-    at = -np.einsum("kij,ki->kj", poses.R[some], poses.t[some])
-    apart = np.linalg.norm(at + poses.R[i].T @ poses.t[i], axis=1)
-    return np.asarray((turn < angle) & (apart < part * np.linalg.norm(poses.t[i])))
+    at = -np.einsum("kij,ki->kj", poses.R, poses.t)  # where the camera stands in the base link
+    apart = np.linalg.norm(at[:, None] - at, axis=2)
+    reach = part * np.linalg.norm(poses.t, axis=1)
+    return np.asarray((turn < angle) & (apart < reach[:, None]))
 
 
 def flipped(pairs: CandidatePairs, corners: Array, flip: Array) -> CandidatePairs:
@@ -542,7 +527,7 @@ class _FirstAssignments(NamedTuple):
 def pose_hypotheses(picture: Picture, n_legs: int) -> CameraPoses:
     """Return camera poses that put two legs where two pairs of a picture are."""
     pairs, targets = (
-        picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
+        picture.pairs.choose(np.arange(min(N_SECOND, len(picture.pairs)))),
         picture.targets,
     )
     nothing = CameraPoses.none(n_legs)
@@ -631,7 +616,7 @@ def _turns(
 def _firsts(pairs: CandidatePairs, targets: LegSegments) -> _FirstAssignments:
     """Take the best pairs for every segment, with all leans that their edges allow."""
     n = min(N_FIRST, len(pairs))
-    first = pairs.take(np.arange(n))
+    first = pairs.choose(np.arange(n))
     rays, planes = _rays(first), _planes(first)
     along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
     ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.perception.profiles import Samples
 from legcal.perception.tuning import EDGE_LENGTH, EDGE_SLOPE
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey, shrink
+from legcal.vision.image_file import Grey
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
@@ -58,17 +59,13 @@ DUPLICATE = 0.35, 0.2  # of a pair that repeats another: distance, difference of
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeSegments:
+class EdgeSegments(Table):
     """Straight edges on the sensor plane."""
 
     ends: Array  # (n, 2, 2) on the way from the first to the second the picture is brighter on the
     # left-hand side, as one sees it: in the direction (dy, -dx)
     covered: Array  # (n,) share of the length on which the edge was seen
     pixel: float  # size of a pixel of the reduced picture
-
-    def __len__(self) -> int:
-        """Return the number of edges."""
-        return len(self.ends)
 
 
 def reduction(camera: Camera, part: float) -> int:
@@ -117,12 +114,6 @@ def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
     along = pieces[:, None, 0] + share * (pieces[:, None, 1] - pieces[:, None, 0])
     x, y = np.rint(np.clip(along, 0, np.array(picture.shape[::-1]) - 1)).astype(np.intp).T
     return np.asarray(differs[y, x].mean(axis=0) > MOVING_SHARE)
-
-
-def find_segments(grey: Grey, camera: Camera) -> EdgeSegments:
-    """Return the straight edges of a picture, which is reduced if it is large."""
-    factor = reduction(camera, 1.0)
-    return segments_of_reduced(shrink(grey, factor), camera, factor)
 
 
 def segments_of_reduced(
@@ -370,7 +361,7 @@ def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array
 
 
 @dataclass(frozen=True, eq=False)
-class CandidatePairs:
+class CandidatePairs(Table):
     """Candidate cylinders of a picture, best first, on its sensor plane."""
 
     middle: Array  # (n, 2) of the axis
@@ -379,10 +370,6 @@ class CandidatePairs:
     width: Array  # (n, 2) distance of the edges at both ends; the first one is against ``along``
     merit: Array  # (n,) length on which both edges were seen
     pixel: float  # how well edges are known
-
-    def __len__(self) -> int:
-        """Return the number of pairs."""
-        return len(self.middle)
 
     @property
     def best_merit(self) -> float:
@@ -393,17 +380,6 @@ class CandidatePairs:
     def normal(self) -> Array:
         """Unit normals (n, 2) of the axes."""
         return np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
-
-    def take(self, chosen: IntArray | BoolArray) -> "CandidatePairs":
-        """Return some of the pairs."""
-        return CandidatePairs(
-            self.middle[chosen],
-            self.along[chosen],
-            self.half_length[chosen],
-            self.width[chosen],
-            self.merit[chosen],
-            self.pixel,
-        )
 
 
 def find_candidate_pairs(segments: EdgeSegments) -> CandidatePairs:
@@ -449,7 +425,7 @@ def find_candidate_pairs(segments: EdgeSegments) -> CandidatePairs:
         for t, v in ((first, centre[0]), (last, centre[1]))
     )
     chosen = _best(np.where(good, merit, 0.0), i, j, len(ends))
-    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:MAX_PAIRS]
+    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])]
     start, stop = start[chosen], stop[chosen]
     full = np.linalg.norm(stop - start, axis=1)
     return CandidatePairs(
@@ -477,8 +453,8 @@ def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int) -> IntArray:
     return np.array(chosen, dtype=np.intp)
 
 
-def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
-    """Return the mask of pairs (n,), best first, not within better ones of the same width."""
+def _distinct(start: Array, stop: Array, width: Array) -> IntArray:
+    """Return the pairs, best first, that are not within better ones of the same width."""
     along = stop - start
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]
@@ -490,8 +466,4 @@ def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
     alike = np.abs(offset).max(axis=2) <= DUPLICATE[0] * width[:, None]
     alike &= (middle > 0.0) & (middle < length[:, None])
     alike &= np.abs(width[None, :] - width[:, None]) <= DUPLICATE[1] * width[:, None]
-    kept = np.ones(len(start), dtype=np.bool_)
-    for i in range(len(start)):
-        if kept[i]:
-            kept[i + 1 :] &= ~alike[i, i + 1 :]
-    return kept
+    return first_apart(alike.T, MAX_PAIRS)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.image_file import Grey
 
@@ -69,7 +70,7 @@ _LAGS = 2  # pixels over which residuals are correlated: mosaics of colour, JPEG
 
 
 @dataclass(frozen=True, eq=False)
-class Saddles:
+class Saddles(Table):
     """Crossings of two edges in an image."""
 
     px: Array  # (n, 2) where they are [px]
@@ -81,14 +82,6 @@ class Saddles:
     contrast: Array
     misfit: Array  # (n,) residual of the model (root mean square), over the contrast
     found: BoolArray  # (n,) whether the picture is a crossing at all; others have no numbers
-
-    def choose(self, rows: IntArray | BoolArray) -> Saddles:
-        """Return some of them."""
-        return Saddles(*(value[rows] for value in vars(self).values()))
-
-    def moved_to(self, px: Array, scale: float) -> Saddles:
-        """Return them where they are in an image, found in one that is scaled by a factor."""
-        return replace(self, px=px, sigma_px=self.sigma_px / scale, blur_px=self.blur_px / scale)
 
 
 def fit_saddles(
@@ -434,7 +427,6 @@ class Lattice:
 
     ij: IntArray  # (k, 2) their columns and rows; the first ones are 0
     px: Array  # (k, 2) where they are [px]; x, y and the line of sight are right-handed
-    black: IntArray  # (k,) 1 where the square at greater column and row is black, else -1
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -447,7 +439,7 @@ def find_lattice(grey: Grey) -> Lattice:
     """Return the largest lattice of crossings in an image (height, width), maybe of none."""
     places, angles, contrast = _candidates(grey)
     near, ray = _neighbours(grey, places, angles, contrast)
-    return _largest(places, angles, contrast, near, ray)
+    return _largest(places, near, ray)
 
 
 def _candidates(grey: Grey) -> tuple[Array, Array, Array]:
@@ -577,10 +569,9 @@ def _wrapped(angle: Array) -> Array:
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _largest(px: Array, angles: Array, contrast: Array, near: IntArray, back: IntArray) -> Lattice:
+def _largest(px: Array, near: IntArray, back: IntArray) -> Lattice:
     """Return the largest set of candidates that are neighbours of each other, as a lattice."""
     n = len(px)
-    none = Lattice(np.zeros((0, 2), np.intp), np.zeros((0, 2)), np.zeros(0, np.intp))
     turn = np.full(n, -1, dtype=np.intp)  # quarter turns of the lattice against each one's rays
     best: list[tuple[int, tuple[int, int]]] = []
     links, arrivals = near.tolist(), back.tolist()
@@ -609,14 +600,11 @@ def _largest(px: Array, angles: Array, contrast: Array, near: IntArray, back: In
         if len(place) > len(best):
             best = list(place.items())
     if len(best) < _MIN_LATTICE:
-        return none
+        return Lattice(np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)))
     members = np.array([k for k, _ in best], dtype=np.intp)
     ij = np.array([at for _, at in best], dtype=np.intp)
     # Rays turn from x to y of the image, and so do the steps of the lattice: it is right-handed.
-    # Bright after ray 0; the square at greater column and row follows the ray of step (1, 0).
-    follows = (-turn[members]) % 2 == 0
-    bright = np.where(follows, contrast[members], -contrast[members]) > 0.0
-    return Lattice(ij - ij.min(axis=0), px[members], np.where(bright, -1, 1).astype(np.intp))
+    return Lattice(ij - ij.min(axis=0), px[members])
 
 
 _NEAR = 1.5  # pitches within which corners give how the board lies around a place
@@ -707,14 +695,7 @@ def measured(
         _, axes = expected(board.xy(known), places, board.xy(beside), board.pitch)
         more = fit_saddles(grey, start, axes, board.length, board.band, blur)
         n = len(ij)
-        both = replace(
-            found,
-            **{
-                name: np.concatenate([value, getattr(more, name)])
-                for name, value in vars(found).items()
-            },
-        )
-        ij, found = _alike(board, known, both)
+        ij, found = _alike(board, known, Saddles.joined([found, more]))
         tried = (tried | set(map(tuple, beside.tolist()))) - set(map(tuple, ij.tolist()))
         if len(ij) <= n:
             break

@@ -28,28 +28,27 @@ from legcal.perception.pair_matching import (
     CameraPoses,
     Picture,
     Pictures,
-    leg_segments,
     match_pairs,
 )
-from legcal.perception.placement import NotPlaced, Placement, Search, sensor_extent
+from legcal.perception.placement import NotPlaced, Placement, Search
 from legcal.perception.tuning import SEARCHING, SHARE_OF_OTHERS
 from legcal.workers import Run
 
 TOLERANCE = SEARCHING[-1]  # of an axis from its edge pair
-NOMINAL_TOLERANCE = 0.0375  # of a leg that nothing has moved from where the model has it
 # Share of the legs of another explanation of an image: at least, times that of its own reading,
 # and more than that.
 MIN_SHARE, MIN_GAIN, MIN_MORE = 0.35, 2.0, 0.15
 AMBIGUOUS = 0.85  # part of the best explanation from which on another one is about as good
 LONE_READING = 3.0  # how many times more than any other one it differs, if it alone is wrong
 ZOOMS = 1.02 ** np.setdiff1d(np.arange(-12, 36), 0)  # of images cut out and scaled
-_ORIGINAL = "replace it by the original"  # a remedy
+# Remedies
+_ORIGINAL = "replace it by the original"
+_CHECK_ROWS = "check which image belongs to which row"
 _FLIPS = (
     (LEFT_RIGHT, Reason.MIRRORED), (UP_DOWN, Reason.MIRRORED), (UPSIDE_DOWN, Reason.UPSIDE_DOWN)
 )  # fmt: skip
 
 N_REFERENCES = 3  # good images that others are compared with
-MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
 GOOD_PERCENTILE = 75.0  # percentile of the shares that images show, for good images
 MIN_USUAL_SHARE = 0.3  # that good images show, for others to be compared with them
 NOT_IN_SIGHT = (Reason.OUTSIDE, Reason.HIDDEN)
@@ -122,7 +121,7 @@ def find_wrong_images(
         else:
             barely[row] = Cause("{}.", (said,))
     notes += _left_out_notes(search.measurements, left_out)
-    notes += _leg_notes(search, placement, outlines, counts, reasons)
+    notes += _leg_notes(search, outlines, counts, reasons)
     return replace(placement, notes=(*placement.notes, *notes), barely=barely), reasons
 
 
@@ -240,16 +239,14 @@ def _most_common(rejections: Sequence[Rejection]) -> Rejection:
     return Rejection(reason, details.pop() if len(details) == 1 else "")
 
 
-def share_shown(
-    search: Search, placement: Placement, row: int, *, legs: IntArray | None = None
-) -> float:
+def share_shown(search: Search, placement: Placement, row: int) -> float:
     """Return the fraction of the predicted legs, by visible length, that an image shows.
 
-    By default of the legs stated for its view, which must have been placed.
+    Of the legs stated for its view, which must have been placed.
     """
     view = int(search.measurements.view[row])
-    picture = _picture(search, search.pairs(row, view), row, view, legs)
-    return _share(picture, placement, view, TOLERANCE if legs is None else NOMINAL_TOLERANCE)
+    picture = search.picture(row)
+    return _share(picture, placement, view)
 
 
 def explain(
@@ -269,53 +266,38 @@ def explain(
     measurements = search.measurements
     view = int(measurements.view[row])
     pairs = search.pairs(row, view)
-    picture = _picture(search, pairs, row, view)
+    picture = search.picture(row, view, pairs)
     own = _share(picture, placement, view)
-    others = [
-        (
-            _share(replace(picture, pairs=flipped(pairs, picture.corners, flip)), placement, view),
-            Rejection(reason),
-        )
+
+    def as_if(changed: CandidatePairs) -> float:
+        return _share(replace(picture, pairs=changed), placement, view)
+
+    def best_reading(rows: Sequence[int], v: int, seen: CandidatePairs) -> list[tuple[float, int]]:
+        readings = [(_share(search.picture(r, v, seen), placement, v), r) for r in rows]
+        return _best(readings, suspects)
+
+    tried = [
+        (as_if(flipped(pairs, picture.corners, flip)), Rejection(reason), _ORIGINAL)
         for flip, reason in _FLIPS
     ]
-    tried = [(share, why, _ORIGINAL) for share, why in others]
-    zooms = [
-        (_share(replace(picture, pairs=shrunk(pairs, picture.corners, z)), placement, view), z)
-        for z in ZOOMS
-    ]
-    share = max(share for share, _ in zooms)
-    zoom = float(np.median([z for own, z in zooms if own == share]))
-    tried.append((share, Rejection(Reason.ZOOMED, Cause("{:.2f}", (zoom,))), _ORIGINAL))
+    zooms = np.array([as_if(shrunk(pairs, picture.corners, zoom)) for zoom in ZOOMS.tolist()])
+    zoom = float(np.median(ZOOMS[zooms == zooms.max()]))
+    zoomed = Rejection(Reason.ZOOMED, Cause("{:.2f}", (zoom,)))
+    tried.append((float(zooms.max()), zoomed, _ORIGINAL))
     rows = _other_readings(search, row)
-    readings = [
-        (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
-    ]
-    for share, other in _best(readings, suspects):
+    for share, other in best_reading(rows, view, pairs):
         tried.append((share, *_at_other_reading(search, row, other, other in suspects)))
     for w, other_view in enumerate(measurements.views):
         sizes = [(c.width, c.height) for c in (measurements.views[view].camera, other_view.camera)]
         if w == view or placement.T_base_camera[w] is None or sizes[0] != sizes[1]:
             continue
         same = other_view.camera is measurements.views[view].camera
-        seen = pairs if same else search.pairs(row, w)
         there = [row, *(other for other in rows if measurements.view[other] == w)]
-        readings = [
-            (_share(_picture(search, seen, other, w), placement, w), other) for other in there
-        ]
-        for share, other in _best(readings, suspects):
-            at = (
-                ""
-                if other == row
-                else f" at the reading given for image {measurements.image[other]}"
-            )
+        for share, other in best_reading(there, w, pairs if same else search.pairs(row, w)):
+            image = measurements.image[other]
+            at = "" if other == row else f" at the reading given for image {image}"
             shown = f"it was taken by the camera of view {other_view.name}{at}"
-            tried.append(
-                (
-                    share,
-                    Rejection(Reason.OTHER_VIEW, shown),
-                    "check which image belongs to which row",
-                )
-            )
+            tried.append((share, Rejection(Reason.OTHER_VIEW, shown), _CHECK_ROWS))
     share, why, remedy = max(tried, key=lambda one: one[0])
     # Clearly more of the legs than the reading's own, and enough of them
     of_others = SHARE_OF_OTHERS * usual.get(view, 0.0)
@@ -332,7 +314,7 @@ def _at_other_reading(
     one wrong digit in this reading makes the difference.
     """
     measurements = search.measurements
-    image, remedy = measurements.image[other], "check which image belongs to which row"
+    image, remedy = measurements.image[other], _CHECK_ROWS
     if exchanged:
         shown = f"it shows the reading given for image {image}"
         return Rejection(Reason.OTHER_READING, shown), remedy
@@ -377,25 +359,13 @@ def _other_readings(search: Search, row: int) -> list[int]:
     return list(of_pose.values())
 
 
-def _picture(
-    search: Search, pairs: CandidatePairs, row: int, view: int, legs: IntArray | None = None
-) -> Picture:
-    """Return pairs with what a view should show at the reading of a row."""
-    wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
-    targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
-    corners = sensor_extent(search.measurements.views[view].camera)
-    return Picture(pairs, targets, corners, search.size, search.joint_error)
-
-
-def _share(
-    picture: Picture, placement: Placement, view: int, tolerance: float = TOLERANCE
-) -> float:
+def _share(picture: Picture, placement: Placement, view: int) -> float:
     """Return the share of the visible length of the legs on which a picture has their pairs."""
     T = placement.T_base_camera[view]
     if T is None or len(picture.targets) == 0:
         return 0.0
     pose = CameraPoses.one(T, placement.shift[view])
-    seen = match_pairs(Pictures.of([picture]), pose, tolerance)
+    seen = match_pairs(Pictures.of([picture]), pose, TOLERANCE)
     share = picture.targets.share
     visible = float(seen.visible[0, 0] @ share)
     return float(seen.exclusive_score[0, 0] @ share) / visible if visible > 0.0 else 0.0
@@ -458,12 +428,11 @@ def _references(
 
 def _leg_notes(
     search: Search,
-    placement: Placement,
     outlines: Outlines,
     counts: Mapping[int, OutlineCount],
     reasons: Mapping[int, Rejection],
 ) -> list[str]:
-    """Return notes on the legs listed for views."""
+    """Return notes on legs that views list and do not show."""
     measurements, names = search.measurements, search.leg_names
     notes = []
     for v, view in enumerate(measurements.views):
@@ -482,28 +451,7 @@ def _leg_notes(
                 f"outline of it ({why}); inspect them with legcal detect, or remove it from the "
                 "list."
             )
-        good = {row: counts[row] for row in rows}
-        notes += _left_out_legs(search, placement, v, _references(measurements, good, v))
     return notes
-
-
-def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[int]) -> list[str]:
-    """Return a note on legs that a view does not list although its images show them clearly."""
-    clear = [
-        name
-        for leg, name in enumerate(search.leg_names)
-        if not search.wanted[v, leg]
-        and search.cylinders[leg]
-        and all(
-            share_shown(search, placement, row, legs=np.array([leg])) >= MIN_VISIBLE for row in rows
-        )
-    ]
-    if not clear:
-        return []
-    return [
-        f"view {search.measurements.views[v].name} does not list {', '.join(clear)} (legs), which "
-        "its images show clearly; add them to use them."
-    ]
 
 
 def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
@@ -515,16 +463,13 @@ def far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 
 
 def _other_meanings(hint: RigidTransform) -> Iterator[tuple[str, RigidTransform]]:
     """Yield common misinterpretations of T_base_camera, with the pose each would mean."""
-    other = Rotation.from_quat(np.roll(hint.rotation.as_quat(), -1))
-    for what, R in (("", hint.rotation), ("its quaternion is in the order w, x, y, z", other)):
-        pose = RigidTransform.from_components(hint.translation, R)
-        if what:
-            yield what, pose
-        both = f", and {what}" if what else ""
-        yield f"it is T_camera_base, the inverse{both}", pose.inv()
-        for axes, R_axes in _CAMERA_AXES.items():
-            turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
-            yield f"its camera axes are {axes}{both}", pose * turned
+    yield "it is T_camera_base, the inverse", hint.inv()
+    w_first = Rotation.from_quat(np.roll(hint.rotation.as_quat(), -1))
+    order = "its quaternion is in the order w, x, y, z"
+    yield order, RigidTransform.from_components(hint.translation, w_first)
+    for axes, R_axes in _CAMERA_AXES.items():
+        turned = RigidTransform.from_rotation(Rotation.from_matrix(R_axes))
+        yield f"its camera axes are {axes}", hint * turned
 
 
 def far_from_hints(

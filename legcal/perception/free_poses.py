@@ -38,12 +38,12 @@ from legcal.estimation.solver import information
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import motions_of
 from legcal.geometry.rotations import rotation_matrices
+from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import is_constrained, machine_equations
 from legcal.machine.leg import LegKind
 from legcal.machine.model import Machine
 from legcal.machine.solver import poses_after, solve
-from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.pair_matching import (
     CameraPoses,
     LegSegments,
@@ -53,7 +53,7 @@ from legcal.perception.pair_matching import (
     match_pairs,
     segment_equations,
 )
-from legcal.perception.placement import Search, sensor_extent
+from legcal.perception.placement import Search
 from legcal.perception.tuning import JOINT_ERROR, SEARCHING
 from legcal.workers import Run
 
@@ -86,15 +86,6 @@ class FreePoses:
 
 
 @dataclass(frozen=True, eq=False)
-class _Image:
-    """An image of a pose."""
-
-    view: int
-    pairs: CandidatePairs
-    corners: Array  # (2, 2) of its sensor plane
-
-
-@dataclass(frozen=True, eq=False)
 class _Scene:
     """Constants of the machine; they travel to worker processes."""
 
@@ -103,7 +94,7 @@ class _Scene:
     q: Array  # (n_poses, n_legs) readings; of motors alone they have a meaning
     drawn: Array  # (n_drawn, 3, 4) poses of the workspace
     targets: tuple[LegSegments, ...]  # predicted legs at them
-    images: Mapping[int, Sequence[_Image]]  # by pose
+    images: Mapping[int, Sequence[tuple[int, Picture]]]  # by pose, with their views
     # (n, 3, 4) by pose: where clicks have the platform, and around; drawn ones are not tried then
     clicked: Mapping[int, Array] = field(default_factory=dict)
 
@@ -113,7 +104,7 @@ class _Scene:
         machine: Machine,
         wanted: BoolArray,
         q: Array,
-        images: Mapping[int, Sequence[_Image]],
+        images: Mapping[int, Sequence[tuple[int, Picture]]],
         clicked: Mapping[int, Sequence[RigidTransform]],
     ) -> _Scene:
         """Return the scene of a machine and its images."""
@@ -131,33 +122,24 @@ class _Scene:
         """
         found, index = list[Picture](), list[int]()
         for n, (own, k) in enumerate(zip(targets, of_pose, strict=True)):
-            for image in self.images[k]:
-                camera = cameras[n, image.view]
-                shown = replace(own, share=own.share * self.wanted[image.view, own.leg])
-                at = {"R": camera[:, :3], "t": camera[:, 3]}
-                found.append(Picture(image.pairs, shown, image.corners, self.machine.size, **at))
+            for view, image in self.images[k]:
+                camera = cameras[n, view]
+                shown = replace(own, share=own.share * self.wanted[view, own.leg])
+                found.append(replace(image, targets=shown, R=camera[:, :3], t=camera[:, 3]))
                 index.append(n)
         return Pictures.of(found), np.array(index, dtype=np.intp)
 
     def views(self, k: int) -> list[int]:
         """Return the views that show a pose of the measurements."""
-        return sorted({image.view for image in self.images[k]})
+        return sorted({view for view, _ in self.images[k]})
 
 
 @dataclass(frozen=True, eq=False)
-class _Guesses:
+class _Guesses(Table):
     """Where the platform may be at a pose of the measurements, each with cameras that suit it."""
 
     poses: Array  # (n, 3, 4) T_base_platform
     cameras: Array  # (n, n_views, 3, 4) T_camera_base
-
-    def __len__(self) -> int:
-        """Return their number."""
-        return len(self.poses)
-
-    def take(self, chosen: IntArray | slice) -> _Guesses:
-        """Return some of them."""
-        return _Guesses(self.poses[chosen], self.cameras[chosen])
 
     @classmethod
     def before(cls, cameras: Array, poses: Array) -> _Guesses:
@@ -238,11 +220,9 @@ def find_free_poses(
     m = search.measurements
     require_standing_joints(machine)
     require_rough_cameras(m, rows, hints)
-    images: dict[int, list[_Image]] = {}
-    for row, pairs in zip(rows, run(search.own_pairs, rows), strict=True):
-        view = int(m.view[row])
-        image = _Image(view, pairs, sensor_extent(m.views[view].camera))
-        images.setdefault(int(m.pose[row]), []).append(image)
+    images: dict[int, list[tuple[int, Picture]]] = {}
+    for row, picture in zip(rows, run(search.picture, rows), strict=True):
+        images.setdefault(int(m.pose[row]), []).append((int(m.view[row]), picture))
     scene = _Scene.of(machine, search.wanted, m.q_of_poses, images, clicked)
     rough = _cameras_of(hints)
     cameras, every = rough, dict[int, _Guesses]()
@@ -302,14 +282,14 @@ def _searched(scene: _Scene, cameras: Array, k: int) -> _Guesses:
         targets = _targets(scene.machine, guesses.poses)
     for kept, tolerance in zip(KEPT, TOLERANCES, strict=True):
         score = _scores(scene, cameras, k, guesses, targets, tolerance)
-        guesses = guesses.take(np.argsort(-score, kind="stable"))
+        guesses = guesses.choose(np.argsort(-score, kind="stable"))
         few = kept <= ALL_ALIKE
-        guesses = guesses.take(_apart(scene.machine, guesses.poses, kept) if few else slice(kept))
+        guesses = guesses.choose(_apart(scene.machine, guesses.poses, kept) if few else slice(kept))
         guesses = _stepped_often(scene, cameras, k, guesses, [tolerance] * (1 + few))
         targets = _targets(scene.machine, guesses.poses)
     score = _scores(scene, cameras, k, guesses, targets, TOLERANCES[-1])
-    guesses = guesses.take(np.argsort(-score, kind="stable"))
-    return guesses.take(_apart(scene.machine, guesses.poses, CHOICES))
+    guesses = guesses.choose(np.argsort(-score, kind="stable"))
+    return guesses.choose(_apart(scene.machine, guesses.poses, CHOICES))
 
 
 def _agreed(scene: _Scene, rough: Array, every: Mapping[int, _Guesses]) -> Array:
@@ -327,11 +307,7 @@ def _apart(machine: Machine, poses: Array, n: int) -> IntArray:
     ends = machine.B_platform @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
     off = np.linalg.norm(ends[:, None] - ends, axis=3)
     near = np.sqrt(np.mean(off**2, axis=2)) < APART * machine.size
-    kept = list[int]()
-    for i in range(len(poses)):
-        if len(kept) < n and not near[i, kept].any():
-            kept.append(i)
-    return np.array(kept, dtype=np.intp)
+    return first_apart(near, n)
 
 
 def _stepped_often(
@@ -383,7 +359,7 @@ def _stepped(
     weight, value = np.zeros(n), np.zeros((len(poses), n))  # of the priors
     weight[:6] = unit**-2
     if rough is not None:
-        seen = np.array([views.index(image.view) for image in scene.images[k]] * len(poses))
+        seen = np.array([views.index(view) for view, _ in scene.images[k]] * len(poses))
         for i, v in enumerate(views):
             part = slice(6 + 6 * i, 12 + 6 * i)
             J[:, :, part] = by_camera * (seen == i)[:, None, None]
@@ -528,10 +504,10 @@ def _fitted(
 ) -> tuple[dict[int, Array], Array]:
     """Return poses and cameras after steps of all of them together towards the pairs."""
     keys = np.array(sorted(poses), dtype=np.intp)
-    images = [(i, image) for i, k in enumerate(keys.tolist()) for image in scene.images[k]]
-    views = sorted({image.view for _, image in images})
+    images = [(i, view) for i, k in enumerate(keys.tolist()) for view, _ in scene.images[k]]
+    views = sorted({view for _, view in images})
     element = np.array([i for i, _ in images], dtype=np.intp)
-    view = np.array([views.index(image.view) for _, image in images], dtype=np.intp)
+    view = np.array([views.index(view) for _, view in images], dtype=np.intp)
     state = _State(cameras[views], np.array([poses[k] for k in keys.tolist()]))
     n_rows = 4 * sum(len(leg.cylinders) for leg in scene.machine.legs)  # at most, of an image
     unit = _pose_unit(scene)

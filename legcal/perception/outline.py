@@ -88,11 +88,18 @@ class LegPart:
     leg: PredictedLeg
     segment: Segment
     band: Band  # the frame along the part
+    h: Array  # (2, 3) its outlines
     predicted: Array  # (2, 2) offsets of edge 1 and 2 at both ends of the band [px]
-    hidden: BoolArray  # (n_blocks,) which of the block_positions other legs hide
     window: float  # largest distance of an edge from its prediction, at either end [px]
     guided: bool  # whether a fit to other legs predicts it: one edge near there is enough
+    # (n_blocks,) which of the block_positions other legs hide; none before that is asked
+    hidden: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     pair: EdgePair | None = None
+
+    @property
+    def width(self) -> float:
+        """Predicted width in the middle [px]."""
+        return 0.5 * float((self.predicted[1] - self.predicted[0]).sum())
 
     @property
     def edges(self) -> EdgePair:
@@ -414,26 +421,22 @@ Method = Callable[[ImageSearch], tuple[Outlines, float]]
 """Finds the outlines of all parts in one image, and the blur of the image [px] or NaN."""
 
 
-class OutlineLine(NamedTuple):
-    """The line of an outline in the band of its part."""
+class PartVerdict(NamedTuple):
+    """Which outlines of a part are used."""
 
-    v: Array  # (2,) offsets at both ends of the band [px]
-    place: (
-        Array | tuple[float, float]
-    )  # where the used piece begins and ends, as fractions of the band
-    covariance: Array  # (2, 2) of the offsets there [px^2]
-    # contrast, length, residual, by_gamma, polish of Outlines
-    quality: Sequence[float] = (math.nan,) * 5
+    reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
+    bias: float = 0.0  # how far used ones may be off besides their covariance [px]
+    weight: float = 1.0  # of used ones, whose covariance is larger by its inverse
 
 
-class PartLines(NamedTuple):
-    """Both outlines of a part, with the reasons of rejected ones."""
+class JudgedPart(NamedTuple):
+    """Both outlines of a part of a leg as the table has them."""
 
     leg: int
     part: str
-    reasons: tuple[Rejection, Rejection]  # why each outline is rejected
-    lines: Sequence[OutlineLine | None] = (None, None)
-    band: Band | None = None  # the frame of the lines
+    verdict: PartVerdict
+    edges: Sequence[MeasuredEdge | LostEdge] = ()  # none where it was not measured
+    band: Band | None = None  # their frame
 
 
 def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, float]:
@@ -505,17 +508,6 @@ def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:
     return measure(search, together=False)
 
 
-class _Predicted(NamedTuple):
-    """A part of a leg where it is predicted."""
-
-    leg: PredictedLeg
-    segment: Segment
-    band: Band
-    h: Array  # (2, 3) its outlines
-    v: Array  # (2, 2) offsets of these at both ends of the band [px]
-    width: float  # [px], in the middle
-
-
 def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
     """Return outlines that are used as the same ones were before, if they are seen at all.
 
@@ -533,18 +525,18 @@ def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
     return replace(outlines, used=used, reason=reason)
 
 
-def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
+def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[JudgedPart]]:
     """Find the edges of all parts in one image to about a pixel.
 
     Return the parts to measure, and the others with the reasons why their outlines are rejected.
     """
-    rejected: list[PartLines] = []
+    rejected: list[JudgedPart] = []
 
     def reject(leg: PredictedLeg, part: str, reason: Reason, detail: str = "") -> None:
         why = Rejection(reason, detail)
-        rejected.append(PartLines(leg.leg, part, (why, why)))
+        rejected.append(JudgedPart(leg.leg, part, PartVerdict((why, why))))
 
-    searched: list[_Predicted] = []
+    searched: list[LegPart] = []
     for leg in search.legs:
         if math.isnan(search.window[leg.leg]):
             continue
@@ -553,26 +545,25 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
                 reject(leg, segment.link, Reason.OUTSIDE)
                 continue
             v = band.offsets(h[:, None, :], np.array([0.0, band.length]))
-            width = 0.5 * float((v[1] - v[0]).sum())
-            if width < MIN_WIDTH:
-                reject(leg, segment.link, Reason.NARROW, f"{width:.1f}")
-            elif band.length < least_length(width):
+            window = float(search.window[leg.leg])
+            part = LegPart(leg, segment, band, h, v, window, search.guided)
+            if part.width < MIN_WIDTH:
+                reject(leg, segment.link, Reason.NARROW, f"{part.width:.1f}")
+            elif band.length < least_length(part.width):
                 reject(leg, segment.link, Reason.SHORT, f"{band.length:.0f} px in the image")
             else:
-                searched.append(_Predicted(leg, segment, band, h, v, width))
+                guided = search.guided and window <= MAX_GUIDED_WINDOW * part.width
+                searched.append(replace(part, guided=guided))
     free_parts: list[LegPart] = []
     names = [*search.names, *(occluder.link for occluder in search.occluders.occluders)]
-    for predicted, front in zip(searched, _in_front(search, searched), strict=True):
-        leg, segment, band, _, v, width = predicted
+    for part, front in zip(searched, _in_front(search, searched), strict=True):
         hidden = np.any(front >= 0, axis=0)
-        if np.mean(~hidden) * band.length < least_length(width):
+        if np.mean(~hidden) * part.band.length < least_length(part.width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
             in_front = names[values[np.argmax(counts)]]
-            reject(leg, segment.link, Reason.HIDDEN, in_front)
+            reject(part.leg, part.segment.link, Reason.HIDDEN, in_front)
         else:
-            window = float(search.window[leg.leg])
-            guided = search.guided and window <= MAX_GUIDED_WINDOW * width
-            free_parts.append(LegPart(leg, segment, band, v, hidden, window, guided))
+            free_parts.append(replace(part, hidden=hidden))
     parts: list[LegPart] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
     for part, pair in zip(free_parts, pairs, strict=True):
@@ -583,7 +574,7 @@ def find_parts(search: ImageSearch) -> tuple[list[LegPart], list[PartLines]]:
     return parts, rejected
 
 
-def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
+def outline_table(search: ImageSearch, parts: Sequence[JudgedPart]) -> Outlines:
     """Return both outlines of all parts of an image, NaN where there is no line."""
     parts = [part._replace(leg=search.leg_of(part.leg)) for part in parts]
     parts.sort(key=lambda part: (part.leg, part.part))
@@ -591,15 +582,23 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     h, ends, quality = np.full((n, 3), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 5), np.nan)
     covariance = np.full((n, 2, 2), np.nan)
     seen = [
-        (2 * i + edge, part.band, line)
+        (2 * i + k, part.band, edge, part.verdict)
         for i, part in enumerate(parts)
-        for edge, line in enumerate(part.lines)
-        if part.band is not None and line is not None
+        for k, edge in enumerate(part.edges)
+        if part.band is not None and isinstance(edge, MeasuredEdge)
     ]
     if seen:
-        at, bands, lines = zip(*seen, strict=True)
+        at, bands, edges, verdicts = zip(*seen, strict=True)
         has = list(at)
-        v, place, covariance[has], quality[has] = (np.array(x) for x in zip(*lines, strict=True))
+        v, place = (
+            np.array(x)
+            for x in zip(*((e.v, (e.line.first, e.line.last)) for e in edges), strict=True)
+        )
+        covariance[has] = [
+            edge.covariance / judged.weight + judged.bias**2
+            for edge, judged in zip(edges, verdicts, strict=True)
+        ]
+        quality[has] = [_quality(e, band.length) for e, band in zip(edges, bands, strict=True)]
         origin, along, normal = (
             np.array(x) for x in zip(*((b.origin, b.along, b.normal) for b in bands), strict=True)
         )
@@ -614,7 +613,7 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
         xy = first[:, None] + place[..., None] * step[:, None]
         ends[has] = search.camera.distort(xy)
     gamma = np.where(np.isnan(quality[:, 3]), np.nan, search.camera.gamma)
-    reasons = tuple(reason for part in parts for reason in part.reasons)
+    reasons = tuple(reason for part in parts for reason in part.verdict.reasons)
     return Outlines(
         row=np.full(n, search.row, dtype=np.intp),
         leg=np.repeat(np.array([part.leg for part in parts], dtype=np.intp), 2),
@@ -635,7 +634,7 @@ def outline_table(search: ImageSearch, parts: Sequence[PartLines]) -> Outlines:
     )
 
 
-def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntArray]:
+def _in_front(search: ImageSearch, searched: Sequence[LegPart]) -> list[IntArray]:
     """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free.
 
     Other solids of the machine count on from the legs and arms. Where the edge of one goes along
@@ -644,8 +643,9 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     if not searched:
         return []
     points = []
-    for leg, _, band, h, _, _ in searched:
-        s = leg.distance_along(band, block_positions(band))
+    for part in searched:
+        leg, h = part.leg, part.h
+        s = leg.distance_along(part.band, block_positions(part.band))
         axis = leg.A_camera + s[:, None] * leg.u
         radius = EPSILON * (h @ leg.A_camera)
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
@@ -673,14 +673,15 @@ def _in_front(search: ImageSearch, searched: Sequence[_Predicted]) -> list[IntAr
     return hiding
 
 
-def _beside(part: _Predicted, edges: Array, window: float) -> BoolArray:
+def _beside(part: LegPart, edges: Array, window: float) -> BoolArray:
     """Return which blocks (2, n_blocks) of a part have an edge of a solid near an outline.
 
     It is one of the edges (n, 2, 2) on the sensor plane that are as good as parallel to the part
     and within the window, where an outline cannot be told from it.
     """
     at = block_positions(part.band)
-    outlines = part.v[:, :1] + (part.v[:, 1:] - part.v[:, :1]) * at / part.band.length
+    v0, v1 = part.predicted[:, :1], part.predicted[:, 1:]
+    outlines = v0 + (v1 - v0) * at / part.band.length
     t, v = part.band.coordinates(edges)
     along, across = np.diff(t, axis=1), np.diff(v, axis=1)  # (n, 1)
     is_parallel = np.abs(across) < SKEW * np.abs(along)
@@ -695,41 +696,24 @@ def _with_verdict(
     measured: tuple[MeasuredEdge | LostEdge, MeasuredEdge | LostEdge],
     *,
     near_fit: bool,
-) -> PartLines:
+) -> JudgedPart:
     """Return the measured edges of a part with verdicts and how well they were seen."""
     length, window = part.band.length, part.window if part.guided else None
     judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
-    lines: list[OutlineLine | None] = []
-    for edge in measured:
-        if isinstance(edge, LostEdge):
-            lines.append(None)
-            continue
-        line = edge.line
-        position = sorted(line.position.tolist())
-        # Hidden and wrong blocks leave gaps between the others.
-        spacing = min(after - before for before, after in pairwise(position))
-        visible = (len(position) - 1) * spacing * length
-        quality = (
-            round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4),
-            edge.by_gamma, round(edge.polish, 2),
-        )  # fmt: skip
-        lines.append(
-            OutlineLine(
-                edge.v,
-                (line.first, line.last),
-                edge.covariance / judged.weight + judged.bias**2,
-                quality,
-            )
-        )
-    return PartLines(part.leg.leg, part.segment.link, judged.reasons, lines, part.band)
+    return JudgedPart(part.leg.leg, part.segment.link, judged, measured, part.band)
 
 
-class PartVerdict(NamedTuple):
-    """Which outlines of a part are used."""
-
-    reasons: tuple[Rejection, Rejection]  # why each outline cannot be trusted
-    bias: float = 0.0  # how far used ones may be off besides their covariance [px]
-    weight: float = 1.0  # of used ones, whose covariance is larger by its inverse
+def _quality(edge: MeasuredEdge, length: float) -> tuple[float, ...]:
+    """Return contrast, length, residual, by_gamma and polish of Outlines; a band's length [px]."""
+    line = edge.line
+    position = sorted(line.position.tolist())
+    # Hidden and wrong blocks leave gaps between the others.
+    spacing = min(after - before for before, after in pairwise(position))
+    visible = (len(position) - 1) * spacing * length
+    return (
+        round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4),
+        edge.by_gamma, round(edge.polish, 2),
+    )  # fmt: skip
 
 
 def verdict(
@@ -936,11 +920,9 @@ def _of_image(
     found, blur = (no_outlines(), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}
     why = Rejection(Reason.NOT_PLACED if T is None else Reason.OUTSIDE)
-    others = [PartLines(j, _longest(search, j), (why, why)) for j in wanted if j not in seen]
+    # The longest part stands for a leg that is not looked for.
+    longest = {j: max(search.cylinders[j], key=lambda c: (c.end - c.start, c.link)) for j in wanted}
+    others = [
+        JudgedPart(j, longest[j].link, PartVerdict((why, why))) for j in wanted if j not in seen
+    ]
     return join_outlines([found, outline_table(one, others)]) if others else found, blur
-
-
-def _longest(search: Search, leg: int) -> str:
-    """Return the part of a leg that stands for it where it is not looked for."""
-    of_leg = search.cylinders[leg]
-    return max(of_leg, key=lambda cylinder: (cylinder.end - cylinder.start, cylinder.link)).link

@@ -7,7 +7,6 @@ that both are legible when the picture fills a screen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -18,13 +17,11 @@ from numpy.typing import NDArray
 from legcal.data.corners import Corners
 from legcal.data.outlines import Outlines, are_of_bodies
 from legcal.data.reasons import Reason, Rejection
-from legcal.geometry.types import Array, BoolArray, Image
-from legcal.perception.candidate_pairs import find_candidate_pairs, find_segments
+from legcal.geometry.types import Array, Image
 from legcal.vision.camera import Camera
-from legcal.vision.image_file import Grey
 from legcal.vision.visibility import PredictedLeg
 
-MarkKind = Literal["edge 1", "edge 2", "axis", "body", "rejected", "predicted", "pair", "corner"]
+MarkKind = Literal["edge 1", "edge 2", "axis", "body", "rejected", "predicted", "corner"]
 N_POINTS = 40  # of a curve
 
 Canvas = NDArray[np.uint8]
@@ -39,7 +36,6 @@ COLOURS: dict[MarkKind, tuple[int, int, int]] = {  # blue, green, red
     "body": (220, 220, 0),
     "rejected": (70, 70, 255),
     "predicted": (30, 150, 255),
-    "pair": (255, 120, 230),
     "corner": (255, 255, 0),
 }
 _MEANING: dict[MarkKind, str] = {
@@ -49,7 +45,6 @@ _MEANING: dict[MarkKind, str] = {
     "body": "edge of a body",
     "rejected": "rejected",
     "predicted": "expected here, not found",
-    "pair": "edge pair",
     "corner": "corner of a board",
 }
 _WHITE = (255, 255, 255)
@@ -61,13 +56,7 @@ _SMALLER = 0.8  # letters of reasons and of the legend
 _DASH, _GAP = 9.0, 7.0  # in widths of a line
 _CROSS = 5.0  # arms of a corner, in widths of a line
 
-_PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # along a curve
-_FARTHER = (0.0, 1.0, 2.5, 5.0)  # from the curve, in the least distance of a text
-_APART = 0.25  # of that distance between two texts
-_ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
-_ON_LINE = 0.1  # of the area of a text, that each point of a line under it costs
-_ON_TEXT = 4.0  # weight of the overlap of two texts
-_LEADER_POINTS = 8
+_PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # of texts along a curve
 
 
 class Mark(NamedTuple):
@@ -130,20 +119,6 @@ def marks_of_image(
         for i in range(len(of_bodies))
     )
     return [*found, PartMarks("", "", edges)] if edges else found
-
-
-def marks_of_pairs(camera: Camera, image: Grey) -> PartMarks:
-    """Return the edge pairs of an image, by which its camera is looked for."""
-    pairs = find_candidate_pairs(find_segments(image, camera))
-    marks = []
-    for k in range(len(pairs)):
-        steps = np.linspace(-1.0, 1.0, N_POINTS)[:, None]
-        axis = pairs.middle[k] + pairs.half_length[k] * steps * pairs.along[k]
-        width = pairs.width[k, 0] + 0.5 * (1.0 + steps) * (pairs.width[k, 1] - pairs.width[k, 0])
-        for side in (0.5, -0.5):
-            edge = axis + side * width * pairs.normal[k]
-            marks.append(Mark("pair", camera.distort(edge)))
-    return PartMarks("", "", tuple(marks))
 
 
 def _reason(pair: Outlines) -> str:
@@ -248,11 +223,10 @@ def draw(
         for arm in np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]]):
             at = (mark.points + 0.5) * factor - 0.5 + _CROSS * width * arm
             _polyline(picture, at, COLOURS[mark.kind], width)
-    lines = np.concatenate([np.zeros((0, 2)), *(m.points for marks in curves for m in marks)])
-    places = LabelPlaces(picture.shape[1], picture.shape[0], lines)
+    boxes = list[Array]()
     for part, marks in zip(parts, curves, strict=True):
         if part.name:
-            _label(picture, places, part, marks, letter)
+            boxes.append(_label(picture, boxes, part, marks, letter))
     kinds = {mark.kind for mark in [*corners, *(mark for part in parts for mark in part.marks)]}
     return np.vstack([picture, _legend(picture.shape[1], letter, width, caption, kinds)])
 
@@ -270,7 +244,7 @@ def _draw_curve(picture: Canvas, mark: Mark, width: int) -> None:
             dashes.append(np.column_stack([np.interp(at, along, c) for c in mark.points.T]))
         for dash in dashes:
             _polyline(picture, dash, colour, width)
-    elif mark.kind in ("axis", "pair"):
+    elif mark.kind == "axis":
         _polyline(picture, mark.points, colour, max(1, width // 2))
     else:
         _polyline(picture, mark.points, colour, width)
@@ -282,9 +256,12 @@ def _polyline(picture: Canvas, points: Array, colour: tuple[int, int, int], widt
 
 
 def _label(
-    picture: Canvas, places: LabelPlaces, part: PartMarks, marks: Sequence[Mark], letter: float
-) -> None:
-    """Write the name of a part beside it, and why an outline of it is not used."""
+    picture: Canvas, boxes: Sequence[Array], part: PartMarks, marks: Sequence[Mark], letter: float
+) -> Array:
+    """Write the name of a part beside it, and why an outline of it is not used.
+
+    Return the box (2, 2) of the text, which keeps clear of earlier ones.
+    """
     kinds = {mark.kind for mark in marks}
     colour = _WHITE
     if part.reason or kinds == {"predicted"}:
@@ -298,13 +275,15 @@ def _label(
     pad, step = round(0.3 * letter), round(1.3 * letter)
     size = (max(widths) + 2 * pad, step * len(lines) + pad)
     middle = min(marks, key=lambda mark: mark.kind != "axis").points
-    (x, y), leader = places.place(middle, size, 1.2 * letter)
-    _polyline(picture, leader, colour, 1 + round(letter / 40.0))
+    limit = np.array(picture.shape[1::-1], dtype=np.float64)
+    corner = _place(middle, size, 1.2 * letter, limit, boxes)
+    x, y = corner.astype(int).tolist()
     box = picture[y : y + size[1], x : x + size[0]]
     box[:] = (0.35 * box).astype(np.uint8)
     for k, (line, (scale, thick)) in enumerate(zip(lines, lettering, strict=False), start=1):
         at = (x + pad, y + k * step - pad // 2)
         cv2.putText(picture, line, at, _FONT, scale, colour, thick, cv2.LINE_AA)
+    return np.array([corner, corner + size])
 
 
 def _lettering(letter: float) -> tuple[float, int]:
@@ -325,7 +304,7 @@ def _legend(width: int, letter: float, line: int, caption: str, kinds: set[MarkK
     )
     x, y = letter, 2.9 * letter
     for kind, meaning in _MEANING.items():
-        if kind in ("body", "pair", "corner") and kind not in kinds:
+        if kind in ("body", "corner") and kind not in kinds:
             continue
         (w, _), _ = cv2.getTextSize(meaning, _FONT, _SMALLER * scale, thick)
         start = np.array([x, y - 0.3 * letter])
@@ -337,68 +316,23 @@ def _legend(width: int, letter: float, line: int, caption: str, kinds: set[MarkK
     return strip
 
 
-@dataclass(eq=False)
-class LabelPlaces:
-    """The texts of a picture, each where it hides least."""
+def _place(
+    curve: Array, size: tuple[int, int], distance: float, limit: Array, boxes: Sequence[Array]
+) -> Array:
+    """Return the left top corner (2,) of a text beside a curve (n, 2), over no earlier text.
 
-    width: int  # of the picture [px]
-    height: int
-    lines: Array  # (n, 2) points of all that is drawn [px]
-    boxes: list[Array] = field(default_factory=list)  # (4,) left, top, right, bottom of texts
-
-    def place(
-        self, curve: Array, size: tuple[int, int], distance: float
-    ) -> tuple[tuple[int, int], Array]:
-        """Return the left top corner of a text (width, height) [px] beside a curve (n, 2).
-
-        It keeps its place, at least a distance from the curve [px] where the picture has room; and
-        a leader (2, 2) to it.
-        """
-        extent = np.array(size, dtype=np.float64)
-        limit = np.floor(np.maximum([self.width, self.height] - extent, 0.0))
-        candidates = []
-        for farther, place in product(_FARTHER, _PLACES):
-            i = min(int(place * len(curve)), len(curve) - 2)
-            along = curve[i + 1] - curve[i]
-            normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
-            reach = (1.0 + farther) * distance + 0.5 * float(np.abs(normal) @ extent)
-            # A text above or below its curve may begin or end there, one at its side stand askew.
-            shift = 0.5 * extent * (np.abs(normal) < np.abs(normal).max())
-            for side, shifted in product((reach, -reach), (0.0, 1.0, -1.0)):
-                middle = curve[i] + side * normal + shifted * shift
-                corner = np.clip(np.rint(middle - 0.5 * extent), 0.0, limit)
-                candidates.append((curve[i], corner))
-        costs = [
-            self._cost(corner, extent, _leader(anchor, corner, extent)) + _ORDER * k * extent.prod()
-            for k, (anchor, corner) in enumerate(candidates)
-        ]
-        anchor, corner = candidates[int(np.argmin(costs))]
-        leader = _leader(anchor, corner, extent)
-        self.lines = np.concatenate([self.lines, leader])
-        gap = _APART * distance
-        self.boxes.append(np.concatenate([corner - gap, corner + extent + gap]))
-        return (int(corner[0]), int(corner[1])), leader[[0, -1]]
-
-    def _cost(self, corner: Array, extent: Array, leader: Array) -> float:
-        """Return the cost of a place, as an area [px^2]."""
-        area, cost = float(extent.prod()), 0.0
-        low, high = corner, corner + extent
-        crossed = int(np.count_nonzero(_is_in(self.lines, low, high)))
-        for box in self.boxes:
-            overlap = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
-            if np.all(overlap > 0.0):
-                cost += _ON_TEXT * (area + float(overlap.prod()))
-            crossed += int(np.count_nonzero(_is_in(leader, box[:2], box[2:])))
-        return cost + _ON_LINE * area * crossed
-
-
-def _leader(anchor: Array, corner: Array, extent: Array) -> Array:
-    """Return the points (n, 2) of the line from a curve to a text."""
-    share = np.linspace(0.0, 1.0, _LEADER_POINTS)[:, None]
-    return anchor + share * (np.clip(anchor, corner, corner + extent) - anchor)
-
-
-def _is_in(points: Array, low: Array, high: Array) -> BoolArray:
-    """Return the mask of points (n, 2) in a box."""
-    inside: BoolArray = np.all((points > low) & (points < high), axis=1)
-    return inside
+    Texts have a size (width, height) and are a distance from the curve [px], where the picture has
+    room, which ends at a limit (2,); boxes (2, 2) of the earlier ones are their corners.
+    """
+    extent, corners = np.array(size, dtype=np.float64), list[Array]()
+    for place, side in product(_PLACES, (1.0, -1.0)):
+        i = min(int(place * len(curve)), len(curve) - 2)
+        along = curve[i + 1] - curve[i]
+        normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
+        reach = distance + 0.5 * float(np.abs(normal) @ extent)
+        middle = curve[i] + side * reach * normal
+        corners.append(np.clip(np.rint(middle - 0.5 * extent), 0.0, np.maximum(limit - extent, 0)))
+    for corner in corners:
+        if not any(np.all((corner < b[1]) & (corner + extent > b[0])) for b in boxes):
+            return corner
+    return corners[0]

@@ -14,8 +14,8 @@ rod in two may have none that is clean.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import cross_matrices, rotation_matrices
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, Image, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -50,7 +51,7 @@ MAX_TURN, MAX_DISPLACEMENT = 0.4, 0.2  # the same, at most
 
 
 @dataclass(frozen=True, eq=False)
-class LegSegments:
+class LegSegments(Table):
     """The visible segments of all legs at the reading of a picture."""
 
     leg: IntArray  # (n,) the leg of each segment
@@ -58,10 +59,6 @@ class LegSegments:
     place: Array  # (n, 2) where these ends are along the leg, 0 at A and 1 at B
     radius: Array  # (n,) [m]
     share: Array  # (n,) its part of the visible length of its leg
-
-    def __len__(self) -> int:
-        """Return the number of segments."""
-        return len(self.leg)
 
 
 def leg_segments(
@@ -90,7 +87,7 @@ def leg_segments(
 
 
 @dataclass(frozen=True, eq=False)
-class CameraPoses:
+class CameraPoses(Table):
     """Candidate camera poses T_camera_base."""
 
     R: Array  # (n, 3, 3)
@@ -108,30 +105,21 @@ class CameraPoses:
         return cls.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
 
     @classmethod
-    def one(cls, T_base_camera: RigidTransform, shift: Array) -> CameraPoses:
-        """Return one pose, with shifts (n_legs, 2, 3)."""
-        T = T_base_camera.inv()
-        return cls(T.rotation.as_matrix()[None], T.translation[None], shift[None])
+    def of(cls, T_base_camera: Sequence[RigidTransform], n_legs: int) -> CameraPoses:
+        """Return poses the other way round, at which legs are where the model has them."""
+        T = [one.inv() for one in T_base_camera]
+        R = np.array([one.rotation.as_matrix() for one in T]).reshape(-1, 3, 3)
+        return cls.rigid(R, np.array([one.translation for one in T]).reshape(-1, 3), n_legs)
 
     @classmethod
-    def joined(cls, parts: Sequence[CameraPoses]) -> CameraPoses:
-        """Return all poses of some sets."""
-        return cls(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("R", "t", "shift"))
-        )
+    def one(cls, T_base_camera: RigidTransform, shift: Array) -> CameraPoses:
+        """Return one pose, with shifts (n_legs, 2, 3)."""
+        return replace(cls.of([T_base_camera], len(shift)), shift=shift[None])
 
     def T_base_camera(self, i: int = 0) -> RigidTransform:
         """Return a pose the other way round."""
         R = Rotation.from_matrix(self.R[i])
         return RigidTransform.from_components(self.t[i], R).inv()
-
-    def __len__(self) -> int:
-        """Return the number of poses."""
-        return len(self.R)
-
-    def take(self, chosen: IntArray | slice) -> CameraPoses:
-        """Return some of the poses."""
-        return CameraPoses(self.R[chosen], self.t[chosen], self.shift[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +137,7 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class Pictures(Table):
     """Pictures of one camera in arrays, where all have as many segments and pairs as the most.
 
     Segments that fill up count for nothing, pairs that do are far from everything.
@@ -203,10 +191,6 @@ class Pictures:
             pictures[0].joint_error if pictures else JOINT_ERROR,
         )
 
-    def __len__(self) -> int:
-        """Return the number of pictures."""
-        return len(self.ends)
-
     @property
     def min_depth(self) -> float:
         """Depth of the nearest point of a leg [m]."""
@@ -217,12 +201,6 @@ class Pictures:
         """The ends of all segments, (n, 3) [m]."""
         return self.ends[self.share > 0.0].reshape(-1, 3)
 
-    def take(self, chosen: slice) -> Pictures:
-        """Return some of the pictures."""
-        names = (one.name for one in fields(self) if one.name not in ("size", "joint_error"))
-        arrays = {name: getattr(self, name) for name in names}
-        return replace(self, **{name: values[chosen] for name, values in arrays.items()})
-
     def blocks(self, n_poses: int) -> Iterator[Pictures]:
         """Return the pictures a few at a time, fewer for more poses, so that arrays stay small."""
         n = max(1, CHUNK // max(n_poses, 1))
@@ -230,7 +208,7 @@ class Pictures:
             yield self
             return
         for first in range(0, len(self), n):
-            yield self.take(slice(first, first + n))
+            yield self.choose(slice(first, first + n))
 
 
 def _filled(parts: Sequence[NDArray[Any]], n: int, value: NDArray[Any]) -> NDArray[Any]:
@@ -242,7 +220,8 @@ def _filled(parts: Sequence[NDArray[Any]], n: int, value: NDArray[Any]) -> NDArr
     return filled
 
 
-class PairMatches(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PairMatches(Table):
     """Scores of poses in images, (n_pictures, n_poses, n_segments) each."""
 
     score: Array  # of each segment, 0 to 1: how well, times how much of its visible length
@@ -256,10 +235,6 @@ class PairMatches(NamedTuple):
         better = self.score[..., None, :] > self.score[..., :, None]
         return np.where(np.any(same & better, axis=-1), 0.0, self.score)
 
-    def of_pictures(self, chosen: slice | IntArray) -> PairMatches:
-        """Return the matches of some pictures."""
-        return PairMatches(self.score[chosen], self.pair[chosen], self.visible[chosen])
-
 
 def match_pairs(pictures: Pictures, poses: CameraPoses, tolerance: float) -> PairMatches:
     """Match poses to pictures; ``tolerance`` is how far axes may be from pairs, of the size."""
@@ -267,24 +242,14 @@ def match_pairs(pictures: Pictures, poses: CameraPoses, tolerance: float) -> Pai
     if len(pictures) == 0 or n == 0:
         nothing = np.zeros((len(pictures), n, pictures.ends.shape[1]))
         return PairMatches(nothing, nothing.astype(np.intp), nothing)
-    blocks = [
-        _joined(
-            [
-                _match_block(some, poses.take(slice(k, k + CHUNK)), tolerance)
-                for k in range(0, n, CHUNK)
-            ],
-            1,
+    if n <= CHUNK:
+        return PairMatches.joined(
+            [_match_block(some, poses, tolerance) for some in pictures.blocks(n)]
         )
-        for some in pictures.blocks(n)
-    ]
-    return _joined(blocks, 0)
-
-
-def _joined(parts: Sequence[PairMatches], axis: int) -> PairMatches:
-    """Return matches of several pictures, or of several poses, as one."""
-    if len(parts) == 1:
-        return parts[0]
-    return PairMatches(*(np.concatenate(x, axis=axis) for x in zip(*parts, strict=True)))
+    few = (poses.choose(slice(k, k + CHUNK)) for k in range(0, n, CHUNK))
+    parts = [match_pairs(pictures, some, tolerance) for some in few]
+    every = ((part.score, part.pair, part.visible) for part in parts)
+    return PairMatches(*(np.concatenate(of_field, axis=1) for of_field in zip(*every, strict=True)))
 
 
 def projected(pictures: Pictures, poses: CameraPoses) -> tuple[Array, Array, Array]:
@@ -395,7 +360,7 @@ def gauss_newton_step(
     of_legs = np.zeros((n, n_legs, 6, 13))  # products with shifts, with motions, with residuals
     done = 0
     for some in pictures.blocks(n):
-        found = matches.of_pictures(slice(done, done := done + len(some)))
+        found = matches.choose(slice(done, done := done + len(some)))
         if found.score.size == 0 or some.pairs.shape[1] == 0:
             continue
         J, J_leg, residual, weight = segment_equations(some, poses, found, tolerance)
@@ -563,7 +528,7 @@ MOST_SAMPLES = 4_000_000  # that are looked up at once
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeMaps:
+class EdgeMaps(Table):
     """Edges in pictures, on their sensor planes."""
 
     maps: Samples  # (n_pictures, N_DIRECTIONS, height, width), 0 to 1
@@ -592,10 +557,6 @@ class EdgeMaps:
         corner = np.array([corner for _, corner, _ in grids])
         return cls(maps, corner, np.array([cell for _, _, cell in grids]))
 
-    def take(self, chosen: slice) -> EdgeMaps:
-        """Return the maps of some images."""
-        return EdgeMaps(self.maps[chosen], self.corner[chosen], self.cell[chosen])
-
     def mirrored(self, middle: Array) -> EdgeMaps:
         """Return maps with left and right exchanged about middles x (n_pictures,)."""
         turned = np.roll(self.maps[:, ::-1, :, ::-1], 1, axis=1)
@@ -622,7 +583,7 @@ class EdgeMaps:
         """Return the number of legs that poses explain in all images together, (n_poses,)."""
         samples = 2 * SAMPLES * pictures.ends.shape[1] * len(pictures)
         n = max(1, MOST_SAMPLES // max(samples, 1))
-        chunks = [poses.take(slice(k, k + n)) for k in range(0, len(poses), n)]
+        chunks = [poses.choose(slice(k, k + n)) for k in range(0, len(poses), n)]
         return np.concatenate([np.zeros(0), *(self._scores(pictures, some) for some in chunks)])
 
     def _scores(self, pictures: Pictures, poses: CameraPoses) -> Array:

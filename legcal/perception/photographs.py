@@ -232,7 +232,8 @@ def place_and_measure(
         defects |= doubtful
         usable = np.setdiff1d(usable, list(doubtful))
     search = photographs.search(nominal, pairs, rough)
-    placement = _placed(photographs, search, usable, hints, report, joined)
+    counted = _counted(report, "Recognising legs", len(usable))
+    placement = place_views(search, usable, hints, joined, run=photographs.run, progress=counted)
     outlines, blur = _measured(photographs, search, placement, report, method=method)
     if not free_poses:  # which would follow wrong radii, and these wrong poses
         photographs, search, outlines, notes = _with_other_radii(
@@ -400,7 +401,7 @@ def _decided_by_outlines(
     hints = nominal.T_base_camera
     for _ in range(CHOICE_ROUNDS):
         search = photographs.search(nominal)
-        placement = _placed(photographs, search, rows, hints, report, joined)
+        placement = place_views(search, rows, hints, joined, run=photographs.run)
         most = dict.fromkeys(choices, -1)
         chosen = dict[int, int]()
         for n in range(max(map(len, choices.values()))):
@@ -487,19 +488,6 @@ def _radii_of_outlines(
     return radii
 
 
-def _placed(
-    photographs: Photographs,
-    search: Search,
-    rows: IntArray,
-    hints: Sequence[RigidTransform | None],
-    report: Report,
-    joined: Joined,
-) -> Placement:
-    """Return the placement of views by the legs in some images."""
-    progress = _counted(report, "Recognising legs", len(rows))
-    return place_views(search, rows, hints, joined, run=photographs.run, progress=progress)
-
-
 def _measured(
     photographs: Photographs,
     search: Search,
@@ -541,7 +529,7 @@ def _inspect_images(
         count(row)
     defects = defects_of(measurements, exposures)
     photographs.still.update(_still_pictures(measurements, small, defects))
-    pairs_of = partial(_pairs_of_reduced, photographs.search(nominal))
+    pairs_of = photographs.search(nominal).pairs_of_reduced
     seen_by = [(picture, int(measurements.view[row])) for row, picture in small.items()]
     pairs = dict(zip(small, photographs.run(pairs_of, seen_by), strict=True))
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
@@ -557,11 +545,6 @@ def _still_pictures(
             of_view.setdefault(int(measurements.view[row]), []).append(picture)
     still = {view: still_picture(pictures) for view, pictures in of_view.items()}
     return {view: picture for view, picture in still.items() if picture is not None}
-
-
-def _pairs_of_reduced(search: Search, seen_by: tuple[Grey, int]) -> CandidatePairs:
-    """Return the candidate pairs of a reduced image and the view of it."""
-    return search.pairs_of_reduced(*seen_by)
 
 
 def defects_of(

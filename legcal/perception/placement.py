@@ -31,7 +31,7 @@ from legcal.perception.candidate_pairs import (
     reduction,
     segments_of_reduced,
 )
-from legcal.perception.pair_matching import EdgeMaps, LegSegments, Picture, leg_segments
+from legcal.perception.pair_matching import EdgeMaps, Picture, leg_segments
 from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey, shrink
@@ -70,19 +70,27 @@ class Search:
         """Number of legs."""
         return len(self.cylinders)
 
-    def picture(self, row: int) -> Picture:
-        """Return the edge pairs and predicted legs of the image of a row."""
-        view = int(self.measurements.view[row])
-        camera = self.measurements.views[view].camera
-        extent = sensor_extent(camera)
-        pairs, targets = self.pairs(row, view), self.targets(row, view)
+    def picture(
+        self, row: int, view: int | None = None, pairs: CandidatePairs | None = None
+    ) -> Picture:
+        """Return the edge pairs and predicted legs of the image of a row.
+
+        As if the camera of another view had taken it, or with other pairs, if given.
+        """
+        view = int(self.measurements.view[row]) if view is None else view
+        legs = np.flatnonzero(self.wanted[view])
+        targets = leg_segments(self.A_base[row], self.B_base[row], self.shapes, legs)
+        extent = sensor_extent(self.measurements.views[view].camera)
+        pairs = self.pairs(row, view) if pairs is None else pairs
         return Picture(pairs, targets, extent, self.size, self.joint_error)
 
-    def pairs(self, row: int, view: int) -> CandidatePairs:
-        """Return the edge pairs of an image as if the camera of a view had taken it."""
-        if view == int(self.measurements.view[row]) and row in self.edge_pairs:
+    def pairs(self, row: int, view: int | None = None) -> CandidatePairs:
+        """Return the edge pairs of an image, as if the camera of another view had taken it."""
+        own = int(self.measurements.view[row])
+        view = own if view is None else view
+        if view == own and row in self.edge_pairs:
             return self.edge_pairs[row]
-        return self.pairs_of_reduced(shrink(self.load(row), self.reduction(view)), view)
+        return self.pairs_of_reduced((shrink(self.load(row), self.reduction(view)), view))
 
     def reduction(self, view: int) -> int:
         """Return the factor by which the pictures of a view are reduced."""
@@ -101,20 +109,12 @@ class Search:
         ]
         return EdgeMaps.of(small, moving, cameras, factors)
 
-    def pairs_of_reduced(self, small: Grey, view: int) -> CandidatePairs:
+    def pairs_of_reduced(self, seen_by: tuple[Grey, int]) -> CandidatePairs:
         """Return the edge pairs of a reduced image as if the camera of a view had taken it."""
+        small, view = seen_by
         camera, still = self.measurements.views[view].camera, self.still.get(view)
         segments = segments_of_reduced(small, camera, self.reduction(view), still)
         return find_candidate_pairs(segments)
-
-    def own_pairs(self, row: int) -> CandidatePairs:
-        """Return the edge pairs of an image."""
-        return self.pairs(row, int(self.measurements.view[row]))
-
-    def targets(self, row: int, view: int) -> LegSegments:
-        """Return the legs at the reading of a row that a view is stated to show."""
-        legs = np.flatnonzero(self.wanted[view])
-        return leg_segments(self.A_base[row], self.B_base[row], self.shapes, legs)
 
     @cached_property
     def shapes(self) -> list[tuple[Cylinder, ...]]:
@@ -301,6 +301,16 @@ class Group:
     view_of_row: dict[int, int]
     hint: RigidTransform | None  # T_base_group, roughly
     is_placed: bool = False  # by clicks: the hint is its camera where its images show too little
+
+    def cameras(self, T_base_group: RigidTransform) -> dict[int, RigidTransform | None]:
+        """Return T_base_camera of its views."""
+        return {v: T_base_group * self.T_group_camera[v] for v in self.views}
+
+    def not_placed(self, measurements: Measurements, why: Cause) -> dict[str, NotPlaced]:
+        """Return why its views have no camera, by their names."""
+        names = [measurements.views[v].name for v in self.views]
+        name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+        return dict.fromkeys(names, NotPlaced(name, why))
 
     def pictures(self, of_row: Mapping[int, Picture], rows: Sequence[int]) -> list[Picture]:
         """Return the pictures of some rows, in the frame of the group."""

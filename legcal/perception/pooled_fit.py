@@ -207,7 +207,7 @@ class _Pool:
         bounds = np.searchsorted(edge, np.arange(n_edges + 1)).tolist()
         of_all = blocks.bins(blur).sums(blocks.light)
         ratio = noise_ratios(of_all, blocks.bounds, share, blur)
-        sums = of_all.of_blocks(usable).shared(share[usable]).joined(first)
+        sums = of_all.choose(usable).shared(share[usable]).summed(first)
         sums = sums.weighted(even_weights(sums.grid, ratio[edge], blur))
 
         def total(values: Array) -> Array:
@@ -289,7 +289,7 @@ class _Pool:
             row_edge=number[self.row_edge[rows]],
             edge=edge,
             bounds=np.searchsorted(edge, np.arange(np.count_nonzero(edges) + 1)).tolist(),
-            sums=self.sums.of_blocks(is_kept),
+            sums=self.sums.choose(is_kept),
             at=_Iterate(*(of_all[edges] for of_all in self.at)),
             functions=(values[edges], slopes[edges], widenings[edges]),
             **{

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.camera import Camera
 from legcal.vision.image_file import Grey
@@ -287,11 +288,13 @@ def to_light(grey: Samples, window: Samples, gamma: float) -> tuple[Samples, Sam
 
 
 @dataclass(frozen=True, eq=False)
-class PixelSums:
+class PixelSums(Table):
     """Sums over the pixels of blocks, in bins of their distances from the lines.
 
     Pixels count by their squared weights; o is the distance of one from the middle of its bin.
     """
+
+    common = ("grid",)
 
     grid: Array  # (m,) middles of the bins [px]
     weight: Array  # (n, 3, m) of 1, o, and o^2
@@ -299,17 +302,12 @@ class PixelSums:
     power: Array  # (n, m) of its square
     count: Array  # (n, m) how many pixels, by their windows alone
 
-    def of_blocks(self, blocks: BoolArray) -> "PixelSums":
-        """Return the sums of some blocks (n,)."""
-        of_pixels = self.weight, self.light, self.power, self.count
-        return PixelSums(self.grid, *(sums[blocks] for sums in of_pixels))
-
-    def joined(self, first: IntArray) -> "PixelSums":
-        """Return the sums of blocks that consist of these, each from its first one (n_joined,)."""
+    def summed(self, first: IntArray) -> "PixelSums":
+        """Return the sums of blocks that consist of these, each from its first one (n_summed,)."""
         if len(first) == len(self.count):
             return self
-        of_pixels = self.weight, self.light, self.power, self.count
-        return PixelSums(self.grid, *(np.add.reduceat(sums, first, axis=0) for sums in of_pixels))
+        sums = self.columns().values()
+        return PixelSums(self.grid, *(np.add.reduceat(x, first, axis=0) for x in sums))
 
     def shared(self, share: Array) -> "PixelSums":
         """Return the sums of blocks that count as so many (n,)."""

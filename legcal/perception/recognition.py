@@ -22,7 +22,6 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
 from legcal.perception.camera_search import (
     SOME_PICTURES,
-    START_PICTURES,
     PoseCandidates,
     is_mirrored,
     may_be_mirrored,
@@ -44,7 +43,7 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.tuning import EVIDENCE_RATIO
-from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
+from legcal.perception.view_fit import ViewFit, fit_view, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
 MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
@@ -97,31 +96,78 @@ def place_views(
     unclear = [k for k, near in enumerate(found) if near is None or not near.is_clear]
     missing = [r for k in unclear for r in groups[k].rows if r not in pictures]
     pictures |= _pictures(search, missing, progress, run)
-    of_groups = [groups[k].pictures(pictures, groups[k].rows) for k in unclear]
-    anywhere = _anywhere(of_groups, n_legs, START_PICTURES, run)
-    for k, of_group, one in zip(unclear, of_groups, anywhere, strict=True):
-        hint = groups[k].hint
-        found[k] = one if hint is None else _better(place_near(of_group, hint, n_legs), one)
-    # Views that pairs do not place, by all edges along legs.
-    left = [k for k in unclear if (by_pairs := found[k]) is None or not by_pairs.is_convincing]
-    of_left = [_ByEdges(groups[k], pictures, found[k]) for k in left]
-    for k, one in zip(left, run(partial(_by_edges, search), of_left), strict=True):
-        found[k] = one
-    candidates = [one for one in found if one is not None]
-    decide = partial(_decided_by_outlines, search, pictures)
-    placed = list(run(decide, list(zip(groups, candidates, strict=True))))
-    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
-        if group.is_placed and group.hint is not None and not one.is_convincing:
-            seen = group.pictures(pictures, [r for r in group.rows if r in pictures])
-            placed[g] = place_at(seen, group.hint, n_legs)
-    return _gathered(search, hints, groups, pictures, placed, run)
+    tasks = [
+        _Task(group, {row: pictures[row] for row in group.rows if row in pictures}, one)
+        for group, one in zip(groups, found, strict=True)
+    ]
+    T, unplaced = dict(enumerate(hints)), dict[str, NotPlaced]()
+    shift = np.zeros((len(T), n_legs, 2, 3))
+    error: Array = np.full((len(T), n_legs), search.joint_error)
+    for group, (one, swapped) in zip(groups, run(partial(_placed, search), tasks), strict=True):
+        if swapped or not one.is_convincing:
+            cause = _why_not_placed(one, group.hint is not None, is_mirrored=swapped)
+            unplaced |= group.not_placed(search.measurements, cause)
+            T |= dict.fromkeys(group.views)
+            continue
+        T |= group.cameras(one.pose())
+        seen, leg_error = np.isfinite(one.leg_error), MIN_ERROR + ERROR_SIGMAS * one.leg_error
+        shift[group.views] = one.poses.shift[0]
+        error[group.views] = np.where(seen, leg_error, search.joint_error)
+    placement = Placement(search.A_base, search.B_base, tuple(T.values()), error)
+    return replace(placement.shifted(search, shift), unplaced=unplaced)
+
+
+class _Task(NamedTuple):
+    """A group to place."""
+
+    group: Group
+    pictures: Mapping[int, Picture]  # of its rows; of all of them where the search near is unclear
+    near: PoseCandidates | None  # the camera near its rough pose, by a few of its images
+
+
+def _placed(search: Search, task: _Task) -> tuple[PoseCandidates, bool]:
+    """Return the camera of a group, and whether its images are mirrored.
+
+    By pairs near its rough pose; else by pairs of all images, anywhere; else by all edges along
+    legs; decided by outlines where pairs are ambiguous.
+    """
+    group, pictures, best = task
+    n_legs = search.n_legs
+    if best is None or not best.is_clear:
+        every = group.pictures(pictures, group.rows)
+        best = place_camera(every, n_legs)
+        if group.hint is not None:
+            best = _better(place_near(every, group.hint, n_legs), best)
+        if not best.is_convincing:
+            best = _by_edges(search, group, pictures, best.poses)
+    best = _decided_by_outlines(search, group, pictures, best)
+    if group.is_placed and group.hint is not None and not best.is_convincing:
+        best = place_at(group.pictures(pictures, list(pictures)), group.hint, n_legs)
+    return best, _is_mirrored(search, group, pictures, best)
+
+
+def _is_mirrored(
+    search: Search, group: Group, pictures: Mapping[int, Picture], placed: PoseCandidates
+) -> bool:
+    """Return whether images of a group show the legs only with left and right exchanged."""
+    if not may_be_mirrored(placed):
+        return False
+    few = placed.hinted and placed.support.shape[1] == len(group.some)
+    flipped = mirrored(group.pictures(pictures, group.some if few else group.rows))
+    if not is_mirrored(placed, place_camera(flipped, search.n_legs, MIRRORED_STARTS)):
+        return False
+    if not (placed.along_edges and placed.is_convincing):
+        return True
+    # Pairs say little of a view that is placed by other edges.
+    none = CameraPoses.none(search.n_legs)
+    other = _by_edges(search, group, pictures, none, is_flipped=True)
+    return other.along_edges >= MIRRORED_EDGES * placed.along_edges
 
 
 def _decided_by_outlines(
-    search: Search, pictures: Mapping[int, Picture], task: tuple[Group, PoseCandidates]
+    search: Search, group: Group, pictures: Mapping[int, Picture], candidates: PoseCandidates
 ) -> PoseCandidates:
     """Return the poses of a group, first the one of outlines if pairs are ambiguous."""
-    group, candidates = task
     near = candidates.hinted and candidates.is_convincing
     n = len(candidates.poses)
     if n == 0 or near or candidates.is_clear:
@@ -142,7 +188,7 @@ def _decided_by_outlines(
     if fit is None or not _is_decided(trials, candidates, few):
         return replace(candidates, by_outlines=False)
     pose = CameraPoses.one(fit.T_base_group, fit.shift)
-    of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
+    of_group = group.pictures(pictures, list(pictures))
     return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
@@ -158,40 +204,22 @@ def _pictures(
     return pictures
 
 
-class _ByEdges(NamedTuple):
-    """A group that is placed by all edges along legs."""
-
-    group: Group
-    pictures: Mapping[int, Picture]  # by row
-    by_pairs: PoseCandidates | None  # where pairs have it
-    is_mirrored: bool = False  # whether left and right are exchanged
-
-
-def _by_edges(search: Search, task: _ByEdges) -> PoseCandidates:
+def _by_edges(
+    search: Search,
+    group: Group,
+    pictures: Mapping[int, Picture],
+    known: CameraPoses,
+    *,
+    is_flipped: bool = False,  # whether left and right are exchanged
+) -> PoseCandidates:
     """Return the camera of a group by all edges along legs in a few of its pictures."""
-    group, pictures, by_pairs, is_mirrored = task
+    known = CameraPoses.rigid(known.R, known.t, search.n_legs)
     rows = sorted(group.rows, key=lambda row: -pictures[row].pairs.best_merit)[:SOME_PICTURES]
-    known = CameraPoses.none(search.n_legs)
-    if by_pairs is not None and len(by_pairs.poses):
-        known = CameraPoses.rigid(by_pairs.poses.R, by_pairs.poses.t, search.n_legs)
     maps, some = search.edge_maps(rows), group.pictures(pictures, rows)
-    if is_mirrored:
+    if is_flipped:
         maps = maps.mirrored(np.array([one.corners[:, 0].mean() for one in some]))
         some = mirrored(some)
     return place_by_edges(some, maps, search.n_legs, known)
-
-
-def _anywhere(
-    groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], run: Run
-) -> list[PoseCandidates]:
-    """Return the cameras of groups by pictures of them, searched for anywhere."""
-    return list(run(partial(_place, groups, n_legs, starts), range(len(groups))))
-
-
-def _place(
-    groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], group: int
-) -> PoseCandidates:
-    return place_camera(groups[group], n_legs, starts)
 
 
 def _better(near: PoseCandidates, anywhere: PoseCandidates) -> PoseCandidates:
@@ -221,11 +249,9 @@ class _Trial:
 def _measure_at(search: Search, group: Group, candidates: PoseCandidates, i: int) -> _Trial:
     """Measure outlines at a pose, and fit it to them."""
     shift, n_views = candidates.poses.shift[i], len(search.measurements.views)
-    T: list[RigidTransform | None] = [None] * n_views
-    for v in group.views:
-        T[v] = candidates.pose(i) * group.T_group_camera[v]
+    T = dict.fromkeys(range(n_views)) | group.cameras(candidates.pose(i))
     error = min(POSE_JOINT_ERROR, search.joint_error)
-    placement = Placement(search.A_base, search.B_base, tuple(T), error)
+    placement = Placement(search.A_base, search.B_base, tuple(T.values()), error)
     shifts = np.broadcast_to(shift, (n_views, *shift.shape)).copy()
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
@@ -280,50 +306,6 @@ def _gap(one: Array, other: Array) -> float:
     along = other[1] - other[0]
     step = one.mean(axis=0) - other[0]
     return float(abs(along[0] * step[1] - along[1] * step[0]) / np.linalg.norm(along))
-
-
-def _gathered(
-    search: Search,
-    hints: Sequence[RigidTransform | None],
-    groups: Sequence[Group],
-    pictures: Mapping[int, Picture],
-    placed: Sequence[PoseCandidates],
-    run: Run,
-) -> Placement:
-    """Assemble the placement of all views, with the causes of unplaced ones."""
-    views = search.measurements.views
-    T, unplaced = list(hints), dict[str, NotPlaced]()
-    shift = np.zeros((len(views), search.n_legs, 2, 3))
-    error: Array = np.full((len(views), search.n_legs), search.joint_error)
-    unclear = [g for g, one in enumerate(placed) if may_be_mirrored(one)]
-    flipped = []
-    for g in unclear:  # those pictures by which it was placed, with left and right exchanged
-        few = placed[g].hinted and placed[g].support.shape[1] == len(groups[g].some)
-        rows = groups[g].some if few else groups[g].rows
-        flipped.append(mirrored(groups[g].pictures(pictures, rows)))
-    mirrors = _anywhere(flipped, search.n_legs, MIRRORED_STARTS, run)
-    exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(placed[g], m)}
-    # Pairs say little of views that are placed by other edges.
-    doubted = [g for g in sorted(exchanged) if placed[g].along_edges and placed[g].is_convincing]
-    others = [_ByEdges(groups[g], pictures, None, is_mirrored=True) for g in doubted]
-    for g, other in zip(doubted, run(partial(_by_edges, search), others), strict=True):
-        if other.along_edges < MIRRORED_EDGES * placed[g].along_edges:
-            exchanged.remove(g)
-    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
-        names = [views[v].name for v in group.views]
-        if g in exchanged or not one.is_convincing:
-            hinted, mirror = group.hint is not None, g in exchanged
-            why = NotPlaced(group_name(names), _why_not_placed(one, hinted, is_mirrored=mirror))
-            unplaced |= dict.fromkeys(names, why)
-            for v in group.views:
-                T[v] = None
-            continue
-        for v in group.views:
-            T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
-            seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, search.joint_error)
-    placement = Placement(search.A_base, search.B_base, tuple(T), error)
-    return replace(placement.shifted(search, shift), unplaced=unplaced)
 
 
 def _why_not_placed(placed: PoseCandidates, hinted: bool, *, is_mirrored: bool) -> Cause:

@@ -43,7 +43,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import main_cylinders
 from legcal.perception.outline import Method, measure, measure_outlines
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
-from legcal.perception.placement import Group, NotPlaced, Placement, Search
+from legcal.perception.placement import Group, Placement, Search
 from legcal.perception.tuning import EVIDENCE, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
@@ -563,11 +563,11 @@ def _placed_by_fits(
     search: Search, groups: Sequence[Group], placement: Placement, fits: Fits
 ) -> Placement:
     """Return cameras and joint centres by the fits; other groups stay as recognised."""
-    T, shift = list(placement.T_base_camera), placement.shift.copy()
+    T, shift = dict(enumerate(placement.T_base_camera)), placement.shift.copy()
     for group, fit in zip(groups, fits, strict=True):
         if fit is not None:
-            for v in group.views:
-                T[v], shift[v] = fit.T_base_group * group.T_group_camera[v], fit.shift
+            T |= group.cameras(fit.T_base_group)
+            shift[group.views] = fit.shift
     recognised = placement.shifted(search, shift)
     A, B = placement.A_base.copy(), placement.B_base.copy()
     for group, fit in zip(groups, fits, strict=True):
@@ -575,20 +575,19 @@ def _placed_by_fits(
         if fit is not None:
             joints = fit.joints(search.A_base, search.B_base)
         A[group.rows], B[group.rows] = (X[group.rows] for X in joints)
-    return replace(recognised, T_base_camera=tuple(T), A_base=A, B_base=B)
+    return replace(recognised, T_base_camera=tuple(T.values()), A_base=A, B_base=B)
 
 
 def _without_weak_views(
     search: Search, groups: Sequence[Group], placement: Placement, fits: Fits
 ) -> Placement:
     """Return cameras without those for which hardly an outline speaks, near no rough pose."""
-    T, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
+    T, unplaced = dict(enumerate(placement.T_base_camera)), dict(placement.unplaced)
     for group, fit in zip(groups, fits, strict=True):
         least = WEAK * min_evidence(group)
         is_sure = fit is not None and fit.is_determined and fit.evidence >= least
         if group.hint is not None or T[group.views[0]] is None or is_sure:
             continue
-        names = [search.measurements.views[v].name for v in group.views]
         n, n_images = 0 if fit is None else int(fit.n_outlines.sum()), len(group.rows)
         why = Cause(
             "its camera could not be placed: found only {} outlines that agree in its {} image"
@@ -596,15 +595,9 @@ def _without_weak_views(
             "other readings, in better light, or a rough T_base_camera.",
             (n, n_images),
         )
-        unplaced |= dict.fromkeys(names, NotPlaced(group_name(names), why))
-        for v in group.views:
-            T[v] = None
-    return replace(placement, T_base_camera=tuple(T), unplaced=unplaced)
-
-
-def group_name(names: Sequence[str]) -> str:
-    """Return the name of a view, or of a group."""
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+        unplaced |= group.not_placed(search.measurements, why)
+        T |= dict.fromkeys(group.views)
+    return replace(placement, T_base_camera=tuple(T.values()), unplaced=unplaced)
 
 
 def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outlines) -> Array:

@@ -75,7 +75,7 @@ def legs_in_image(
         return np.asarray(free.all(axis=-1))
 
     seen = visible_parts(camera, T_base_camera, bodies, are_clear=are_clear, n_along=samples)
-    return seen.chosen(shares(seen, len(legs))[seen.is_arm.astype(np.intp), seen.leg] >= least)
+    return seen.choose(shares(seen, len(legs))[seen.is_arm.astype(np.intp), seen.leg] >= least)
 
 
 def shares(seen: Seen, n_legs: int) -> Array:
@@ -148,7 +148,7 @@ def take_images(
         views = [legs_in_image(legs, posed_machines[p], camera, T) for p in poses]
         if viewpoint.legs is not None:
             named = np.array([leg.name in viewpoint.legs for leg in legs])
-            views = [view.chosen(named[view.leg]) for view in views]
+            views = [view.choose(named[view.leg]) for view in views]
         if all(view.is_arm.all() for view in views):
             problems.append(_sees_nothing(viewpoint.name, legs))
         for p, view in zip(poses, views, strict=True):

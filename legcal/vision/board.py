@@ -234,10 +234,6 @@ class ChessboardEntry(_BoardEntry):
             )
         return self
 
-    def board(self) -> Board:
-        """Return the board."""
-        return Board("chessboard", self.squares_x, self.squares_y, self.square)
-
 
 class CharucoEntry(_BoardEntry):
     """A ChArUco board: markers in the white squares of a chessboard."""
@@ -281,18 +277,6 @@ class CharucoEntry(_BoardEntry):
             )
         return self
 
-    def board(self) -> Board:
-        """Return the board."""
-        return Board(
-            "charuco",
-            self.squares_x,
-            self.squares_y,
-            self.square,
-            marker=self.marker,
-            dictionary=self.dictionary,
-            legacy=self.legacy_pattern,
-        )
-
 
 class AprilgridEntry(_BoardEntry):
     """An AprilGrid as Kalibr prints it."""
@@ -324,17 +308,6 @@ class AprilgridEntry(_BoardEntry):
             )
         return self
 
-    def board(self) -> Board:
-        """Return the board."""
-        return Board(
-            "aprilgrid",
-            self.tags_x,
-            self.tags_y,
-            self.tag_size,
-            spacing=self.tag_spacing,
-            dictionary=APRIL_TAGS,
-        )
-
 
 class CirclesEntry(FileSchema):
     """A grid of dark circles, in the words of ``--board``."""
@@ -353,10 +326,6 @@ class CirclesEntry(FileSchema):
                 "needed gaps between them; exchange distance and diameter, or correct them."
             )
         return self
-
-    def board(self) -> Board:
-        """Return the board."""
-        return Board(self.kind, self.circles_x, self.circles_y, self.distance, self.diameter)
 
 
 class _ForeignTarget(FileSchema):
@@ -441,7 +410,7 @@ def _markers(board: Board) -> str:
 def parse_board(mapping: Any, path: Path) -> FixedBoard:
     """Return the board that one mapping describes; it may not look like itself turned."""
     entry = _entry(mapping, path)
-    board = entry.board()
+    board = _board(entry)
     if board.kind == "chessboard" and board.columns % 2 == board.rows % 2:
         raise DatasetError(
             f"{path}: board could not be used: found a chessboard of {board.columns} x "
@@ -482,15 +451,18 @@ def _entry(mapping: Any, path: Path) -> ChessboardEntry | CharucoEntry | Aprilgr
 
 def board_document(board: Board) -> dict[str, Any]:
     """Return the block of ``dataset.yaml`` for a board, without its pose."""
-    n = (board.columns, board.rows)
-    if board.kind == "aprilgrid":
-        sizes = {"tag_size": board.side, "tag_spacing": board.spacing}
-        return {"kind": board.kind, "tags_x": n[0], "tags_y": n[1], **sizes}
-    squares = {"kind": board.kind, "squares_x": n[0], "squares_y": n[1], "square": board.side}
-    if board.kind == "chessboard":
-        return squares
-    legacy = {"legacy_pattern": True} if board.legacy else {}
-    return {**squares, "marker": board.marker, "dictionary": board.dictionary, **legacy}
+    values = {key: getattr(board, _FIELDS[key]) for key in _KEYS[board.kind]}
+    if not board.legacy:
+        values.pop("legacy_pattern", None)
+    return {"kind": board.kind, **values}
+
+
+def _board(entry: ChessboardEntry | CharucoEntry | AprilgridEntry | CirclesEntry) -> Board:
+    """Return the board of a block."""
+    values = {_FIELDS[key]: getattr(entry, key) for key in _KEYS[entry.kind]}
+    if entry.kind == "aprilgrid":
+        values["dictionary"] = APRIL_TAGS
+    return Board(entry.kind, **values)
 
 
 FORMS = {
@@ -508,6 +480,16 @@ _KEYS = {
     "aprilgrid": ("tags_x", "tags_y", "tag_size", "tag_spacing"),
     "circles": ("circles_x", "circles_y", "distance", "diameter"),
     "asymmetric_circles": ("circles_x", "circles_y", "distance", "diameter"),
+}
+# The fields of a board by these keys
+_FIELDS = {
+    **dict.fromkeys(("squares_x", "tags_x", "circles_x"), "columns"),
+    **dict.fromkeys(("squares_y", "tags_y", "circles_y"), "rows"),
+    **dict.fromkeys(("square", "tag_size", "distance"), "side"),
+    **dict.fromkeys(("marker", "diameter"), "marker"),
+    "tag_spacing": "spacing",
+    "dictionary": "dictionary",
+    "legacy_pattern": "legacy",
 }
 _USUAL_SQUARE = 0.025  # [m]: the size does not matter to a camera
 _COUNTS = re.compile(r"(\d{1,4})[xX](\d{1,4})", re.ASCII)
@@ -543,8 +525,8 @@ def board_of(spec: str | Path | Board) -> Board:
         block.setdefault("square", _USUAL_SQUARE)
     try:
         if kind not in _KINDS:  # datasets have no circles
-            return validate(CirclesEntry, block, Path(_OPTION), "board").board()
-        return _entry(block, Path(_OPTION)).board()
+            return _board(validate(CirclesEntry, block, Path(_OPTION), "board"))
+        return _board(_entry(block, Path(_OPTION)))
     except DatasetError as error:
         raise UsageError(error.facts) from error
 
@@ -557,7 +539,7 @@ def read_board_file(path: Path) -> Board:
     document = read_yaml(path, "board file")
     block = document.get("board")
     if isinstance(block, dict):
-        return _entry(block, path).board()
+        return _board(_entry(block, path))
     if "target_type" in document or "tagCols" in document:
         return _kalibr_target(document, path)
     raise DatasetError(
@@ -573,7 +555,7 @@ def _kalibr_target(document: Mapping[str, Any], path: Path) -> Board:
         grid = validate(KalibrAprilgrid, document, path)
         sides = {"tag_size": grid.tagSize, "tag_spacing": grid.tagSpacing}
         numbers = {"tags_x": grid.tagCols, "tags_y": grid.tagRows, **sides}
-        return _entry({"kind": kind, **numbers}, path).board()
+        return _board(_entry({"kind": kind, **numbers}, path))
     if kind != "checkerboard":
         raise DatasetError(
             f"{path}: target_type could not be used: found {describe(kind)}, needed aprilgrid or "

@@ -215,6 +215,14 @@ class Camera:
         x, y = self.width - 1.0, self.height - 1.0
         return np.array([[0.0, 0.0], [x, 0.0], [0.0, y], [x, y]])
 
+    def grid(self, n_columns: int, n_rows: int) -> Array:
+        """Return pixels (n, 2) all over the image at even distances, row by row."""
+        u, v = (
+            np.linspace(0.0, self.width - 1.0, n_columns),
+            np.linspace(0.0, self.height - 1.0, n_rows),
+        )
+        return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
     def reaches(self, pixels: Array) -> BoolArray:
         """Return a mask (n,) of pixels (n, 2) that have a ray: none where the lens folds back."""
         off = np.linalg.norm(self.distort(self.undistort(pixels)) - pixels, axis=1)

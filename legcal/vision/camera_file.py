@@ -861,9 +861,7 @@ def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
 
     Least squares of pixels all over the image; the largest distance between them is returned.
     """
-    u = np.linspace(0.0, camera.width - 1.0, _SIDES[0])
-    v = np.linspace(0.0, camera.height - 1.0, _SIDES[1])
-    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    pixels = camera.grid(*_SIDES)
     pixels = pixels[camera.reaches(pixels)]
     xy = camera.undistort(pixels)
     rays = np.column_stack([xy, np.ones(len(xy))])

@@ -22,6 +22,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import moment
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm, main_cylinders
 from legcal.machine.rods import arms_at, ends_in_base, readings_of_rods
@@ -320,6 +321,22 @@ def rays_past_axes(
     return distance, depth, of_A + along * (along + 2.0 * from_foot) - depth**2
 
 
+def _before(
+    P_camera: Array,  # (..., n, 3) points [m]
+    A: Array,  # (..., n_legs, 3) one end of each leg [m]
+    u: Array,  # (..., n_legs, 3) its unit direction
+    length: Array,  # (..., n_legs) [m]
+    radius: Array,  # (n_legs,) [m]
+    margin: Array,  # (..., n) angles by which rays to points must pass a leg [rad]
+) -> BoolArray:
+    """Return a mask (..., n, n_legs) of the legs in front of points, own ones as well."""
+    distance, depth, square = rays_past_axes(P_camera, A, u, length)
+    reach = radius + margin[..., None] * depth
+    return np.asarray(
+        (reach > 0.0) & (square < reach**2) & (depth > 0.0) & (depth < distance[..., None])
+    )
+
+
 def hidden_by(
     legs: Sequence[PredictedLeg],
     leg_of_point: IntArray,  # (n,) the leg to whose outline each point belongs
@@ -330,11 +347,8 @@ def hidden_by(
     u, A, B = (
         np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in legs), strict=True)
     )
-    length = np.linalg.norm(B - A, axis=1)
     radius = np.array([max(segment.radius for segment in other_leg.segments) for other_leg in legs])
-    distance, depth, square = rays_past_axes(P_camera, A, u, length)
-    reach = radius + margin[:, None] * depth
-    hides = (reach > 0.0) & (square < reach**2) & (depth < distance[:, None])
+    hides = _before(P_camera, A, u, np.linalg.norm(B - A, axis=1), radius, margin)
     front = np.full(len(P_camera), -1, dtype=np.intp)
     for k, other_leg in enumerate(legs):
         front[hides[:, k] & (leg_of_point != other_leg.leg)] = other_leg.leg
@@ -421,7 +435,7 @@ class Bodies:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Seen(Table):
     """The n visible segments of legs and arms in images of one camera."""
 
     image: IntArray  # (n,)
@@ -435,22 +449,8 @@ class Seen:
 
     def only(self, image: int) -> Seen:
         """Select the segments of one image."""
-        seen = self.chosen(self.image == image)
+        seen = self.choose(self.image == image)
         return replace(seen, image=np.zeros_like(seen.image))
-
-    def chosen(self, mask: BoolArray) -> Seen:
-        """Select some of the segments."""
-        selected = np.flatnonzero(mask)
-        return Seen(
-            self.image[selected],
-            self.leg[selected],
-            self.is_arm[selected],
-            tuple(self.part[i] for i in selected),
-            self.h[selected],
-            self.ends[selected],
-            self.span[selected],
-            self.length_px[selected],
-        )
 
     def visible_legs(self, n_images: int, n_legs: int) -> BoolArray:
         """Return a mask of the legs in each image, (n_images, n_legs)."""
@@ -520,7 +520,12 @@ def _hidden(bodies: Bodies, P: Array, body: IntArray, radius: Array) -> BoolArra
     """Return a mask of the points P (n_images, n_parts, m, 3) of parts that something hides."""
     largest_radius = np.zeros(len(bodies.leg))
     np.maximum.at(largest_radius, body, radius)
-    hidden = _behind_others(P, body, radius, bodies.A, *bodies.axes, largest_radius)
+    # A ray to the edge of a body itself passes at its radius, as far as the other is nearer.
+    flat = P.reshape(len(P), -1, 3)
+    beside = np.repeat(radius, P.shape[2]) / np.linalg.norm(flat, axis=-1)
+    hides = _before(flat, bodies.A, *bodies.axes, largest_radius, beside)
+    hides &= np.repeat(body, P.shape[2])[:, None] != np.arange(bodies.A.shape[1])
+    hidden: BoolArray = np.any(hides, axis=-1).reshape(P.shape[:-1])
     own_leg, beside = (
         np.repeat(x, N_ALONG_PART) for x in (np.where(body < bodies.n_legs, body, -1), radius)
     )
@@ -558,25 +563,6 @@ def _parts(
                 start[k, i], end[k, i] = segment.start, segment.end
     leg = np.array([j for j, _ in index], dtype=np.intp)
     return leg, [link for _, link in index], np.array(radius), start, end
-
-
-def _behind_others(
-    P: Array,  # (k, n_parts, m, 3)
-    own: IntArray,  # (n_parts,)
-    radius: Array,  # (n_parts,)
-    A: Array,  # (n_images, n, 3)
-    u: Array,  # (k, n, 3)
-    length: Array,  # (k, n)
-    of_body: Array,  # (n,) the largest radius that is seen
-) -> BoolArray:
-    """Mask of points occluded by another leg or arm, at least partly."""
-    rays = rays_past_axes(P.reshape(len(P), -1, 3), A, u, length)
-    distance, depth, square = (x.reshape(*P.shape[:-1], *x.shape[2:]) for x in rays)
-    # A ray to the edge of a body itself passes at its radius, as far as the other is nearer.
-    beside = radius[:, None, None] * depth / distance[..., None]
-    hides = (square < (of_body + beside) ** 2) & (depth > 0.0) & (depth < distance[..., None])
-    hides &= own[:, None, None] != np.arange(A.shape[1])
-    return np.asarray(hides.any(axis=-1))
 
 
 def behind_plate(P: Array, joints: Array, thick: float, *, surely: bool = True) -> BoolArray:

@@ -37,23 +37,23 @@ from legcal.data.photograph_notes import differences, recorded
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import describe
-from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import SHEET, BoardImages
 from legcal.perception.board_corners import (
     NumberedCorners,
     SeenBoard,
     board_in_words,
     describe_image,
-    search_board,
+    search_images,
     shown_board,
     tags_are_mirrored,
 )
-from legcal.progress import Progress, Report, shown_progress
+from legcal.progress import Progress, shown_progress
 from legcal.vision.board import Board, board_of
 from legcal.vision.camera import Camera
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.image_file import (
     BadImage,
+    Grey,
     ImageFacts,
     ImageSize,
     image_size,
@@ -63,9 +63,9 @@ from legcal.vision.image_file import (
     read_image,
 )
 from legcal.vision.point_pose import on_a_line
-from legcal.workers import Run, Workers, worker_pool
+from legcal.workers import Workers, worker_pool
 
-_STAGE, _ADJUSTING = "Searching the board", "Adjusting the camera"
+_ADJUSTING = "Adjusting the camera"
 _N_DESCRIBED = 2  # images without the board that are described
 # smallest motion of the board between two images, relative to its diagonal, and smallest change of
 # its shape where it is shifted by less than the last number
@@ -131,7 +131,9 @@ def calibrate_camera(
     )
     with shown_progress(progress) as report:
         with worker_pool(workers) as run:
-            board_images = _search(stated, photographs, run, report)
+            paths = tuple(path.absolute() for path in photographs.paths)
+            load = replace(photographs, paths=paths).read  # in any process
+            board_images = search_images(stated, load, range(len(paths)), run, report)
         board_in_images = _shown_in(stated, photographs, board_images)
         report(_ADJUSTING, 0, 1)
         table, size = board_in_images.table, photographs.size
@@ -180,10 +182,9 @@ class _Photographs:
     facts: tuple[ImageFacts, ...]  # metadata of each file
     size: ImageSize
 
-    def read(self, k: int) -> Array:
+    def read(self, k: int) -> Grey:
         """Return the grey levels of photograph k."""
-        blank = Camera(np.eye(3), self.size.width, self.size.height)
-        return np.asarray(read_image(self.paths[k], blank))
+        return read_image(self.paths[k], Camera(np.eye(3), self.size.width, self.size.height))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,27 +212,6 @@ class _ShownBoard:
             np.concatenate([corners.sigma_px for corners in tables]),
             0.5 * self.board.marker if self.board.has_circles else 0.0,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _CornerSearch:
-    """The search of an image, for any process."""
-
-    board: Board
-    photographs: _Photographs
-
-    def __call__(self, k: int) -> SeenBoard:
-        return search_board(self.board, self.photographs.read(k))
-
-
-def _search(board: Board, photographs: _Photographs, run: Run, progress: Report) -> list[SeenBoard]:
-    n, results = len(photographs.paths), list[SeenBoard]()
-    progress(_STAGE, 0, n)
-    anywhere = replace(photographs, paths=tuple(path.absolute() for path in photographs.paths))
-    for result in run(_CornerSearch(board, anywhere), range(n)):
-        results.append(result)
-        progress(_STAGE, len(results), n)
-    return results
 
 
 def _shown_in(

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtri
 
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of, readjust
@@ -58,20 +57,17 @@ _LEAST_SCATTER_PX = 1e-4  # standard deviation of exact corners
 _MIN_INLIERS = 0.6  # smallest share of inlier corners in a used image
 
 
-@dataclass(frozen=True, eq=False)
-class _Agreement:
-    adjusted: AdjustedBoard  # camera fitted to these; poses and residuals of all images
-    left_out: dict[int, str]  # the other images with their faults
-    rival: tuple[int, ...]  # other images that agree among themselves
-
-
 def _agreeing_images(
     corners: BoardImages,
     size: ImageSize,
     model: DistortionModel,
     first: AdjustedBoard | None = None,  # adjustment to all images, if there is one
-) -> _Agreement | None:
-    """Return the largest group of images that agree on a camera; None if no fit succeeds."""
+) -> tuple[AdjustedBoard, dict[int, str], tuple[int, ...]] | None:
+    """Return the largest group of images that agree on a camera; None if no fit succeeds.
+
+    The camera fitted to these, with poses and residuals of all images; the other images with their
+    faults; those of them that agree among themselves.
+    """
     n = int(corners.image[-1]) + 1
     largest = _largest(corners, size, model, first)
     if largest is None:
@@ -79,14 +75,14 @@ def _agreeing_images(
     adjusted, group = largest
     others = np.flatnonzero(~group)
     if not len(others):
-        return _Agreement(adjusted, {}, ())
+        return adjusted, {}, ()
     rival: tuple[int, ...] = ()
     if len(others) >= _RIVAL:
         part, numbers = part_of(corners, np.isin(corners.image, others), n)
         second = _largest(part, size, model)
         if second is not None and np.count_nonzero(second[1]) >= _RIVAL:
             rival = tuple(np.array(numbers)[second[1]].tolist())
-    return _Agreement(adjusted, _reasons(adjusted, corners, group), rival)
+    return adjusted, _reasons(adjusted, corners, group), rival
 
 
 def _largest(
@@ -275,12 +271,8 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
         i: [name for name, fault in of_image.items() if fault.gain > _EXPLAINED]
         for i, of_image in faults.items()
     }
-    # The simplest fault wins; among equally simple ones, the most frequent.
     every = [name for names in candidates.values() for name in names]
-    likeliest = {
-        i: min(names, key=lambda name: (name in _FREE, -every.count(name)), default="")
-        for i, names in candidates.items()
-    }
+    likeliest = {i: max(names, key=every.count, default="") for i, names in candidates.items()}
     reasons = {}
     in_group = corners.px[group[corners.image]]
     for i, name in likeliest.items():
@@ -306,7 +298,9 @@ def _reasons(adjusted: AdjustedBoard, corners: BoardImages, group: BoolArray) ->
                 "stabilisation or another crop"
             )
         elif name:
-            reasons[i] = _IN_WORDS[name]
+            reasons[i] = (
+                "another distortion of the lens than in the others, as where a program corrects it"
+            )
         else:
             rms = [adjusted.rms_px(mask) for mask in (corners.image == i, group[corners.image])]
             reasons[i] = (
@@ -326,11 +320,6 @@ def _is_outside(px: Array, others: Array) -> bool:
 
 _FREE = {"zoom": slice(0, 2), "shift": slice(2, 4), "lens": slice(4, 6)}  # of intrinsics
 _LIKE_A_LENS = ("", "zoom", "lens")  # faults like those of a wrong lens model
-_IN_WORDS = {
-    "turned": "turned by half a turn after it was taken",
-    "mirrored": "mirrored",
-    "lens": "another distortion of the lens than in the others, as where a program corrects it",
-}
 
 
 def _faults(
@@ -340,13 +329,7 @@ def _faults(
     camera, T, of_image = adjusted.camera, adjusted.T_camera_board[i], corners.image == i
     points, sheet = corners.points[of_image], adjusted.sheet or Sheet.flat(corners.points)
     only = np.zeros(len(points), dtype=np.intp)
-    image = BoardImages(
-        only,
-        sheet.placed(points)[0],
-        corners.px[of_image],
-        corners.sigma_px[of_image],
-        corners.radius,
-    )
+    image = replace(corners.choose(of_image), image=only, points=sheet.placed(points)[0])
     plain = adjust_board(camera, [T], image)
     if plain is None:
         return {}
@@ -364,18 +347,6 @@ def _faults(
                 return
         faults[name] = _Fault((plain.cost - variant.cost) / excess, change)
 
-    # Undo the rotation or mirroring of the image; corner numbers are those of the mirrored board.
-    far = np.array([camera.width - 1.0, camera.height - 1.0])
-    for name, sides in (("turned", [-1.0, -1.0, 1.0]), ("mirrored", [-1.0, 1.0, 1.0])):
-        side = np.array(sides)
-        flip = np.array([side.prod(), 1.0, 1.0])
-        to_there = sheet.middle[0] * (1.0 - flip)
-        R = T.rotation.as_matrix()
-        t = side * (T.translation + R @ to_there)
-        pose = RigidTransform.from_components(t, Rotation.from_matrix(side[:, None] * R * flip))
-        px = np.where(side[:2] < 0.0, far - image.px, image.px)
-        back = replace(image, points=sheet.placed(points * flip + to_there)[0], px=px)
-        add(name, adjust_board(camera, [pose], back, tolerance=tolerance))
     for name, free in _FREE.items():
         names = intrinsic_names(camera)[free]
         add(name, adjust_board(camera, [T], image, names, tolerance=tolerance))
@@ -423,7 +394,7 @@ def robust_fit(
     agreed = _agreeing_images(corners, size, model, first)
     if agreed is None:
         return None
-    adjusted, left_out = agreed.adjusted, dict(agreed.left_out)
+    adjusted, left_out, rival = agreed
     poses = list(adjusted.T_camera_board)
     is_kept = ~np.isin(corners.image, list(left_out))
     for _ in range(_MOST_ROUNDS):
@@ -464,7 +435,7 @@ def robust_fit(
         part,
         images,
         left_out,
-        agreed.rival,
+        rival,
         int(np.count_nonzero(~is_kept & others)),
         ratio,
         adjusted.clusters.covariance(ratio),

@@ -137,7 +137,7 @@ def refuse_undetermined(fit: RobustFit, names: Sequence[str], left_out: Sequence
             f"{np.degrees(tilts(fit).max()):.0f} deg out of the image plane and at most "
             f"{np.degrees(spread(fit)):.0f} deg to each other, which leave the focal length open "
             f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
-            f"board by 30 deg and more{_missing_tilts(fit)}."
+            "board by 30 deg and more to all sides."
         )
     if (angle := camera.turns_back) is not None:
         raise NotIdentifiable(
@@ -226,7 +226,7 @@ def warnings(fit: RobustFit) -> list[str]:
             f"The focal length is weakly determined, to {100.0 * focal:.2g} % ({sigma[0]:.2g} px): "
             f"the boards are tilted by at most {np.degrees(tilt):.0f} deg out of the image plane "
             f"and {np.degrees(largest_angle):.0f} deg to each other; tilt them by 30 deg and more"
-            f"{_missing_tilts(fit)}."
+            " to all sides."
         )
     share = coverage(fit.corners.px, camera)
     if share < _MIN_COVERAGE:
@@ -304,22 +304,6 @@ def _uncovered_parts(fit: RobustFit) -> str:
     images = [len(set(fit.corners.image[number == k].tolist())) for k in range(9)]
     unseen = [name for name, n in zip(_PARTS, images, strict=True) if n < _IMAGES_OF_PART]
     return ", ".join(unseen) or "every edge and corner"
-
-
-def _missing_tilts(fit: RobustFit) -> str:
-    """Return the directions without tilted boards, as the end of a sentence; "" without any."""
-    normal = np.array([T.rotation.as_matrix()[:, 2] for T in fit.adjusted.T_camera_board])
-    towards = -normal * np.sign(normal[:, 2:])  # normal towards the camera
-    slant = np.degrees(np.arctan2(towards[:, :2], -towards[:, 2:]))
-    least = float(np.degrees(_MIN_TILT))
-    farther = {
-        "right": slant[:, 0].max() < least,
-        "left": slant[:, 0].min() > -least,
-        "lower": slant[:, 1].max() < least,
-        "upper": slant[:, 1].min() > -least,
-    }
-    missing = [side for side, lacks in farther.items() if lacks]
-    return f", also with the {' and the '.join(missing)} side farther away" if missing else ""
 
 
 def _folding(camera: Camera) -> list[str]:

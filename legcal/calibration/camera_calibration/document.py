@@ -16,7 +16,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from legcal.brief import brief
 from legcal.calibration.camera_calibration.diagnostics import Repeats, coverage, covered
-from legcal.calibration.camera_calibration.projection import GRID, finite, grid, projection_sigma
+from legcal.calibration.camera_calibration.projection import GRID, finite, projection_sigma
 from legcal.files.folder import OutputFile
 from legcal.files.schema import Document
 from legcal.geometry.types import Array
@@ -125,24 +125,14 @@ class CameraCalibration:
         """Return the output of ``--json``."""
         sheet = zip(SHEET, self.sheet.tolist(), self.sheet_sigma.tolist(), strict=True)
         numbers = zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True)
-        return CameraDocument(
+        return CameraDocument.describing(
+            self,
             legcal_camera=1,
             model=self.camera.model,
             width=self.camera.width,
             height=self.camera.height,
             intrinsics=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in numbers],
             covariance=self.covariance.tolist(),
-            rms_px=self.rms_px,
-            noise_px=self.noise_px,
-            noise_length_px=self.noise_length_px,
-            effective_corners=self.effective_corners,
-            repeats=self.repeats,
-            coverage=self.coverage,
-            images=list(self.images),
-            warnings=list(self.warnings),
-            lens=self.lens,
-            validated_px=self.validated_px,
-            error_ratio=self.error_ratio,
             projection_sigma_px=[finite(row) for row in self.projection_sigma],
             sheet=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in sheet],
         ).document()
@@ -278,7 +268,7 @@ def _picture(calibration: CameraCalibration) -> NDArray[np.uint8]:
             for p in (middle - scale * mean[drawn], middle + scale * mean[drawn])
         )
         cv2.arrowedLine(canvas, start, end, _RESIDUAL, 2, cv2.LINE_AA, tipLength=0.3)
-    places = grid(camera).reshape(*GRID[::-1], 2)[::_LABELLED, ::_LABELLED].reshape(-1, 2)
+    places = camera.grid(*GRID).reshape(*GRID[::-1], 2)[::_LABELLED, ::_LABELLED].reshape(-1, 2)
     sigmas = calibration.projection_sigma[::_LABELLED, ::_LABELLED].ravel()
     for place, sigma in zip(places, sigmas.tolist(), strict=True):
         label = f"{sigma:.2g}"

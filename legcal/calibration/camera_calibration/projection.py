@@ -22,19 +22,12 @@ _TURNS = 10  # Gauss-Newton steps of the turn between two cameras
 _LEAST_REACHED = 0.5  # of the image, for a comparison of cameras
 
 
-def grid(camera: Camera) -> Array:
-    """Return pixels (n, 2) all over the image, row by row."""
-    u = np.linspace(0.0, camera.width - 1.0, GRID[0])
-    v = np.linspace(0.0, camera.height - 1.0, GRID[1])
-    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-
-
 def projection_sigma(camera: Camera, covariance: Array) -> Array:
-    """Return the standard deviation of the projection at ``grid``, (n,) [px].
+    """Return the standard deviation of the projection at the places of ``GRID``, (n,) [px].
 
     That of the worst direction in the image; infinite where the lens model folds back.
     """
-    pixels = grid(camera)
+    pixels = camera.grid(*GRID)
     reached = camera.reaches(pixels)
     rays = _rays(camera, pixels[reached])
     _, by_ray, J = project_with_derivatives(camera, rays, intrinsic_names(camera))
@@ -144,7 +137,7 @@ def compare_cameras(first: Camera, second: Camera) -> CameraComparison:
             f"The cameras could not be compared: found images of {sizes[0]} and of {sizes[1]}, "
             "needed one size; give two calibrations of one camera."
         )
-    pixels = grid(first)
+    pixels = first.grid(*GRID)
     reached = first.reaches(pixels)
     share = float(np.mean(reached))
     if share < _LEAST_REACHED:

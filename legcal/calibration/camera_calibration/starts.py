@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -137,11 +138,5 @@ def part_of(
     images = sorted(set(corners.image[is_kept].tolist()))
     new = np.full(n_images, -1, dtype=np.intp)
     new[images] = np.arange(len(images))
-    part = BoardImages(
-        new[corners.image[is_kept]],
-        corners.points[is_kept],
-        corners.px[is_kept],
-        corners.sigma_px[is_kept],
-        corners.radius,
-    )
-    return part, tuple(images)
+    part = corners.choose(is_kept)
+    return replace(part, image=new[part.image]), tuple(images)

@@ -38,7 +38,6 @@ from legcal.perception.agreement import (
     Agreement,
     Assumption,
     compare_assumptions,
-    pairs_of_images,
     pairs_of_outlines,
 )
 from legcal.perception.diagnostics import far_off
@@ -250,7 +249,7 @@ class _Judge:
         placement = Placement(nowhere, nowhere, (None,) * len(data.measurements.views))
         search = data.photographs.search(placement, data.edge_pairs)
         missing = [row for row in rows if row not in data.edge_pairs]
-        data.edge_pairs.update(pairs_of_images(search, missing, data.pool))
+        data.edge_pairs.update(zip(missing, data.pool(search.pairs, missing), strict=True))
         self.search = replace(search, edge_pairs={row: data.edge_pairs[row] for row in rows})
         self.pool: list[list[RigidTransform]] = [self.known(g) for g in range(len(groups))]
         self.of_groups = [
