@@ -7,7 +7,7 @@ never reordered later. A job restores the order of the files at its end.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, star
 from legcal.causes import Cause, by_cause
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset
-from legcal.data.image_choice import dataset_at
+from legcal.data.image_choice import dataset_at, images_to_name
 from legcal.data.image_tables import (
     Order,
     canonical_order,
@@ -32,7 +32,7 @@ from legcal.data.measurements import Measurements, few, images_in_words, row_nam
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
 from legcal.geometry.motions import components, product
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import solve_poses
 from legcal.machine.kinematics import followed_poses, platform_in_base, platforms_in_base
 from legcal.machine.leg import Leg
@@ -76,6 +76,7 @@ class OrderedDataset:
     # edge pairs of searched images, by row among all images
     edge_pairs: dict[int, CandidatePairs] = field(default_factory=dict)
     joint_error: float = math.inf  # of joints of the model where stated, of the mean leg length
+    left_out: Collection[int] = ()  # rows among all images that no fit uses
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -117,7 +118,8 @@ class OrderedDataset:
 
     @cached_property
     def _nominal(self) -> tuple[tuple[RigidTransform, ...], Array]:
-        T, residual = nominal_poses(self.machine, self.measurements)
+        unused = [k for k, row in enumerate(self.rows.tolist()) if row in self.left_out]
+        T, residual = nominal_poses(self.machine, self.measurements, unused)
         if not self.seen_poses:
             return T, residual
         rows = self.rows[self.measurements.first_rows].tolist()
@@ -209,7 +211,12 @@ class OrderedDataset:
 
 
 def order_dataset(
-    dataset: Dataset, pool: Run, progress: Report, *, fingerprint: str = ""
+    dataset: Dataset,
+    pool: Run,
+    progress: Report,
+    *,
+    fingerprint: str = "",
+    left_out: BoolArray | None = None,  # (n_rows,): images that no fit will use
 ) -> OrderedDataset:
     """Put a dataset into canonical order, and select the images to be searched.
 
@@ -226,11 +233,12 @@ def order_dataset(
         machine=dataset.machine.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
         rows=np.arange(dataset.measurements.n_rows),
+        left_out=() if left_out is None else np.flatnonzero(left_out[order.rows]).tolist(),
     )
 
 
 def nominal_poses(
-    machine: Machine, measurements: Measurements
+    machine: Machine, measurements: Measurements, unused: Collection[int] = ()
 ) -> tuple[tuple[RigidTransform, ...], Array]:
     """Return T_Rb_Re of a nominal model at the readings, and its largest residual (n_poses,) [m].
 
@@ -242,7 +250,7 @@ def nominal_poses(
     ------
     DatasetError
         If residuals of images exceed 3 % of the mean leg length, or readings of redundant motors
-        contradict each other as much without showing which is wrong.
+        contradict each other as much without showing which is wrong. Not for *unused* rows.
     """
     q = measurements.q_of_poses
     if not machine.is_determined:
@@ -254,11 +262,11 @@ def nominal_poses(
     residual = np.zeros(len(q))
     if unreached:
         residual[unreached] = _solve_anew(machine, q, T, unreached)
-    limit, first = _largest_residual(machine), measurements.first_rows.tolist()
+    limit = _largest_residual(machine)
     T, contradicting = _contradictions(machine, measurements, T)
     refused = {
-        first[k]: Cause(
-            "found {}; check this reading, its encoder and the offset of the leg, or take",
+        k: Cause(
+            "found {}; check this reading, its encoder and the offset of the leg, or leave",
             (contradiction.cause(machine),),
         )
         for k, contradiction in contradicting.items()
@@ -271,21 +279,27 @@ def nominal_poses(
             consistent[:, np.equal(machine.reads, contradiction.legs[0])] = np.nan
             T[k] = _least_squares(machine, consistent, [T[k]])[0][0]
     refused |= {
-        first[k]: Cause(
+        k: Cause(
             "found that the nominal model cannot reach them, with a residual of {:.1f} mm at the "
             "nearest pose, needed at most {:.1f} mm; check these readings, their columns, the "
-            "joints of the model and legcal.home, or take",
+            "joints of the model and legcal.home, or leave",
             (1e3 * float(residual[k]), 1e3 * limit),
         )
         for k in unreached
         if not residual[k] <= limit and k not in contradicting
     }
-    if refused:
+    causes = {
+        row: refused[pose]
+        for row, pose in enumerate(measurements.pose.tolist())
+        if pose in refused and row not in unused
+    }
+    if causes:
         raise DatasetError(
             [
                 f"The readings of {images_in_words(measurements, rows)} could not be used: {cause} "
-                f"the image{'s' * (len(rows) > 1)} out of the tables."
-                for cause, rows in by_cause(refused)
+                f"the image{'s' * (len(rows) > 1)} out (--leave-out "
+                f"{images_to_name(measurements, np.array(rows)[:, None])})."
+                for cause, rows in by_cause(causes)
             ]
         )
     return tuple(T), residual

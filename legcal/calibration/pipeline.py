@@ -205,12 +205,15 @@ def calibrate(
     if zeros := own_zeros(dataset, listed(split), left_out):
         dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
     fitted, held_out = _fitted_and_held_out(dataset, left_out, holdout)
-    identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
+    identify_notes: tuple[str, ...] = ()
+    with suppress(DatasetError):  # readings out of reach are refused below, with likely mistakes
+        identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)
     with shown_progress(progress) as report, worker_pool(workers) as pool:
-        data = order_dataset(dataset, pool, report, fingerprint=key if use_cache else "")
+        use = key if use_cache else ""
+        data = order_dataset(dataset, pool, report, fingerprint=use, left_out=left_out)
         options = Options(choices, None if only else criteria)
         estimate, turned = estimate_teeth(data, fitted, options)
     cache_notes = _store_outlines(data, estimate, key)

@@ -31,7 +31,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
 from legcal.calibration.joint_fit.variables import LegConstraints, State
 from legcal.calibration.tuning import DOUBT_BY_CHANCE
-from legcal.data.image_choice import images_in_words
+from legcal.data.image_choice import images_to_name
 from legcal.data.measurements import Measurements, few_views, row_names
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, normal_equations
@@ -388,8 +388,8 @@ def _side(measurements: Measurements, course: _Course, test: _Test) -> str:
     if hypothesis.kind == "encoder":
         for row in np.flatnonzero(is_known & (course.block < 0)).tolist():
             sides[int(after[row])].append(np.array([row], dtype=np.intp))
-        return images_in_words(measurements, sides[0])
-    return images_in_words(measurements, min(sides, key=lambda side: sum(map(len, side))))
+        return images_to_name(measurements, sides[0])
+    return images_to_name(measurements, min(sides, key=lambda side: sum(map(len, side))))
 
 
 def _runs(view: IntArray, rows: IntArray, chosen: BoolArray) -> Iterator[IntArray]:

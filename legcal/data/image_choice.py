@@ -176,7 +176,7 @@ def _motor_and_images(dataset: Dataset, text: str) -> tuple[str, str]:
     raise UsageError(f"The split {describe(text)} could not be used: {cause}")
 
 
-def images_in_words(measurements: Measurements, parts: Sequence[IntArray]) -> str:
+def images_to_name(measurements: Measurements, parts: Sequence[IntArray]) -> str:
     """Return the text that names rows in order: ranges, of one view or of all."""
     names, view = row_names(measurements), measurements.view
     words = []

@@ -208,10 +208,10 @@ def _column_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 
 
 def _numbering_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield joints of the platform, or of the base, that the model numbers from another one on.
+    """Yield joints of the platform, or of the base, that the model numbers wrongly.
 
-    Base joints with their motors that are some numbers on are platform joints and columns that are
-    as many back.
+    From another one on, or two of them exchanged. Base joints with their motors that are some
+    numbers on are platform joints and columns that are as many back.
     """
     machine = given.machine
     files = inverse(data.order.legs).tolist()  # legs as the files have them
@@ -221,17 +221,23 @@ def _numbering_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistak
     if n < 3 or len({len(group) for group in groups}) > 1:
         return
 
-    def with_platform_joints(k: int) -> Assumed:
+    def with_platform_joints(source: Sequence[int]) -> Assumed:
         legs = list(machine.legs)
         for i, group in enumerate(groups):
-            for j, other in zip(group, groups[(i + k) % n], strict=True):
+            for j, other in zip(group, groups[source[i]], strict=True):
                 end = machine.legs[other]
                 legs[j] = replace(legs[j], B=end.B, platform_axis=end.platform_axis)
         return replace(given, machine=_at_reachable_home(replace(machine, legs=tuple(legs))))
 
+    def with_base_joints(source: Sequence[int], platform: Assumed) -> Assumed:
+        q = given.q.copy()
+        q[:, motors] = given.q[:, [motors[i] for i in source]]
+        return replace(platform, q=q)
+
     turns = {leg.actuator.turns for leg in machine.legs if leg.actuator is not None}
     base = "base joints" if not turns else "arms" if turns == {True} else "carriages"
-    renumbered = [(k, with_platform_joints(k)) for k in range(1, n)]
+    turned = {k: [(i + k) % n for i in range(n)] for k in range(1, n)}
+    renumbered = [(k, with_platform_joints(source)) for k, source in turned.items()]
     # The home that the model states is likelier than one that is solved for.
     for k, true in sorted(renumbered, key=lambda one: one[1].machine.home is not machine.home):
         yield Mistake(
@@ -243,17 +249,28 @@ def _numbering_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistak
             true,
             test=_MOVE_ONE,
         )
-        q = given.q.copy()
-        q[:, motors] = given.q[:, [motors[(i + k) % n] for i in range(n)]]
         yield Mistake(
             "base joints renumbered",
             f"the {base} of the model appear to be turned against the platform ({names[0]} stands "
             f"where {names[k]} should)",
             f"with the {base} renumbered by {n - k}",
             f"correct the numbers of the {base} in the model",
-            replace(true, q=q),
+            with_base_joints(turned[k], true),
             test=_MOVE_ONE,
         )
+    for one, other in combinations(range(n), 2) if n > 3 else ():
+        source = list(range(n))
+        source[one], source[other] = other, one
+        true = with_platform_joints(source)
+        for noun, swapped in (base, with_base_joints(source, true)), ("platform joints", true):
+            yield Mistake(
+                "joints exchanged",
+                f"the {noun} of {names[one]} and {names[other]} appear to be swapped in the model",
+                f"with these {noun} swapped",
+                f"swap these {noun} in the model",
+                swapped,
+                test=_MOVE_ONE,
+            )
 
 
 def _at_reachable_home(machine: Machine) -> Machine:
@@ -570,21 +587,26 @@ def _turned_over(
 
 
 def _handedness_mistake(given: Assumed) -> Iterator[Mistake]:
-    """Yield the joints of a left-handed table."""
+    """Yield the joints of left-handed tables: of all joints, of the base or of the platform."""
     machine = given.machine
-    mirrored = replace(
-        machine,
-        legs=tuple(_mirrored(leg) for leg in machine.legs),
-        home=RigidTransform.from_matrix(_MIRROR_4 @ machine.home.as_matrix() @ _MIRROR_4),
-    )
-    yield Mistake(
-        "handedness",
-        "the model appears mirrored: the y coordinates of its joints have the wrong sign",
-        "with the signs of y reversed",
-        "reverse the signs of all y in the model",
-        replace(given, machine=mirrored),
-        test="compare the signs of y in the model with the order of the legs in an image",
-    )
+    mirrored = tuple(_mirrored(leg) for leg in machine.legs)
+    home = RigidTransform.from_matrix(_MIRROR_4 @ machine.home.as_matrix() @ _MIRROR_4)
+    both = list(zip(machine.legs, mirrored, strict=True))
+    base = [replace(one, B=leg.B, platform_axis=leg.platform_axis) for leg, one in both]
+    platform = [replace(leg, B=one.B, platform_axis=one.platform_axis) for leg, one in both]
+    for of, these, changed in (
+        ("", "all y", replace(machine, legs=mirrored, home=home)),
+        ("base of the ", "y of the base joints", replace(machine, legs=tuple(base))),
+        ("platform of the ", "y of the platform joints", replace(machine, legs=tuple(platform))),
+    ):
+        yield Mistake(
+            f"handedness of the {of}model" if of else "handedness",
+            f"the {of}model appears mirrored: the y coordinates of its joints have the wrong sign",
+            "with the signs of y reversed",
+            f"reverse the signs of {these} in the model",
+            replace(given, machine=_at_reachable_home(changed)),
+            test="compare the signs of y in the model with the order of the legs in an image",
+        )
 
 
 def _mirrored(leg: Leg) -> Leg:
