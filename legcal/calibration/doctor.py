@@ -337,8 +337,10 @@ def _look_at_parameters(checklist: _Checklist, rows: Sequence[int], choices: Cho
         return
     try:
         notes = check_identifiable(dataset_at(checklist.dataset, np.array(rows)), choices)
-    except (NotIdentifiable, DidNotConverge) as error:
+    except (DatasetError, NotIdentifiable, DidNotConverge) as error:
         checklist.checks["parameters"] = "not all of them can be identified"
+        if isinstance(error, DatasetError):  # the model does not reach the readings
+            checklist.checks["parameters"] = "they could not be checked"
         for message in error.problems:
             checklist.add("parameters", "error", message)
         return

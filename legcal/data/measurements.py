@@ -151,23 +151,48 @@ def places(measurements: Measurements) -> list[tuple[str, str]]:
 def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) -> IntArray:
     """Return for each row of a table of images the row of the measurements, -1 where unknown.
 
-    Unknown views and images are refused, unless said otherwise.
+    Unknown views and images are refused, unless said otherwise: images with one sentence a view.
     """
     names = places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
     index = {place: row for row, place in enumerate(names)}
     named = list(zip(table.text("view"), table.text("image"), strict=True))
     rows = np.array([index.get(place, -1) for place in named], dtype=np.intp)
-    for i in np.flatnonzero(rows < 0).tolist() if refuse else ():
-        view, image = named[i]
+    unknown = np.flatnonzero(rows < 0).tolist() if refuse else []
+    for view in dict.fromkeys(named[i][0] for i in unknown):
+        of_view = [i for i in unknown if named[i][0] == view]
         if view not in views:
-            unknown, remedy = f"the unknown view {describe(view)}", closest(view, views)
-            table.refuse(i, unknown, "a view with measurements", "view", remedy=remedy)
-        else:
-            near = closest(image, [name for v, name in names if v == view])
-            needed = f"an image of view {view} in the measurements"
-            table.refuse(i, describe(image), needed, "image", remedy=near)
+            found, remedy = f"the unknown view {describe(view)}", closest(view, views)
+            for i in of_view:
+                table.refuse(i, found, "a view with measurements", "view", remedy=remedy)
+            continue
+        images = list(dict.fromkeys(named[i][1] for i in of_view))
+        found, needed = describe(images[0]), f"an image of view {view} in the measurements"
+        remedy = closest(images[0], [name for v, name in names if v == view])
+        if len(images) > 1:
+            found = f"{few(list(map(describe, images)))} in {len(of_view)} rows"
+            needed = f"images of view {view} in the measurements"
+            remedy = "add their rows to the measurements, or remove theirs from this table"
+        if repeated := _repeated_pose(measurements, view, images):
+            found += f", and two rows of view {view} with pose {repeated} in the measurements"
+            needed = "one row of each pose there, which names an image without a file"
+            remedy = "remove one of these two from the measurements"
+        what = f"{table.thing}{'s' * (len(images) > 1)}"
+        table.refuse(of_view[0], found, needed, "image", remedy=remedy, what=what)
     return rows
+
+
+def _repeated_pose(measurements: Measurements, view: str, images: Sequence[str]) -> str:
+    """Return the pose of two images without names, if *images* of the view are named by poses."""
+    labels = [
+        measurements.pose_labels[pose]
+        for pose, v, image in zip(
+            measurements.pose, measurements.view, measurements.image, strict=True
+        )
+        if measurements.pose_labels and not image and measurements.views[v].name == view
+    ]
+    repeated = [label for label in dict.fromkeys(labels) if label and labels.count(label) > 1]
+    return repeated[0] if repeated and set(images) <= set(labels) else ""
 
 
 def find_legs(table: Table, leg_names: Sequence[str], *, refuse: bool = True) -> IntArray:

@@ -316,7 +316,7 @@ def rows_of_views(data: OrderedDataset) -> list[IntArray]:
 
 
 def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield readings shifted by a row, in all views or in one."""
+    """Yield readings shifted by a row, in all views or in one, and readings in order of text."""
     of_view = rows_of_views(data)
     nonempty = [rows for rows in of_view if len(rows)]
 
@@ -343,6 +343,31 @@ def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
         if len(nonempty) > 1:
             for k in _LATE:
                 yield from moved([rows], k, data.measurements.views[v].name)
+    whole = np.argsort(data.order.rows, kind="stable")
+    for tables in (nonempty, [whole])[: len(nonempty)]:
+        yield from _text_order(tables, given)
+
+
+def _text_order(tables: Sequence[IntArray], given: Assumed) -> Iterator[Mistake]:
+    """Yield readings that are by number where images are sorted as text, or the other way round.
+
+    *tables* are rows that are numbered from 1, in the order of the file.
+    """
+    if all(len(rows) < 10 for rows in tables):
+        return
+    for is_undone in (False, True):
+        q = given.q.copy()
+        for rows in tables:
+            as_text = rows[sorted(range(len(rows)), key=lambda k: str(k + 1))]
+            q[as_text if is_undone else rows] = given.q[rows if is_undone else as_text]
+        yield Mistake(
+            "order of text",
+            "the readings appear to be sorted in another order than the images (1, 10, 11, ..., 2 "
+            "as text against 1, 2, 3, ... as numbers)",
+            "with the readings in the order of the images",
+            "sort both by number, and check which image belongs to which row",
+            replace(given, q=q),
+        )
 
 
 @dataclass(frozen=True, eq=False)
