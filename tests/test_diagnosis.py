@@ -18,6 +18,7 @@ from legcal.calibration.diagnosis.mistakes import Mistake, mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names
+from legcal.errors import DatasetError, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
@@ -236,3 +237,62 @@ def test_a_row_from_which_on_readings_are_late_is_named(
         f"from {row} on, the readings of view c2 appear to be one row late"
     )
     assert found.after > found.before
+
+
+def _base_joints_exchanged(d: Dataset) -> Dataset:
+    """Return the session with the base joints of two legs exchanged in its model."""
+    legs = list(d.machine.legs)
+    for j, other in ((4, 5), (5, 4)):
+        end = d.machine.legs[other]
+        legs[j] = replace(legs[j], A=end.A, base_axis=end.base_axis)
+    return _with_legs(d, legs)
+
+
+def test_joints_exchanged_in_the_model_are_named_before_readings_that_it_cannot_reach(
+    outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    d = _base_joints_exchanged(outlines("hexapod"))
+    kinds = {"joints exchanged", "columns exchanged"}
+    few = [m for m in mistakes(order_dataset(d, in_turn, no_progress)) if m.kind in kinds]
+    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    with pytest.raises(DatasetError) as refused:
+        calibrate(d)
+    first = refused.value.problems[0]
+    assert first.startswith("The base joints of leg5 and leg6 appear to be swapped in the model")
+    (reach,) = map(str, refused.value.consequences)
+    assert "cannot reach" in reach
+    monkeypatch.setattr(diagnosis, "mistakes", lambda _: [])
+    said = reach.partition("--leave-out ")[2].partition(")")[0]
+    calibration = calibrate(d, leave_out=said)  # the other images are fitted
+    assert f"Left out, as asked: {said}." in calibration.notes
+    assert calibration.solution.outlines.used.any()
+
+
+def test_readings_in_the_order_of_text_are_named(
+    outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = outlines("3-upu")
+    q = session.measurements.q.copy()
+    for v in (0, 1):
+        rows = np.flatnonzero(session.measurements.view == v)
+        q[rows[sorted(range(len(rows)), key=lambda k: str(k + 1))]] = q[rows]
+    kinds = {"order of text", "readings shifted"}
+    found = _diagnosed(_with_readings(session, q), lambda one: one.kind in kinds, monkeypatch)
+    assert (found.kind, found.after) == ("order of text", found.images)
+    assert found.before < found.after
+
+
+def test_an_encoder_that_never_moves_is_named_before_what_it_leaves_open(
+    outlines: Callable[[str], Dataset],
+) -> None:
+    session = outlines("delta")
+    motor = session.machine.motors[1]
+    q = session.measurements.q.copy()
+    on_motor = np.equal(session.machine.reads, motor)
+    q[:, on_motor] = q[0, on_motor]
+    d = dataset_at(_with_readings(session, q), np.arange(4))
+    with pytest.raises(NotIdentifiable) as refused:
+        calibrate(d)
+    assert str(session.machine.legs[motor].prismatic) in refused.value.problems[0]
+    assert "the same reading in all rows" in refused.value.problems[0]
+    assert "cannot be identified" in refused.value.problems[1]

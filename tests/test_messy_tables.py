@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import Outcome, run
+from csv_rows import read_rows, write_rows
+from simulated import simulated
 
-from legcal import load_mechanism
+from legcal import load_dataset, load_mechanism
 from legcal.calibration.location.tool_poses import read_tool_poses
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description, assemble
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
-from legcal.errors import ModelError
+from legcal.errors import DatasetError, ModelError
 from legcal.machine.kinematics import forward_kinematics_many
 from legcal.machine.model import Machine, readings_at
 
@@ -360,3 +362,24 @@ def test_what_tables_lack_is_said_once(
     assert all(word in said for word in named), said
     assert "leg2'" not in said or "'leg1'" in said.split("leg2'")[0]
     assert not (tmp_path / "made").exists()
+
+
+def test_rows_of_one_table_without_the_other_are_told_in_a_sentence_with_what_helps(
+    tmp_path: Path,
+) -> None:
+    folder = simulated(tmp_path / "set", "hexapod").folder
+    readings, outlines = folder / "measurements.csv", folder / "observations.csv"
+    rows, seen = read_rows(readings), read_rows(outlines)
+    first, second = (row["pose"] for row in rows[:2])
+
+    write_rows(readings, [rows[0], *rows])
+    with pytest.raises(DatasetError, match=f"two rows of view c1 with pose {first}") as repeated:
+        load_dataset(folder)
+    assert len(repeated.value.problems) == 1
+
+    write_rows(readings, rows[2:])
+    with pytest.raises(DatasetError, match="add their rows") as missing:
+        load_dataset(folder)
+    assert len(missing.value.problems) == 1
+    write_rows(outlines, [row for row in seen if row["image"] not in (first, second)])
+    assert load_dataset(folder).measurements.n_rows == len(rows) - 2

@@ -761,9 +761,7 @@ def _still_encoders(dataset: Dataset) -> list[str]:
     still = np.ptp(m.q[:, motors], axis=0) == 0.0
     if not still.any() or still.all():
         return []
-    columns = [
-        str(machine.legs[j].prismatic) for j, one in zip(motors, still, strict=True) if one
-    ]
+    columns = [str(machine.legs[j].prismatic) for j, one in zip(motors, still, strict=True) if one]
     return [
         f"{dataset.table_path}: found the same reading in all rows of {few(columns)}, while other "
         "encoders move, needed readings that change; if the motor moved, record its readings "
