@@ -296,3 +296,22 @@ def test_an_encoder_that_never_moves_is_named_before_what_it_leaves_open(
     assert str(session.machine.legs[motor].prismatic) in refused.value.problems[0]
     assert "the same reading in all rows" in refused.value.problems[0]
     assert "cannot be identified" in refused.value.problems[1]
+
+
+@pytest.mark.parametrize("kind", ["direction of an encoder", "columns exchanged"])
+def test_readings_that_are_wrong_from_an_image_on_are_named_with_that_image(
+    outlines: Callable[[str], Dataset], kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = outlines("3-upu")
+    q, first = session.measurements.q.copy(), 7  # with all images of the second view
+    if kind == "columns exchanged":
+        q[first:, [0, 1]] = q[first:, [1, 0]]
+    else:
+        q[first:, 0] = sum(session.machine.legs[0].travel) - q[first:, 0]
+    kinds = {"direction of an encoder", "columns exchanged", "images mirrored"}
+    found = _diagnosed(_with_readings(session, q), lambda one: one.kind in kinds, monkeypatch)
+    name = row_names(session.measurements)[first]
+    assert found.kind == kind
+    assert found.what.startswith(f"from {name} of view c1 on, column")
+    assert found.before < found.after
+    assert found.after >= found.images - 1

@@ -23,6 +23,7 @@ from legcal.calibration.diagnosis.mistakes import (
     Mistake,
     as_given,
     joints_of,
+    limited_to,
     mistakes,
     moved_cameras,
     rows_of_views,
@@ -60,6 +61,8 @@ _NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras fi
 _FINALISTS = 6  # mistakes that all images judge
 _SAME_AMOUNT = 2  # of these that differ by how much
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
+_OF_SOME = "columns exchanged", "direction of an encoder"  # that also begin during a session
+_MOST_OF_SOME = 2
 _ONE_ROW = (1, -1)  # by which readings stand late from a row on
 _FINER = (0.5, 0.25)  # steps of an amount between those that are tried
 _SYMMETRIC = 0.03  # of the size of the machine, and the sine of angles
@@ -166,8 +169,10 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
         return ()
+    common = mistakes(data)
     tried = [
-        *mistakes(data),
+        *common,
+        *judge.in_some_images(common),
         *judge.shifted_from_a_row_on(),
         *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
     ]
@@ -279,6 +284,31 @@ class _Judge:
                 if from_on[first] > 0.0:
                     place = of_views[v].tolist().index(order[first])
                     found.append(shifted_from(self.data, self.given, v, place, k))
+        return found
+
+    def in_some_images(self, tried: Sequence[Mistake]) -> list[Mistake]:
+        """Return mistakes in the readings of images that follow each other in the file.
+
+        These gain most with the mistake corrected, near known cameras.
+        """
+        some = [one for one in tried if one.kind in _OF_SOME]
+        gain = np.zeros((len(some), self.data.measurements.n_rows))
+        for g, group in enumerate(self.groups):
+            now = self.of_groups[g]
+            gain[:, now.row] = -now.support  # where all agree, nothing is to be gained
+            if now.images == len(now.row) or not some:
+                continue
+            then = self.compare([one.true for one in some], g, group.rows, ())
+            for k, one in enumerate(then):
+                gain[k, now.row] = one.support - now.support
+        in_file = np.argsort(self.data.order.rows, kind="stable")
+        runs = [_best_run(one[in_file]) for one in gain]
+        gained = [float(one[in_file[a:b]].sum()) for one, (a, b) in zip(gain, runs, strict=True)]
+        found = list[Mistake]()
+        for k in np.argsort(-np.array(gained), kind="stable")[:_MOST_OF_SOME].tolist():
+            first, last = runs[k]
+            if MIN_IMAGES <= last - first <= len(in_file) - MIN_IMAGES and gained[k] > 0.0:
+                found.append(limited_to(self.data, self.given, some[k], in_file[first:last]))
         return found
 
     def turned_images(self) -> list[Mistake]:
@@ -623,6 +653,14 @@ def symmetries(machine: Machine) -> list[Array]:
             if np.all(apart.min(axis=1) < _SYMMETRIC * size) and is_new:
                 found.append(S)
     return found
+
+
+def _best_run(gain: Array) -> tuple[int, int]:
+    """Return first and last + 1 of those gains (n,) that follow each other with the largest sum."""
+    total = np.concatenate([[0.0], np.cumsum(gain)])
+    lowest = np.minimum.accumulate(total)
+    last = int(np.argmax(total - lowest))
+    return int(np.argmin(total[: last + 1])), last
 
 
 def _total(one: Agreement) -> float:

@@ -306,6 +306,30 @@ def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: in
     )
 
 
+def limited_to(data: OrderedDataset, given: Assumed, mistake: Mistake, rows: IntArray) -> Mistake:
+    """Return a mistake in the readings of some rows only, which follow each other in the file."""
+    q, m = given.q.copy(), data.measurements
+    q[rows] = mistake.true.q[rows]
+    names = row_names(data.dataset.measurements)
+    ends = [
+        f"{names[data.order.rows[row]]} of view {m.views[m.view[row]].name}"
+        for row in (rows[0], rows[-1])
+    ]
+    is_to_the_end = data.order.rows[rows].max() == m.n_rows - 1
+    where = f"from {ends[0]} on" if is_to_the_end else f"from {ends[0]} to {ends[1]}"
+    if set(rows.tolist()) == set(np.flatnonzero(m.view == m.view[rows[0]]).tolist()):
+        where = f"in view {m.views[m.view[rows[0]]].name}"
+    return replace(
+        mistake,
+        what=f"{where}, {mistake.what}",
+        mended=f"{mistake.mended} there",
+        remedy="correct the readings there, and look for what was changed (a plug, a setting)",
+        true=replace(given, q=q),
+        same_as=(),
+        test="",
+    )
+
+
 def rows_of_views(data: OrderedDataset) -> list[IntArray]:
     """Return the rows of each view in the order of the file."""
     view, to_file = data.measurements.view, data.order.rows
