@@ -278,7 +278,9 @@ def level_rotation(A: Array, B: Array) -> Rotation:
     It aligns the directions of the joints from their mean in the least-squares sense (Kabsch 1976),
     independent of the link frames: the platform is level and not turned.
     """
-    return Rotation.align_vectors(A - A.mean(axis=0), B - B.mean(axis=0))[0]
+    with warnings.catch_warnings():  # where several rotations are the best, any will do
+        warnings.simplefilter("ignore", UserWarning)
+        return Rotation.align_vectors(A - A.mean(axis=0), B - B.mean(axis=0))[0]
 
 
 def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> list[LegChain]:

@@ -26,8 +26,6 @@ from legcal.calibration.diagnosis.mistakes import (
     limited_to,
     mistakes,
     moved_cameras,
-    rows_of_views,
-    shifted_from,
     turned_images,
 )
 from legcal.calibration.documents import DiagnosisBlock
@@ -61,9 +59,8 @@ _NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras fi
 _FINALISTS = 6  # mistakes that all images judge
 _SAME_AMOUNT = 2  # of these that differ by how much
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
-_OF_SOME = "columns exchanged", "direction of an encoder"  # that also begin during a session
-_MOST_OF_SOME = 2
-_ONE_ROW = (1, -1)  # by which readings stand late from a row on
+# kinds that may begin during a session, and how many of these are tried
+_OF_SOME, _MOST_OF_SOME = ("columns exchanged", "direction of an encoder", "readings shifted"), 3
 _FINER = (0.5, 0.25)  # steps of an amount between those that are tried
 _SYMMETRIC = 0.03  # of the size of the machine, and the sine of angles
 _SAME = 0.03  # in the share of legs: no more than the lens makes of mirrored images
@@ -173,7 +170,6 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     tried = [
         *common,
         *judge.in_some_images(common),
-        *judge.shifted_from_a_row_on(),
         *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
     ]
     judged = judge.judged(judge.finalists(tried))
@@ -265,50 +261,32 @@ class _Judge:
         self.own = Agreement.joined(self.of_groups)
         self.symmetries = symmetries(data.machine)
 
-    def shifted_from_a_row_on(self) -> list[Mistake]:
-        """Return shifts by a row that begin within a view, each at its likeliest row.
-
-        Images before it agree as they are, those from it on with the readings of the next row.
-        """
-        found, of_views = list[Mistake](), rows_of_views(self.data)
-        for g, group in enumerate(self.groups):
-            for v, k in product(group.views, _ONE_ROW):
-                order = [row for row in of_views[v].tolist() if row in group.rows]
-                if len(order) < 2 * MIN_IMAGES:
-                    continue
-                late = shifted_from(self.data, self.given, v, 0, k).true
-                now, then = self.of_groups[g], self.compare([late], g, group.rows, ())[0]
-                gain = dict(zip(now.row.tolist(), then.support - now.support, strict=True))
-                from_on = np.cumsum([gain[row] for row in order][::-1])[::-1]
-                first = int(np.argmax(from_on[MIN_IMAGES : 1 - MIN_IMAGES])) + MIN_IMAGES
-                if from_on[first] > 0.0:
-                    place = of_views[v].tolist().index(order[first])
-                    found.append(shifted_from(self.data, self.given, v, place, k))
-        return found
-
     def in_some_images(self, tried: Sequence[Mistake]) -> list[Mistake]:
         """Return mistakes in the readings of images that follow each other in the file.
 
         These gain most with the mistake corrected, near known cameras.
         """
-        some = [one for one in tried if one.kind in _OF_SOME]
+        joined = "rows" if len(self.data.measurements.views) > 1 else None  # each view alone then
+        some = [one for one in tried if one.kind in _OF_SOME and one.amount_of != joined]
         gain = np.zeros((len(some), self.data.measurements.n_rows))
         for g, group in enumerate(self.groups):
             now = self.of_groups[g]
-            gain[:, now.row] = -now.support  # where all agree, nothing is to be gained
-            if now.images == len(now.row) or not some:
-                continue
-            then = self.compare([one.true for one in some], g, group.rows, ())
-            for k, one in enumerate(then):
-                gain[k, now.row] = one.support - now.support
+            of = [k for k, m in enumerate(some) if not m.true.is_as(self.given, group.rows)]
+            gain[np.ix_(of, now.row)] = -now.support  # where all agree, nothing is to be gained
+            if now.images < len(now.row):
+                then = self.compare([some[k].true for k in of], g, group.rows, ())
+                for k, one in zip(of, then, strict=True):
+                    gain[k, now.row] += one.support
         in_file = np.argsort(self.data.order.rows, kind="stable")
-        runs = [_best_run(one[in_file]) for one in gain]
-        gained = [float(one[in_file[a:b]].sum()) for one, (a, b) in zip(gain, runs, strict=True)]
+        total = np.pad(np.cumsum(gain[:, in_file], axis=1), ((0, 0), (1, 0)))
+        above = total - np.minimum.accumulate(total, axis=1)
         found = list[Mistake]()
-        for k in np.argsort(-np.array(gained), kind="stable")[:_MOST_OF_SOME].tolist():
-            first, last = runs[k]
-            if MIN_IMAGES <= last - first <= len(in_file) - MIN_IMAGES and gained[k] > 0.0:
-                found.append(limited_to(self.data, self.given, some[k], in_file[first:last]))
+        for k in np.argsort(-above.max(axis=1), kind="stable")[:_MOST_OF_SOME].tolist():
+            last = int(above[k].argmax())  # + 1
+            first = int(np.flatnonzero(above[k, : last + 1] == 0.0)[-1])
+            rows, all_changed = in_file[first:last], np.flatnonzero(gain[k])
+            if MIN_IMAGES <= len(rows) <= len(all_changed) - MIN_IMAGES:
+                found.append(limited_to(self.data, self.given, some[k], rows))
         return found
 
     def turned_images(self) -> list[Mistake]:
@@ -653,14 +631,6 @@ def symmetries(machine: Machine) -> list[Array]:
             if np.all(apart.min(axis=1) < _SYMMETRIC * size) and is_new:
                 found.append(S)
     return found
-
-
-def _best_run(gain: Array) -> tuple[int, int]:
-    """Return first and last + 1 of those gains (n,) that follow each other with the largest sum."""
-    total = np.concatenate([[0.0], np.cumsum(gain)])
-    lowest = np.minimum.accumulate(total)
-    last = int(np.argmax(total - lowest))
-    return int(np.argmin(total[: last + 1])), last
 
 
 def _total(one: Agreement) -> float:

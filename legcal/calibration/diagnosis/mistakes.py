@@ -284,46 +284,26 @@ def _at_reachable_home(machine: Machine) -> Machine:
         return machine
 
 
-def shifted_from(data: OrderedDataset, given: Assumed, v: int, first: int, k: int) -> Mistake:
-    """Return readings of a view that are one row late (k = 1) or early (-1) from a row on.
-
-    *first* is the number of that row in the view. The readings of the last row are unknown and
-    stay.
-    """
-    rows = rows_of_views(data)[v][first:]
-    q = given.q.copy()
-    q[rows[:-k] if k > 0 else rows[-k:]] = given.q[rows[k:] if k > 0 else rows[:k]]
-    name, row = data.measurements.views[v].name, data.order.rows[rows[0]]
-    row_name = row_names(data.dataset.measurements)[row]
-    return Mistake(
-        "readings shifted",
-        f"from {row_name} on, the readings of view {name} appear to be one row {_LATE[k]} "
-        f"({'an image' if k > 0 else 'a row of readings'} may be missing there)",
-        "with the readings moved by 1 row",
-        "check which image belongs to which row",
-        replace(given, q=q),
-        amount_of=f"rows of view {name}",
-    )
-
-
 def limited_to(data: OrderedDataset, given: Assumed, mistake: Mistake, rows: IntArray) -> Mistake:
     """Return a mistake in the readings of some rows only, which follow each other in the file."""
-    q, m = given.q.copy(), data.measurements
+    m, names = data.measurements, row_names(data.dataset.measurements)
+    views = [f" of view {m.views[v].name}" for v in m.view[rows].tolist()]
+    first, last = (names[data.order.rows[row]] for row in (rows[0], rows[-1]))
+    where = f"from {first}{views[0]} to {last}{views[-1]}"
+    if mistake.amount_of:  # that names the view
+        where = f"from {first} on"
+    elif data.order.rows[rows[-1]] == m.n_rows - 1:
+        where = f"from {first}{views[0]} on"
+    elif set(rows.tolist()) == set(np.flatnonzero(m.view == m.view[rows[0]]).tolist()):
+        where = f"in{views[0].removeprefix(' of')}"
+    q = given.q.copy()
     q[rows] = mistake.true.q[rows]
-    names = row_names(data.dataset.measurements)
-    ends = [
-        f"{names[data.order.rows[row]]} of view {m.views[m.view[row]].name}"
-        for row in (rows[0], rows[-1])
-    ]
-    is_to_the_end = data.order.rows[rows].max() == m.n_rows - 1
-    where = f"from {ends[0]} on" if is_to_the_end else f"from {ends[0]} to {ends[1]}"
-    if set(rows.tolist()) == set(np.flatnonzero(m.view == m.view[rows[0]]).tolist()):
-        where = f"in view {m.views[m.view[rows[0]]].name}"
     return replace(
         mistake,
         what=f"{where}, {mistake.what}",
         mended=f"{mistake.mended} there",
-        remedy="correct the readings there, and look for what was changed (a plug, a setting)",
+        remedy="correct the readings there, and look for what changed (a plug, a setting, a row or "
+        "image that is missing)",
         true=replace(given, q=q),
         same_as=(),
         test="",
