@@ -7,6 +7,7 @@ underscore, if these are distinct. The frames are defined by the legs whose join
 triangle, or are farthest apart in a plane.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
