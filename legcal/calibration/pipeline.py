@@ -205,9 +205,12 @@ def calibrate(
     if zeros := own_zeros(dataset, listed(split), left_out):
         dataset = replace(dataset, measurements=replace(dataset.measurements, own_zeros=zeros))
     fitted, held_out = _fitted_and_held_out(dataset, left_out, holdout)
-    identify_notes: tuple[str, ...] = ()
-    with suppress(DatasetError):  # readings out of reach are refused below, with likely mistakes
+    try:
         identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
+    except DatasetError:  # readings out of reach are refused below, with likely mistakes
+        identify_notes = ()
+    except NotIdentifiable as error:  # encoders that stand still, or views without a row, first
+        raise NotIdentifiable([*dataset.table_notes, *error.facts]) from None
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)

@@ -153,7 +153,7 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
 
     Unknown views and images are refused, unless said otherwise: images with one sentence a view.
     """
-    names = places(measurements)
+    m, names = measurements, places(measurements)
     views = list(dict.fromkeys(view for view, _ in names))
     index = {place: row for row, place in enumerate(names)}
     named = list(zip(table.text("view"), table.text("image"), strict=True))
@@ -173,26 +173,15 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
             found = f"{few(list(map(describe, images)))} in {len(of_view)} rows"
             needed = f"images of view {view} in the measurements"
             remedy = "add their rows to the measurements, or remove theirs from this table"
-        if repeated := _repeated_pose(measurements, view, images):
-            found += f", and two rows of view {view} with pose {repeated} in the measurements"
+        poses = [m.pose_labels[p] for p, v in zip(m.pose, m.view, strict=True)
+                 if m.pose_labels and m.views[v].name == view]  # fmt: skip
+        if repeated := [image for image in images if poses.count(image) > 1]:
+            found += f", and two rows of view {view} with pose {repeated[0]} in the measurements"
             needed = "one row of each pose there, which names an image without a file"
             remedy = "remove one of these two from the measurements"
         what = f"{table.thing}{'s' * (len(images) > 1)}"
         table.refuse(of_view[0], found, needed, "image", remedy=remedy, what=what)
     return rows
-
-
-def _repeated_pose(measurements: Measurements, view: str, images: Sequence[str]) -> str:
-    """Return the pose of two images without names, if *images* of the view are named by poses."""
-    labels = [
-        measurements.pose_labels[pose]
-        for pose, v, image in zip(
-            measurements.pose, measurements.view, measurements.image, strict=True
-        )
-        if measurements.pose_labels and not image and measurements.views[v].name == view
-    ]
-    repeated = [label for label in dict.fromkeys(labels) if label and labels.count(label) > 1]
-    return repeated[0] if repeated and set(images) <= set(labels) else ""
 
 
 def find_legs(table: Table, leg_names: Sequence[str], *, refuse: bool = True) -> IntArray:

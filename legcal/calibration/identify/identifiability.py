@@ -45,7 +45,6 @@ from legcal.calibration.joint_fit.predicted import (
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
-from legcal.data.measurements import few
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.files.schema import closest
@@ -558,8 +557,7 @@ def check_identifiable(
     if is_open and n_open_with_radii(analysis) <= n_harmless:  # nothing else is open
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
     if not full.complete:
-        refusal = _refusal(dataset, identifiability_of_dataset(dataset, choices))
-        raise NotIdentifiable([*_still_encoders(dataset), refusal])
+        raise NotIdentifiable(_refusal(dataset, identifiability_of_dataset(dataset, choices)))
     tied = ties_in_words(dataset.machine)
     notes = [] if tied is None else [tied]
     if full.weak:  # only harmless ones are left
@@ -752,21 +750,6 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
         f"{_directions(report.full, harmless=False)}, which moves the platform; {remedy}, or state "
         "known values with --set."
     )
-
-
-def _still_encoders(dataset: Dataset) -> list[str]:
-    """Return the encoders that never move while others do, as a likely cause of a refusal."""
-    machine, m = dataset.machine, dataset.measurements
-    motors = list(machine.motors)
-    still = np.ptp(m.q[:, motors], axis=0) == 0.0
-    if not still.any() or still.all():
-        return []
-    columns = [str(machine.legs[j].prismatic) for j, one in zip(motors, still, strict=True) if one]
-    return [
-        f"{dataset.table_path}: found the same reading in all rows of {few(columns)}, while other "
-        "encoders move, needed readings that change; if the motor moved, record its readings "
-        "anew, else take images with it at other places."
-    ]
 
 
 def _directions(ranks: Ranks, *, harmless: bool) -> str:
