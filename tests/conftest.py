@@ -98,11 +98,11 @@ def _models_are_read_once() -> Iterator[None]:
     """Make machines and sample their workspaces once a process."""
     from legcal.machine import configurations, loader
 
-    load = loader.load_source
+    load = loader._load
     machines: dict[tuple[str, ...], Machine] = {}
 
     def load_once(source: Source) -> Machine:
-        if source.file.legcal is None or source.notes:
+        if source.file.legcal is None or source.notes or source.poses is not None:
             return load(source)
         key = (source.path.name, source.urdf.path.name, repr(source.file), source.urdf.text)
         if key not in machines:
@@ -124,7 +124,7 @@ def _models_are_read_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(configurations, "random_poses", draw_once)
-        patch.setattr(loader, "load_source", load_once)
+        patch.setattr(loader, "_load", load_once)
         yield
 
 

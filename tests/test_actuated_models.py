@@ -147,7 +147,7 @@ def test_a_table_says_at_which_of_two_readings_a_motor_stands_at_home(tmp_path: 
         again = load_mechanism(write_model(machine, tmp_path / f"again{sign}")[0])
         modes = {leg.mode for leg in (*machine.legs, *again.legs)}
         assert modes == {sign * shipped.legs[0].mode}
-    with pytest.raises(ModelError, match=r"rail1 could not .* correct home or home_readings"):
+    with pytest.raises(ModelError, match=r"'rail1'.* correct home or home_readings"):
         at(above - 0.05)
 
 

@@ -34,6 +34,7 @@ from legcal.calibration import doubts, verdict
 from legcal.calibration.documents import Doubt
 from legcal.calibration.doubts import model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
+from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
@@ -214,13 +215,13 @@ def _judged(calibration: Calibration, **changes: Any) -> Calibration:
 
 def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: Calibration) -> None:
     solution = healthy.solution
-    ((what, shared),) = solution.sensitivities.items()
+    shared = solution.sensitivities[ALL_READINGS]
     focal = 0.01 * shared
     fx, change, sigma = np.array([[500.0], [0.02], [0.003]])
     wrong = WrongIntrinsic("focal_length", "c1", fx, change, sigma, 7.0, np.zeros((2, 5)))
     changes = {
         "camera_doubts": (wrong,),
-        "sensitivities": {what: shared, FITTED_CAMERA: focal},
+        "sensitivities": {ALL_READINGS: shared, FITTED_CAMERA: focal},
     }
     found = _judged(healthy, **changes)
     (doubt,) = found.doubts

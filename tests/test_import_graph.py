@@ -16,9 +16,9 @@ LISTED = """
 geometry: covariances lines motions rotations tables types
 files: folder motions quantity reading schema table
 pages: document svg
-machine: actuator closing configurations equations files formats home inspection
+machine: actuator classification closing configurations equations files home inspection
     kinematics leg loader meshes model model_writer parameters picture redundancy rods shapes
-    solver spanning_tree ties tolerance topology urdf
+    solver spanning_tree ties tolerance urdf
 descriptions: controllers firmware new_model
 vision: board camera camera_file cylinder distortion image_file point_pose visibility
 data: cache corners dataset dataset_file image_choice image_tables landmarks measurements

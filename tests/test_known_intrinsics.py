@@ -17,7 +17,7 @@ from legcal import calibrate, check, load_dataset
 from legcal.calibration.documents import Result
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.calibration.joint_fit.sensitivity import INTRINSICS
+from legcal.calibration.joint_fit.sensitivity import EXACT_CAMERAS, INTRINSICS, SIGMA_EXACT
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
@@ -80,6 +80,19 @@ def test_the_part_of_the_intrinsics_is_what_exact_ones_would_remove() -> None:
     assert np.median(np.diagonal(C)[free] / np.diagonal(remains)[free]) > 1.2  # it matters
     sigma, expected = (np.sqrt(np.diagonal(x)[free]) for x in (C - part @ part.T, remains))
     np.testing.assert_allclose(sigma, expected, rtol=0.1)
+
+
+def test_an_exact_focal_length_may_be_off_by_what_the_images_leave_of_it() -> None:
+    by_focal = np.array([LENS.K[0, 0], LENS.K[1, 1], *[0.0] * (len(NAMES) - 2)])
+    right, wrong = (
+        fitted(session(None), moved(part * by_focal, None)) for part in (0.0, SIGMA_EXACT)
+    )
+    left = right.sensitivities[EXACT_CAMERAS][:, 0]
+    change = session().legs.vector(wrong.legs) - session().legs.vector(right.legs)
+    sizes = np.linalg.norm(left), np.linalg.norm(change)
+    assert left @ change > 0.9 * np.prod(sizes)
+    assert 1e-3 < sizes[0] / sizes[1] < 1.0  # images know a part of it
+    assert EXACT_CAMERAS not in fitted(session(), moved(0.0 * SIGMA)).sensitivities
 
 
 def errors(given: MachineSession, found: Solution) -> float:

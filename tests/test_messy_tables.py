@@ -339,7 +339,7 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS, "--base-radius", "9"),
      ("--base-radius", "--family only")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[:-2], "--height", "700"),
-     ("'leg1' at 344.26 mm, 724.264 mm long", "0.00 to 120.00 mm")),
+     ("'leg1', 'leg2'", "close at home", "380 to 500 mm")),
     (wide("bx,by,bz,px,py,pz [Zoll]"), OPTIONS, ("Zoll", "mm, um, nm, cm, m, in, ft")),
     (wide("bx,by,bz,qx,qy,qz"), ("--unit", "mm", *OPTIONS), ("'qx'", "'platform_x'")),
     (B_AND_P.replace("P3,-144.9,38.8,0\n", ""), OPTIONS, ("platform_x",)),

@@ -207,13 +207,13 @@ def _shipped() -> dict[Path, tuple[Source, Machine]]:
             folder = made_input(subject.input)
             run(*words_of(subject.command, {"in": folder, "out": Path(top) / "out"}))
     sources = {path: read_source(path) for path in map(find_model, ("hexapod", "3-rpr"))}
-    return {path: (source, loader.load_source(source)) for path, source in sources.items()}
+    return {path: (source, loader._load(source)) for path, source in sources.items()}
 
 
 def _share_what_is_whole() -> None:
     """Let the cases of this process read once what they do not damage: it takes longest."""
     shipped = _shipped()
-    load = loader.load_source
+    load = loader._load
     parse: Callable[..., object] = cache(yaml.load)
 
     def read(model: str | Path, *stated: str | None) -> Source:
@@ -227,7 +227,7 @@ def _share_what_is_whole() -> None:
         return deepcopy(parse(content, Loader))
 
     patch.object(loader, "read_source", read).start()
-    patch.object(loader, "load_source", loaded).start()
+    patch.object(loader, "_load", loaded).start()
     patch.object(yaml, "load", parsed).start()
 
 

@@ -23,6 +23,7 @@ from legcal.calibration.joint_fit.outlier_readings import reading_notes
 from legcal.calibration.joint_fit.parameter_choices import known_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
+from legcal.calibration.joint_fit.sensitivity import EXACT_CAMERAS, SIGMA_EXACT
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.only import GroupEstimate
 from legcal.calibration.result import REFUSED, Calibration, Verdict
@@ -94,7 +95,8 @@ def judge(
         change, sigma, found = _change_of_platform(platform)
         by_radii = _share_of_scale(platform)
         by_travel = _error_of_travel(platform, solution, machine.tolerance)
-        found += "".join(f"; {clause}" for clause in (by_radii, by_travel) if clause)
+        by_camera = _error_of_exact_cameras(platform)
+        found += "".join(f"; {clause}" for clause in (by_radii, by_travel, by_camera) if clause)
         if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
@@ -265,6 +267,19 @@ def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: 
         f"(1 sigma{assumed}) "
         + ("" if len(witnesses) == 1 else "what these leave ")
         + f"moves the platform by {mm_deg(moved.mean_displacement, moved.mean_rotation)}"
+    )
+
+
+def _error_of_exact_cameras(platform: PlatformAccuracy) -> str:
+    """Return a clause on what an error of exact focal lengths does, "" where it is negligible."""
+    predicted = (platform.workspace or platform.sigma).mean_displacement
+    moved = platform.effects.get(EXACT_CAMERAS)
+    if moved is None or moved.mean_displacement <= NEGLIGIBLE * predicted:
+        return ""
+    return (
+        f"no covariance of the camera is stated; an error of {SIGMA_EXACT:.1%} of its focal length "
+        "(1 sigma, assumed) moves the platform by "
+        f"{mm_deg(moved.mean_displacement, moved.mean_rotation)}"
     )
 
 

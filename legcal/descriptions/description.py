@@ -7,31 +7,33 @@ machine closes, and completes lengths and axes of all legs there.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, ModelError, Problems
-from legcal.files.motions import MotionEntry, motion_to_xyz_quat
+from legcal.errors import ModelError, Problems
+from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.lines import cross
+from legcal.geometry.lines import cross, distance_to_line
+from legcal.geometry.motions import frame_on_points, motion_of, pose_distance
+from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.closing import project_pose
-from legcal.machine.home import (
-    check_home_travel,
-    homes_at_mid_travel,
-    in_modes,
-    readings_at_home,
-    stated_or_middle,
+from legcal.machine.classification import PERPENDICULAR
+from legcal.machine.equations import posture_constraints
+from legcal.machine.leg import (
+    MAX_LENGTH,
+    MAX_RADIUS,
+    MIN_LENGTH,
+    MIN_RADIUS,
+    EquationKind,
+    JointType,
+    Leg,
+    LegKind,
 )
-from legcal.machine.leg import JointType, Leg, LegKind
-from legcal.machine.loader import machine_of_legs
-from legcal.machine.model import Machine, readings_at
-from legcal.machine.parameters import n_frame_legs
-from legcal.machine.topology import widest
-from legcal.machine.urdf import Wording
+from legcal.machine.rods import actuators_of, joints_at, reading_of_rod
+from legcal.machine.solver import postures_after, solve
 
 MAX_NUMBER = 1e9  # largest number of a description, in any unit
 _TYPE = re.compile(r"([PR])([RUS])([RUS])|([RUS])(P?)([RUS]?)")
@@ -107,16 +109,27 @@ class Description:
     source: str  # origin of the description, for messages: a path, or --family
     unit: str  # unit of the description, for messages
     legs: tuple[LegEntry, ...]  # the legs in order
-    home: MotionEntry | None  # T_base_platform of a pose in which it closes
+    home: "Home | None"  # T_base_platform of a pose in which it closes
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
     notes: tuple[str, ...] = ()  # assumptions
     home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
 
 
-def home_of(xyz: Sequence[float], turn: Rotation) -> MotionEntry:
-    """Return a home with the quaternion of a rotation, rounded as in files."""
-    quat = turn.as_quat(canonical=True).tolist()
-    return MotionEntry.model_validate({"xyz": xyz, "quat_xyzw": quat})
+@dataclass(frozen=True, eq=False)
+class Home:
+    """A pose with its numbers as written."""
+
+    xyz: tuple[float, ...]  # position [m]
+    quat_xyzw: tuple[float, ...]  # unit quaternion, to its digits
+
+    @classmethod
+    def of(cls, xyz: tuple[float, ...], turn: Rotation) -> "Home":
+        """Return a home with the quaternion of a rotation, rounded as in files."""
+        return cls(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
+
+    def motion(self) -> RigidTransform:
+        """Return T_base_platform."""
+        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
 
 
 def legs_in_words(names: Sequence[str]) -> str:
@@ -139,7 +152,7 @@ def home_at_height(described: Description, height: float, turn: Rotation | None)
         turn = Rotation.from_euler("z", angle, degrees=True)
     middle = A.mean(axis=0) - turn.apply(B.mean(axis=0))
     x, y = (round(float(value), 3) + 0.0 for value in middle[:2])
-    return replace(described, home=home_of((x, y, height), turn))
+    return replace(described, home=Home.of((x, y, height), turn))
 
 
 def joints_from_base(described: Description) -> Description:
@@ -152,7 +165,7 @@ def joints_from_base(described: Description) -> Description:
         replace(leg, B_platform=np.round(leg.B_platform - origin, 12) + 0.0)
         for leg in described.legs
     )
-    home = home_of(tuple(origin.tolist()), Rotation.identity())
+    home = Home.of(tuple(origin.tolist()), Rotation.identity())
     note = (
         "Platform joints are in coordinates of the base at home: the platform link stands in their "
         f"middle, ({', '.join(f'{1e3 * x:.6g}' for x in origin)}) mm in the base link."
@@ -172,7 +185,7 @@ def check_links(described: Description, problems: Problems) -> None:
     A, B = _joints(described)
     apart = float(np.linalg.norm(B.mean(axis=0) - A.mean(axis=0)))
     if 2.0 * apart < np.linalg.norm(B - A, axis=1).mean() or not _closes(
-        described, home_of((0.0, 0.0, 0.0), Rotation.identity())
+        described, Home.of((0.0, 0.0, 0.0), Rotation.identity())
     ):
         return
     middle = ", ".join(f"{x:g}" for x in np.round(1e3 * B.mean(axis=0), 2) + 0.0)
@@ -192,18 +205,146 @@ def _joints(described: Description) -> tuple[Array, Array]:
     return A, np.array([leg.B_platform for leg in described.legs])
 
 
-def _closes(described: Description, home: MotionEntry) -> bool:
+def _closes(described: Description, home: Home) -> bool:
     """Return whether all motors are inside their travel at a pose."""
-    try:
-        check_home_travel(replace(_legs_alone(described), home=home.motion()), 0.0)
-    except ModelError:
-        return False
-    return True
+    A, B = _joints(described)
+    lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
+    return all(
+        leg.offset + leg.travel[0] - _SLACK * length
+        <= length
+        <= leg.offset + leg.travel[1] + _SLACK * length
+        for leg, length in zip(described.legs, lengths.tolist(), strict=True)
+        if leg.offset is not None and leg.travel is not None
+    )
 
 
+_SLACK = 2.5e-9  # tolerance of lengths, relative to the leg
 _MANY = 3  # legs that hardly all fit by chance
 ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if they coincide
-MAX_OFF = 0.01  # of a stated reading at home, relative to the travel
+
+
+def wrong_sizes(described: Description) -> list[str]:
+    """Return the problems of radii, offsets and travels in themselves."""
+    problems = []
+    for leg in described.legs:
+        if leg.offset is None:
+            continue
+        ends = leg.travel or (0.0, 0.0)
+        for length in (leg.offset + ends[0], leg.offset + ends[1]):
+            problems += _out_of_proportion(described, leg.name, length)[:1]
+            if problems:
+                return problems
+    for side, joints in (
+        ("base", [leg.A_base for leg in described.legs]),
+        ("platform", [leg.B_platform for leg in described.legs]),
+    ):
+        reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
+        if reach > MAX_LENGTH:
+            problems.append(
+                f"{described.source}: the {side} joints could not be used: found them "
+                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
+                f"{MAX_LENGTH:g} m; {_about_the_unit(described.unit, too_long=True)}."
+            )
+    for leg in described.legs:
+        motor = leg.actuator
+        if motor is None or not motor.turns:
+            continue
+        if distance_to_line(leg.A_base, motor.axis, motor.point) < MIN_LENGTH:
+            problems.append(
+                f"{described.source}: leg '{leg.name}' could not be used: found its base joint on "
+                f"the axis of '{motor.joint}', which turns without moving it, needed an arm of "
+                f"{1e3 * MIN_LENGTH:g} mm at least between them; correct the joint, or point and "
+                "axis of the motor."
+            )
+    return problems
+
+
+def wrong_lengths(described: Description, lengths: Array) -> list[str]:
+    """Return the problems of leg lengths at home."""
+    problems = list[str]()
+    outside = list[tuple[str, float, float, float]]()
+    for leg, length in zip(described.legs, lengths, strict=True):
+        disproportions = _out_of_proportion(described, leg.name, float(length))
+        if disproportions:
+            return disproportions
+        for radius in (leg.tube, leg.rod):
+            if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
+                return [
+                    f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
+                    f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
+                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
+                ]
+        if leg.kind is LegKind.CONSTANT or leg.travel is None:
+            continue
+        q0 = leg.offset or 0.0
+        low, high = q0 + leg.travel[0], q0 + leg.travel[1]
+        if not low - _SLACK * length <= length <= high + _SLACK * length:
+            outside.append((leg.name, 1e3 * float(length), 1e3 * low, 1e3 * high))
+    if outside:
+        shortest, longest = (f(x[1] for x in outside) for f in (min, max))
+        there = f"{shortest:.6g} mm" + f" to {longest:.6g} mm" * (longest - shortest > 1e-6)
+        least, most = min(x[2] for x in outside), max(x[3] for x in outside)
+        problems.append(
+            f"{described.source}: {legs_in_words([name for name, *_ in outside])} cannot close at "
+            f"home: found the length {there} there, needed {least:.6g} to {most:.6g} mm (offset "
+            "plus travel); correct home, offsets or travel."
+        )
+    return problems
+
+
+def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
+    """Return the problem of an implausible leg length, if any."""
+    if MIN_LENGTH <= length <= MAX_LENGTH:
+        return []
+    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
+    return [
+        f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
+        f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
+    ]
+
+
+def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
+    """Return the remedy for implausible sizes."""
+    if not positive:
+        return "correct its joints, offset or travel (length = offset + reading)"
+    if unit == "m" and too_long:
+        return "these look like mm values where m are stated: check the unit"
+    if unit == "mm" and not too_long:
+        return "these look like m values where mm are stated: check the unit"
+    return "check the numbers and the unit"
+
+
+def wrong_axes(
+    described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
+) -> list[str]:
+    """Return the problems of axes that do not fit their leg at home."""
+    problems = []
+    for side, joint, axis in (
+        ("base", entry.type.base, axes[0]),
+        ("platform", entry.type.platform, axes[1]),
+    ):
+        angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
+        if joint is JointType.REVOLUTE and 90.0 - angle > np.degrees(PERPENDICULAR):
+            problems.append(
+                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
+                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
+                f"correct {side}_axes or home."
+            )
+        if joint is JointType.UNIVERSAL and angle < ALONG:
+            problems.append(
+                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
+                f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
+                f"needed it across the leg; correct {side}_axes or home."
+            )
+    return problems
+
+
+TRIALS = 40
+APART = 0.1  # least distance of two poses that are not the same [sizes of the machine, rad]
+LIKELY = 1.2  # turn of a pose that is as likely as home, relative to that of home
+CLOSED = 1e-10  # largest residual of a closed pose, relative to the size of the machine
+ROUNDING = 1e-13
+MAX_HOME_RESIDUAL = 0.01  # of a stated home, relative to the size; rounded digits give less
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
 
@@ -230,7 +371,7 @@ class Assembled(Description):
     """A machine with all its numbers; home is a pose in which it closes, as in the file."""
 
     legs: tuple[AssembledLeg, ...]
-    home: MotionEntry
+    home: Home
     base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
     planar: bool  # motion in the xy plane of base and platform
 
@@ -242,48 +383,29 @@ class Assembled(Description):
 
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
-    machine, home, notes = _at_home(described)
+    _refuse(wrong_sizes(described))
+    home, notes = home_of_description(described)
     T = home.motion()
-    check_home_travel(machine, 0.0)
-    q_home = zip(described.legs, readings_at(machine, T).tolist(), strict=True)
-    readings = {leg.actuator.joint: q for leg, q in reversed([*q_home]) if leg.actuator is not None}
-    for actuator in machine.actuators:
-        q, stated = readings[actuator.joint], described.home_readings.get(actuator.joint)
-        if stated is not None and abs(q - stated) > MAX_OFF * np.ptp(actuator.travel):
-            scale, unit = SHOWN_IN[actuator.unit]
-            raise ModelError(
-                f"home_readings.{actuator.joint} could not be used",
-                f"{scale * stated:.6g} {unit}",
-                f"the reading {scale * q:.6g} {unit} at home",
-                "correct home or home_readings",
-                described.source,
-            )
+    readings = _readings_at_home(described, T)
     A = np.array([_at(leg, readings) for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
+    _refuse(wrong_lengths(described, lengths))
     u = (B - A) / lengths[:, None]
     tangents = np.array([across_leg(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
     if all_revolute(described):
         tangents[:] = [0.0, 0.0, 1.0]
-    legs, problems = [], Problems(described.source)
+    legs, problems = [], []
     for j, entry in enumerate(described.legs):
         q = 0.0 if entry.actuator is None else readings[entry.actuator.joint]
-        axes = dict(zip(("base", "platform"), _axes(entry, tangents[j], T, q), strict=True))
-        for side, axis in axes.items():
-            angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u[j]), 0.0, 1.0))))
-            if getattr(entry.type, side) is JointType.UNIVERSAL and angle < ALONG:
-                problems.add(
-                    f"the {side} axis of leg '{entry.name}' could not be used",
-                    f"it along the leg at home ({angle:.3g} deg), where a U joint is singular",
-                    "it across the leg",
-                    f"correct {side}_axes or home",
-                )
+        base_axis, platform_axis = axes = _axes(entry, tangents[j], T, q)
+        problems += wrong_axes(described, entry, u[j], axes)
         q0, travel = _law(entry, float(lengths[j]))
-        numbers = {"travel": travel, **{f"{side}_axis": axis for side, axis in axes.items()}}
+        numbers = {"travel": travel, "base_axis": base_axis, "platform_axis": platform_axis}
         legs.append(AssembledLeg(**(vars(entry) | numbers), u=u[j], q0=q0, q_home=q))
-    problems.raise_if_any()
+    _refuse(problems)
     planar = all_revolute(described) and is_planar(legs, T)
-    frame = described.base_frame or tuple(machine.leg_names[j] for j in machine.frame_legs)
+    frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
     at_home = {name: readings[name] for name in described.home_readings}
     numbers = {"legs": tuple(legs), "home": home, "base_frame": frame, "home_readings": at_home}
     numbers["notes"] = (*described.notes, *notes)
@@ -346,106 +468,208 @@ def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
     return q0, free if entry.travel is None else entry.travel
 
 
-def words_of(described: Description) -> Wording:
-    """Return the words for messages about a table."""
-    return Wording(
-        home="home of the table",
-        no_home="the table has no home",
-        state_home="write home, or correct the joints, offsets or travel",
-        correct_home="correct home, its joints, offsets or travel, and their unit,",
-        readings="home_readings",
-        state_readings="write home_readings (of arms home_readings_deg) in the table",
-        correct_unit=f"lengths are in {described.unit}: check the numbers and the unit",
-    )
-
-
-def _legs_alone(described: Description) -> Machine:
-    """Return a machine of the legs alone, without a URDF, for the search of its home.
-
-    Joints without a stated axis constrain nothing yet, but in a plane.
-    """
-    source, normal = Path(described.source), np.array([0.0, 0.0, 1.0])
-    first = described.legs[0]
-    of_plane = [normal if v is None else v for v in (first.base_axis, first.platform_axis)]
-    axes = [v for leg in described.legs for v in (leg.base_axis, leg.platform_axis)]
-    in_plane = all_revolute(described) and all(
-        v is None or np.linalg.norm(cross(v, n)) < PARALLEL
-        for v, n in zip(axes, of_plane * len(described.legs), strict=True)
-    )
-    planes = of_plane if in_plane else (None, None)
-    A, B = _joints(described)
-    wide = 4.0 * max(float(np.ptp(points, axis=0).max()) for points in (A, B))
-    legs = []
-    for entry in described.legs:
-        is_rod = entry.kind is LegKind.CONSTANT and entry.offset is not None
-        free = (0.0, wide) if entry.travel is None else entry.travel
-        base_axis, platform_axis = (
-            stated if stated is not None else plane
-            for stated, plane in zip((entry.base_axis, entry.platform_axis), planes, strict=True)
-        )
-        legs.append(
-            Leg(
-                entry.type.base,
-                entry.type.platform,
-                LegKind.PASSIVE if entry.kind is LegKind.CONSTANT and not is_rod else entry.kind,
-                entry.A_base,
-                entry.B_platform,
-                entry.offset or 0.0,
-                base_axis,
-                platform_axis,
-                name=entry.name,
-                prismatic=entry.name,
-                travel=free if entry.actuator is None else entry.actuator.travel,
-                actuator=entry.actuator,
+def _base_frame(described: Description, count: int) -> tuple[str, ...]:
+    """Return the legs that define frames: as given, or 1, 3, 5 of six, or the first possible."""
+    legs = described.legs
+    if described.base_frame is not None:
+        names = [leg.name for leg in legs]
+        named = [names.index(name) for name in described.base_frame]
+        if len(named) != count or _degenerate(described, named):
+            raise ModelError(
+                f"{described.source}: base_frame could not be used: found "
+                f"{', '.join(described.base_frame)}, needed {count} legs whose joints on base and "
+                "platform are not in one point or on one line; choose others, or leave it out."
             )
-        )
-    motors = [leg.motor_label for leg in legs]
-    n_d = min(n_frame_legs(spatial=not in_plane), len(legs))
-    frame_legs = widest(A, B, motors, n_d)
-    normals = (of_plane[0], of_plane[1]) if in_plane else None
-    return machine_of_legs(source, legs, frame_legs, normals, words_of(described))
+        return described.base_frame
+    combos = list(combinations(range(len(legs)), count))
+    if len(legs) == 6 and count == 3:
+        combos.insert(0, (0, 2, 4))
+    motors = [j if leg.actuator is None else leg.actuator.joint for j, leg in enumerate(legs)]
+    combos.sort(key=lambda chosen: -len({motors[j] for j in chosen}))  # of different motors first
+    for chosen in combos:
+        if not _degenerate(described, chosen):
+            return tuple(legs[j].name for j in chosen)
+    raise ModelError(
+        f"{described.source}: the frames of base and platform could not be built: found the joints "
+        f"of the base or of the platform all in one point or on one line, needed {count} legs "
+        "whose joints span them; correct base_joints or platform_joints."
+    )
 
 
-def _at_home(described: Description) -> tuple[Machine, MotionEntry, list[str]]:
-    """Return the legs in a closed pose, the pose as files have it, and notes.
+def _degenerate(described: Description, chosen: Sequence[int]) -> bool:
+    """Return whether the joints of some legs define no frame."""
+    try:
+        for side in ("A_base", "B_platform"):
+            frame_on_points(np.array([getattr(described.legs[j], side) for j in chosen]))
+    except ValueError:
+        return True
+    return False
 
-    A stated home is moved onto what the legs keep constant. Without one all motors are at the
-    middle of their travel; a note names another such pose that is as likely.
+
+def _refuse(problems: list[str]) -> None:
+    if problems:
+        raise ModelError(problems)
+
+
+def home_of_description(described: Description) -> tuple[Home, list[str]]:
+    """Return a pose in which a machine closes, projected onto what its legs keep constant.
+
+    If no home is given, all motors are at the middle of their travel; among such poses the one with
+    the smallest rotation of the platform is taken, and of mirror images in the plane of the base
+    joints the one on the positive side of z. A note names another pose that is as likely.
     """
-    machine, stated, notes = _legs_alone(described), described.home_readings, list[str]()
-    if described.home is None:
-        try:
-            q = stated_or_middle(machine, stated)
-            (T, *others), mirrored = homes_at_mid_travel(machine, q)
-        except DidNotConverge as error:
-            raise ModelError(error.facts) from error
-        if others := [*others, *([] if mirrored is None else [mirrored])]:
-            where = [
-                f"({', '.join(f'{round(1e3 * x) + 0:d}' for x in T.translation)}) mm, turned by "
-                f"{round(T.rotation.as_euler('ZYX', degrees=True)[0]) + 0:d} deg about z"
-                for T in (T, others[0])
-            ]
-            notes = [
-                f"Two poses have all motors at mid-travel: home is {' and not '.join(where)}. If "
-                "yours is the other, give --height, or in the table home (YAML) or the joints of "
-                "the platform as they are at home in the base link ('B1 (home)')."
-            ]
-        home = _written(T)
-        return replace(in_modes(machine, T, q), home=home.motion()), home, notes
-    T = described.home.motion()
-    machine = replace(machine, home=T)
-    machine = in_modes(machine, T, readings_at_home(machine, stated, {}))
-    closed, problem = project_pose(machine, T)
-    if problem is not None:
+    if described.home is not None:
+        return _project(described, described.home), []
+    closure = _ClosingEquations(described, mid_travel=True)
+    homes = _search(closure, turning=False) or _search(closure, turning=True)
+    if not homes:
         raise ModelError(
-            "home could not be used",
-            f"{problem} there",
-            "a pose in which the machine closes",
-            "correct home, lengths or axes",
-            described.source,
+            f"{described.source}: no home was found: no pose has all motors at the middle of "
+            "their travel with their axes in place, needed a pose in which the machine closes; "
+            "write home, or correct the joints, offsets or travel."
         )
-    home = described.home if closed is T else _written(closed)
-    return replace(machine, home=home.motion()), home, notes
+    poses = [home.motion() for home in homes[:2]]
+    where = [
+        f"({', '.join(f'{round(1e3 * x) + 0:d}' for x in T.translation)}) mm, turned by "
+        f"{round(T.rotation.as_euler('ZYX', degrees=True)[0]) + 0:d} deg about z"
+        for T in poses
+    ]
+    note = (
+        f"Two poses have all motors at mid-travel: home is {' and not '.join(where)}. If yours is "
+        "the other, give --height, or in the table home (YAML) or the joints of the platform as "
+        "they are at home in the base link ('B1 (home)')."
+    )
+    return homes[0], [note] if len(homes) > 1 else []
+
+
+class _ClosingEquations:
+    """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
+
+    Unknown are the pose and the readings of motors that carry joints; the readings are fixed if
+    home is at mid-travel. Residuals are relative to the size of the machine.
+    """
+
+    def __init__(self, described: Description, *, mid_travel: bool) -> None:
+        self.planar = all_revolute(described)
+        self.stated = described.home_readings
+        legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
+        self.legs = tuple(leg for leg in legs if leg.n_constraints)
+        self.actuators = actuators_of(self.legs)
+        self.still: Array | None = None
+        if mid_travel:
+            middles = [self.stated.get(a.joint, 0.5 * sum(a.travel)) for a in self.actuators]
+            self.still = np.array(middles)
+        self.A = np.array([leg.A for leg in legs])
+        self.B = np.array([leg.B for leg in legs])
+        lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
+        spread = max(float(np.ptp(points, axis=0).max()) for points in (self.A, self.B))
+        self.size = max(spread, 1e-3, *lengths)
+        turns = [1.0 if actuator.turns else self.size for actuator in self.actuators]
+        self.unit = np.array([1.0] * 3 + [self.size] * 3 + turns)
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Return residuals (k, m) and derivatives (k, m, 6 + n) at poses and n readings."""
+        poses, q = points[:, :12].reshape(-1, 3, 4), points[:, 12:]
+        if not self.legs:
+            return np.zeros((len(q), 0)), np.zeros((len(q), 0, 6))
+        R, t = poses[:, :, :3], poses[:, :, 3]
+        with np.errstate(invalid="ignore"):  # a leg without length has no direction
+            equations = posture_constraints(self.legs, R, t, q)
+        values = [equations.values / self.size]
+        slopes = [np.concatenate([equations.by_pose, equations.by_q], axis=2) / self.size]
+        if self.still is not None:
+            slopes[0][:, :, 6:] = 0.0
+        for leg in self.legs if self.planar else ():
+            if leg.base_axis is not None and leg.platform_axis is not None:
+                turned = R @ leg.platform_axis
+                values.append(cross(leg.base_axis, turned))
+                slope = -cross_matrices(leg.base_axis) @ cross_matrices(turned)
+                slopes.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
+        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+
+    def readings_at(self, T: RigidTransform) -> Array:
+        """Return the readings (n,) at a pose: fixed ones, or those of the first rods."""
+        if self.still is not None:
+            return self.still
+        first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
+        candidates = [
+            _candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators
+        ]
+        return np.array([pair[0] for pair in candidates])
+
+    def _point(self, T: RigidTransform) -> Array:
+        """Return a pose with its readings, (1, 12 + n)."""
+        return np.concatenate([T.as_matrix()[:3].ravel(), self.readings_at(T)])[None]
+
+    def residual(self, T: RigidTransform) -> float:
+        """Return the largest residual at a pose."""
+        return float(np.abs(self(self._point(T))[0]).max(initial=0.0))
+
+    def nearest(self, T: RigidTransform) -> RigidTransform:
+        """Return the nearest pose that closes, as far as steps get nearer to one."""
+        solution = solve(
+            self, postures_after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30
+        )
+        pose = solution.points[0, :12].reshape(3, 4)
+        return motion_of(pose[:, :3], pose[:, 3])
+
+    def describe(self, T: RigidTransform) -> list[str]:
+        """Return the residuals at a pose in words."""
+        matrix, q = T.as_matrix()[None], self.readings_at(T)[None]
+        equations = posture_constraints(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], q)
+        (A,) = joints_at(self.legs, q)
+        words, lengths = list[str](), dict[str, list[str]]()  # lengths: legs with the same residual
+        for j, kind, value in zip(equations.leg, equations.kinds, equations.values[0], strict=True):
+            leg = self.legs[j]
+            length = float(np.linalg.norm(T.apply(leg.B) - A[j]))
+            if kind is EquationKind.LENGTH:
+                if abs(value) > CLOSED * self.size:
+                    off = f"{1e3 * length:.6g} mm long instead of {1e3 * leg.q0:.6g} mm"
+                    lengths.setdefault(off, []).append(leg.name)
+                continue
+            angle = np.degrees(np.arccos(min(1.0, abs(float(value)) / length)))
+            if 90.0 - angle > 1e-6:
+                side = "base" if kind is EquationKind.BASE_AXIS else "platform"
+                words.append(
+                    f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
+                    "instead of 90 deg, which an R joint needs,"
+                )
+        words[:0] = [f"{legs_in_words(names)} {off}" for off, names in lengths.items()]
+        return words or ["axes of a planar mechanism that are not parallel"]
+
+
+def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
+    """Return a leg with its length at home, passive if any length will do."""
+    length = entry.offset if entry.kind is LegKind.CONSTANT else None
+    if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
+        length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
+    z = np.array([0.0, 0.0, 1.0]) if planar else None
+    return Leg(
+        entry.type.base,
+        entry.type.platform,
+        LegKind.PASSIVE if length is None else LegKind.CONSTANT,
+        entry.A_base,
+        entry.B_platform,
+        0.0 if length is None else length,
+        z if entry.base_axis is None else entry.base_axis,
+        z if entry.platform_axis is None else entry.platform_axis,
+        travel=(0.0, 0.0) if entry.actuator is None else entry.actuator.travel,
+        name=entry.name,
+        actuator=entry.actuator,
+    )
+
+
+def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> list[float]:
+    """Return the two readings at which a rod reaches a pose.
+
+    The first is the one inside the travel, or the one nearer to the stated reading.
+    """
+    B = np.asarray(T.apply(leg.B))[None]
+    low, high = leg.travel
+    readings = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
+    if stated is not None:
+        return sorted(readings, key=lambda q: abs(q - stated))
+    return sorted(readings, key=lambda q: max(low - q, q - high, 0.0))
 
 
 def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
@@ -456,8 +680,104 @@ def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
     return np.asarray(entry.actuator.at(entry.A_base, q)[0])
 
 
-def _written(T: RigidTransform) -> MotionEntry:
+def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, float]:
+    """Return the readings at home of motors that carry joints.
+
+    Raises
+    ------
+    ModelError
+        If home is outside a travel, or both readings of a rod are inside it.
+    """
+    closure = _ClosingEquations(described, mid_travel=False)
+    readings, problems = dict[str, float](), list[str]()
+    for actuator in closure.actuators:
+        rods = [leg for leg in closure.legs if leg.actuator is actuator]
+        stated = described.home_readings.get(actuator.joint)
+        chosen, other = _candidates(rods[0], T, stated)
+        readings[actuator.joint] = chosen
+        scale, unit = SHOWN_IN[actuator.unit]
+        low, high = (scale * end for end in actuator.travel)
+        where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
+        needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"
+        outside = [max(low - scale * q, scale * q - high) > 1e-6 for q in (chosen, other)]
+        if outside[0]:
+            problems.append(
+                f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "
+                f"there, {needed}; correct home, lengths or travel."
+            )
+        elif stated is not None:
+            if abs(chosen - stated) > MAX_HOME_RESIDUAL * (actuator.travel[1] - actuator.travel[0]):
+                problems.append(
+                    f"{where} at the reading {scale * stated:.6g} {unit} of home_readings: found "
+                    f"{scale * chosen:.6g} and {scale * other:.6g} {unit} there, needed one within "
+                    f"{MAX_HOME_RESIDUAL:.0%} of its travel; correct home or home_readings."
+                )
+        elif not outside[1] and abs(other - chosen) > 1e-9:
+            problems.append(
+                f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
+                f"{unit}, {needed} and not two; write the right one in home_readings, or limit "
+                "the travel to one side of the turning point of "
+                f"{legs_in_words([leg.name for leg in rods])}."
+            )
+    _refuse(problems)
+    return readings
+
+
+def _project(described: Description, home: Home) -> Home:
+    """Return the closed pose nearest to home."""
+    closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
+    if closure.residual(T) < ROUNDING:
+        return home
+    if closure.residual(T) < MAX_HOME_RESIDUAL:
+        T = closure.nearest(T)
+    if closure.residual(T) < CLOSED:
+        return _written(T)
+    raise ModelError(
+        [
+            f"{described.source}: home could not be used: found {residual} there, needed a pose in "
+            "which the machine closes; correct home, lengths or axes."
+            for residual in closure.describe(home.motion())
+        ]
+    )
+
+
+def _search(closure: _ClosingEquations, *, turning: bool) -> list[Home]:
+    """Return the best pose that seeded starts lead to, and others that are as likely as home."""
+    rng = np.random.default_rng(1965)
+    centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
+    n_trials = TRIALS if turning else 8
+    still = np.zeros(0) if closure.still is None else closure.still
+    starts = np.zeros((n_trials, 3, 4))
+    for trial in range(n_trials):
+        shift = rng.normal(0.0, 1.0, 3) if trial else np.array([0.0, 0.0, 1.0])
+        starts[trial, :, 3] = centre + closure.size * shift
+        turn = rng.normal(0.0, 0.3, 3) if turning else np.zeros(3)
+        starts[trial, :, :3] = Rotation.from_rotvec(turn).as_matrix()
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        values, slopes = closure(points)
+        slopes[:, :, :3] *= turning
+        return values, slopes
+
+    points = np.concatenate([starts.reshape(-1, 12), np.tile(still, (n_trials, 1))], axis=1)
+    solution = solve(
+        equations, postures_after, points, tolerance=1e-15, unit=closure.unit, damped=True
+    )
+    closed, best = list[tuple[float, RigidTransform]](), list[tuple[float, RigidTransform]]()
+    for pose in solution.points[solution.worst <= CLOSED, :12].reshape(-1, 3, 4):
+        T = motion_of(pose[:, :3], pose[:, 3])
+        below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
+        closed.append((10.0 * below + float(T.rotation.magnitude()), T))
+    for rank, T in sorted(closed, key=lambda entry: round(entry[0], 6)):
+        upright = rank % 10.0 if T.translation[2] > -1e-9 else rank
+        apart = [max(np.divide(pose_distance(T, other), (closure.size, 1.0))) for _, other in best]
+        if not best or (min(apart) > APART and upright < LIKELY * best[0][0] + APART):
+            best.append((rank, T))
+    return [_written(closure.nearest(T)) for _, T in best]
+
+
+def _written(T: RigidTransform) -> Home:
     """Return a computed pose for a file, without the rounding noise of its zeros."""
     entry = motion_to_xyz_quat(T)
     clean = {key: [x if abs(x) > 1e-13 else 0.0 for x in value] for key, value in entry.items()}
-    return MotionEntry.model_validate(clean)
+    return Home(tuple(clean["xyz"]), tuple(clean["quat_xyzw"]))

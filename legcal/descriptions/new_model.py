@@ -17,14 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from legcal.descriptions.description import (
-    Assembled,
-    AssembledLeg,
-    Description,
-    assemble,
-    leg_type,
-    words_of,
-)
+from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
 from legcal.descriptions.table import BESIDE, described_machine, read_description
 from legcal.errors import LegcalError, Problem, UsageError
 from legcal.files.folder import new_files, with_schema
@@ -34,9 +27,8 @@ from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.files import mechanism_yaml, motor_entries
-from legcal.machine.formats import read_source
 from legcal.machine.leg import JointType, LegKind
-from legcal.machine.loader import load_mechanism, load_source
+from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.spanning_tree import (
     UrdfBuilder,
@@ -615,19 +607,18 @@ def create_model(
         for name, text in zip(names, (yaml_text(machine), urdf_text(machine)), strict=True):
             (temporary / name).parent.mkdir()
             (temporary / name).write_bytes(text.encode())
-        before(_load(temporary / names[0], temporary, described), machine.notes)
+        before(_load(temporary / names[0], temporary, machine.source), machine.notes)
     yaml_path, urdf_path = (output / name for name in names)
     return Created(load_mechanism(yaml_path), yaml_path, urdf_path, machine.notes)
 
 
-def _load(path: Path, temporary: Path, described: Description) -> Machine:
-    """Load the files in the temporary folder; errors name the source instead, in its words."""
+def _load(path: Path, temporary: Path, source: str) -> Machine:
+    """Load the files in the temporary folder; errors name the source instead."""
     try:
-        source = read_source(path)
-        return load_source(replace(source, urdf=replace(source.urdf, wording=words_of(described))))
+        return load_mechanism(path)
     except LegcalError as error:
         raise error.told(
-            lambda problem: _attributed_to_source(problem, temporary, described.source)
+            lambda problem: _attributed_to_source(problem, temporary, source)
         ) from error
 
 

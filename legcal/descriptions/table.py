@@ -42,17 +42,17 @@ from legcal.descriptions.description import (
     MAX_NUMBER,
     NEEDED_TYPE,
     Description,
+    Home,
     LegEntry,
     LegType,
     check_links,
     home_at_height,
-    home_of,
     joints_from_base,
     leg_type,
     legs_in_words,
 )
 from legcal.errors import BadValue, Code, DatasetError, ModelError, Problem, Problems
-from legcal.files.motions import MotionEntry, Quaternion, Vector
+from legcal.files.motions import Quaternion, Vector
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import (
     FileSchema,
@@ -77,11 +77,10 @@ from legcal.files.table import (
     read_table,
     split_heading,
 )
-from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind, Pulses
 from legcal.machine.files import FrameLegs
-from legcal.machine.leg import MAX_LEGS, MIN_LENGTH, LegKind
+from legcal.machine.leg import MAX_LEGS, LegKind
 
 FILE_KIND = "table"
 MOTIONS = ("direction", "point", "axis")  # of the motor that carries a rod
@@ -700,13 +699,13 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
     return np.asarray(axis / np.linalg.norm(axis))
 
 
-def _home(file: TableFile) -> MotionEntry | None:
+def _home(file: TableFile) -> Home | None:
     if file.home is None or file.home.xyz is None:
         return None
     xyz = tuple(file.metres(file.home.xyz))
     if file.home.quat_xyzw is not None:
-        return MotionEntry(xyz=xyz, quat_xyzw=file.home.quat_xyzw)
-    return home_of(xyz, _turn(file.home))
+        return Home(xyz, file.home.quat_xyzw)
+    return Home.of(xyz, _turn(file.home))
 
 
 def _turn(home: HomeEntry) -> Rotation:
@@ -758,17 +757,6 @@ def _check_legs(described: Description, problems: Problems) -> None:
     for some, found, needed, remedy in lacking:
         if some:
             problems.add(_unused(legs_in_words([leg.name for leg in some])), found, needed, remedy)
-    for leg in legs:
-        motor = leg.actuator
-        if motor is None or not motor.turns:
-            continue
-        if distance_to_line(leg.A_base, motor.axis, motor.point) < MIN_LENGTH:
-            problems.add(
-                _unused(f"leg '{leg.name}'"),
-                f"its base joint on the axis of '{motor.joint}', which turns without moving it",
-                f"an arm of {1e3 * MIN_LENGTH:g} mm at least between them",
-                "correct the joint, or point and axis of the motor",
-            )
     # Coincident legs, and joints that all coincide.
     A, B = (np.array([getattr(leg, side) for leg in legs]) for side in ("A_base", "B_platform"))
     spans = [float(np.linalg.norm(np.ptp(joints, axis=0))) for joints in (A, B)]

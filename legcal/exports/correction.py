@@ -27,9 +27,10 @@ from legcal.machine.closing import (
     poses_at_coordinates,
     turned_back,
 )
-from legcal.machine.configurations import motor_travel, workspace
-from legcal.machine.kinematics import poses_at_readings
+from legcal.machine.configurations import workspace
+from legcal.machine.kinematics import equations_of_readings
 from legcal.machine.model import Machine, readings_at_poses
+from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__
 
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
@@ -45,6 +46,7 @@ DEFAULT_NODES = {
 MAX_ROWS = 300_000
 TESTED = 1000  # largest number of cells in whose middle the table is tested
 SHRINKING, ATTEMPTS = 0.8, 20  # factor of the grid size until all nodes are in the travel, attempts
+REACHED = 1e-9  # residual of a reached pose, in leg lengths
 _SEED = 2002
 
 
@@ -72,8 +74,22 @@ class _Models:
 
 
 def _readings(machine: Machine, poses: Array) -> Array:
-    """Return the readings of the motors (k, n_motors) at poses."""
-    return readings_at_poses(machine, poses)[:, list(machine.motors)]
+    """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
+    moved = [leg.is_motor for leg in machine.legs]
+    return np.where(moved, readings_at_poses(machine, poses), 0.0)
+
+
+def poses_at_readings(machine: Machine, q: Array, near: Array) -> tuple[Array, BoolArray]:
+    """Return the poses (k, 3, 4) at readings (k, n_legs), near others, and which were reached."""
+    scale = machine.size
+    solution = solve(
+        equations_of_readings(machine, q[:, list(machine.motors)]),
+        poses_after,
+        near,
+        tolerance=1e-14 * scale,
+        unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
+    )
+    return solution.points, solution.worst <= REACHED * scale
 
 
 def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
@@ -153,8 +169,9 @@ def _corrected(models: _Models, commands: Array) -> tuple[Array, BoolArray]:
     """
     calibrated, columns = models.calibrated, models.columns
     X, reached = models.poses(calibrated, commands)
-    q, (lower, upper) = _readings(calibrated, X), motor_travel(calibrated)
-    reached &= ((q >= lower) & (q <= upper)).all(axis=1)
+    q, motors = _readings(calibrated, X), list(calibrated.motors)
+    ends = np.array([calibrated.legs[j].travel for j in motors]).reshape(-1, 2)
+    reached &= ((q[:, motors] >= ends[:, 0]) & (q[:, motors] <= ends[:, 1])).all(axis=1)
     if not reached.all():
         return commands, reached
     moved, there = poses_at_readings(models.nominal, q, X)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.descriptions.controllers import SIDES, STRUTS, Rig, read_delta, rig_in
 from legcal.descriptions.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
-from legcal.exports.correction import stacked
+from legcal.exports.correction import poses_at_readings, stacked
 from legcal.exports.subject import (
     ExportedFile,
     ExportOptions,
@@ -34,7 +34,6 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
 from legcal.machine.configurations import random_poses, workspace
-from legcal.machine.kinematics import poses_at_readings
 from legcal.machine.leg import LegKind
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
@@ -90,9 +89,7 @@ def firmware_files(name: str, subject: Subject, options: ExportOptions, path: Pa
     after, frame = _placed(ideal, seen)
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(
-            subject.nominal, readings[:, list(machine.motors)], poses
-        )
+        there, reached = poses_at_readings(subject.nominal, readings, poses)
         then = _mounted(subject.nominal, firmware)
         nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
         before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
@@ -526,9 +523,7 @@ def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     after = places.placed(written)
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(
-            subject.nominal, readings[:, list(machine.motors)], poses
-        )
+        there, reached = poses_at_readings(subject.nominal, readings, poses)
         of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
         before = places.placed(of_nominal.nearest()[:_N])
     sentences, figures = in_words("FlyPT Mover", "at the joints of the platform", after, before)

@@ -35,12 +35,13 @@ Render = Callable[[Subject, ExportOptions, Path], Rendered]
 
 @dataclass(frozen=True)
 class Format:
-    """A format: its renderer and its restrictions."""
+    """A format: its renderer, its restrictions and its options."""
 
     render: Render  # files from a subject, options and the requested path
     # reason for refusing a machine, or None
     refusal: Callable[[Subject], str | None] = lambda _: None
     is_folder: bool = False
+    options: tuple[str, ...] = ()  # supported fields of ExportOptions
 
 
 FORMATS: dict[str, Format] = {
@@ -59,7 +60,7 @@ FORMATS: dict[str, Format] = {
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),
     "ros": Format(ros_files, is_folder=True),
-    "correction": Format(correction_files, correction_refusal),
+    "correction": Format(correction_files, correction_refusal, options=("nodes",)),
 }
 _FILE = OutputFile("the export", "export", "", "a new file or --force")
 _FOLDER = OutputKind("export", "", "")
@@ -146,10 +147,7 @@ def export(
     """
     given = ExportOptions() if options is None else options
     format = _format(to)
-    if given.nodes is not None and to != "correction":
-        raise UsageError(
-            f"--nodes could not be used: found it with --to {to}, needed correction; leave it out."
-        )
+    _check_options(to, format, given)
     destination = Path(path)
     if str(path) == "":
         raise UsageError(
@@ -198,6 +196,20 @@ def _format(to: str) -> Format:
             f"{', '.join(FORMATS)}; give one of them with --to."
         )
     return FORMATS[to]
+
+
+def _check_options(to: str, format: Format, given: ExportOptions) -> None:
+    """Refuse options that the format does not support."""
+    nothing = ExportOptions()
+    for name in vars(nothing):
+        if getattr(given, name) != getattr(nothing, name) and name not in format.options:
+            takes = [
+                other for other, other_format in FORMATS.items() if name in other_format.options
+            ]
+            raise UsageError(
+                f"--{name} could not be used: found it with --to {to}, needed "
+                f"{' or '.join(takes)}; leave it out."
+            )
 
 
 def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:

@@ -24,7 +24,6 @@ from legcal.exports.subject import (
     other_gains,
 )
 from legcal.files.motions import motion_to_xyz_quat
-from legcal.files.schema import unused_name
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.urdf import UrdfJoint, origins_of, parse_robot
@@ -197,7 +196,7 @@ class _Writer:
         self._world = etree.Element("worldbody")
         self._name = {link: link for link in urdf.links}  # names of bodies; the root is the world
         if WORLD in self._name and urdf.root != WORLD:
-            self._name[WORLD] = unused_name(WORLD, set(urdf.links))
+            self._name[WORLD] = _unused(WORLD, set(urdf.links))
         self._joints = set(urdf.joints)
         self._motors = {machine.legs[j].prismatic for j in machine.motors}
         self._body: dict[str, etree._Element] = {urdf.root: self._world}
@@ -253,7 +252,7 @@ class _Writer:
                 (f"{joint.name}_y", "slide", turned @ _Y, y),
                 (f"{joint.name}_turn", "hinge", _Z, np.arctan2(sine, cosine)),
             ):
-                _joint(body, unused_name(name, self._joints), kind, axis, value)
+                _joint(body, _unused(name, self._joints), kind, axis, value)
         elif joint.moves:
             value = home[chain.q_index(joint.name)]
             if joint.type == "continuous":
@@ -324,3 +323,11 @@ def _pose(T: RigidTransform) -> dict[str, str]:
 def _text(*numbers: float) -> str:
     """Return numbers that are read back exactly."""
     return " ".join(repr(float(x)) for x in numbers)
+
+
+def _unused(name: str, taken: set[str]) -> str:
+    """Return an unused name."""
+    unused = name
+    while unused in taken:
+        unused += "_"
+    return unused

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legcal.files.schema import unused_name
 from legcal.machine.leg import LegColumns
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
@@ -163,7 +162,12 @@ def identifiers(names: Iterable[str]) -> list[str]:
     """Return names as distinct identifiers."""
     unique_names: list[str] = []
     for name in names:
-        unique_names.append(unused_name(identifier(name), unique_names))
+        plain, number = identifier(name), 1
+        unique = plain
+        while unique in unique_names:
+            number += 1
+            unique = f"{plain}_{number}"
+        unique_names.append(unique)
     return unique_names
 
 

@@ -5,10 +5,9 @@ import os
 import re
 import reprlib
 import typing
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -75,12 +74,6 @@ def _one_plain_line(name: str) -> str:
     if not is_name(name):
         raise BadValue(f"the name {describe(name)}", NAME_NEEDED, "rename it")
     return name
-
-
-def unused_name(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: the given one, or it with a number."""
-    numbered = (f"{name}_{number}" for number in count(2))
-    return name if name not in taken else next(other for other in numbered if other not in taken)
 
 
 def is_plain_name(name: object) -> bool:

@@ -315,10 +315,10 @@ def _meeting(lines: Sequence[Axis], leg: str, within: float) -> Array:
     """Return the intersection of axes (3,) [m]."""
     points = []
     for first, second in pairwise(lines):
-        near, _ = nearest(first, second)
-        apart = gap(first, second)
-        if near is None or apart > within:
-            relation = "parallel" if near is None else f"{1e3 * apart:.4g} mm apart"
+        near, far = nearest(first, second)
+        gap = None if near is None or far is None else float(np.linalg.norm(far - near))
+        if near is None or gap is None or gap > within:
+            relation = "parallel" if gap is None else f"{1e3 * gap:.4g} mm apart"
             raise OutOfClass(
                 f"leg '{leg}' could not be classified",
                 f"the axes of '{first.name}' and '{second.name}' {relation}",
@@ -347,15 +347,6 @@ def nearest(first: Axis, second: Axis) -> tuple[Array, Array] | tuple[None, None
     on_first = float(cross(between, second.along) @ normal) / square
     on_second = float(cross(between, first.along) @ normal) / square
     return first.point + on_first * first.along, second.point + on_second * second.along
-
-
-def gap(first: Axis, second: Axis) -> float:
-    """Return the distance of two axes, or of a sphere and an axis [m]; infinite if parallel."""
-    if first.direction is None or second.direction is None:
-        sphere, other = (first, second) if first.direction is None else (second, first)
-        return other.distance(sphere.point)
-    near, far = nearest(first, second)
-    return math.inf if near is None or far is None else float(np.linalg.norm(far - near))
 
 
 def parallel(first: Array, second: Array) -> bool:
@@ -552,7 +543,15 @@ def _places(axes: Sequence[Axis], within: float) -> list[list[Axis]]:
     places = [[axes[0]]]
     for axis in axes[1:]:
         last = places[-1]
-        if gap(last[-1], axis) <= within:
+        if axis.direction is None or last[-1].direction is None:
+            line, sphere = (axis, last[-1]) if last[-1].direction is None else (last[-1], axis)
+            meets = line.distance(sphere.point) <= within
+        else:
+            near, far = nearest(last[-1], axis)
+            meets = (
+                near is not None and far is not None and float(np.linalg.norm(near - far)) <= within
+            )
+        if meets:
             last.append(axis)
         else:
             places.append([axis])

@@ -7,8 +7,11 @@ coincident frames.
 CAD exports contain the whole machine: a head turns on its base, a hand or an antenna moves on the
 platform, a robot floats in its world. A joint on no path of the tree between the two frames of a
 closure does not move the loops; it is held where it is drawn, so that only the mechanism moves.
+Without a block ``legcal`` the loops are closed near the drawn configuration, and sliders without
+limits get a travel.
 """
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -18,11 +21,13 @@ from typing import cast
 
 import numpy as np
 from lxml import etree
+from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
-from legcal.machine.chain import rigid_bodies
+from legcal.geometry.types import Array
+from legcal.machine.chain import ClosedChain, rigid_bodies
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,
@@ -33,6 +38,7 @@ from legcal.machine.files import (
     yaml_of_urdf,
 )
 from legcal.machine.mjcf import read_mjcf_source
+from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
     Source,
     UrdfBuilder,
@@ -42,7 +48,7 @@ from legcal.machine.spanning_tree import (
     origin_xml,
     read_loop_source,
 )
-from legcal.machine.topology import find_chains, motors_on, propose_block
+from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
     BLOCK,
     LOOP_TAGS,
@@ -74,14 +80,15 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
     source = with_held_joints(source)
     if source.file.legcal is not None:
         check_one_mechanism(source)
-        return source
+        is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
+        return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
     if base is not None or platform is not None:
         source = with_held_joints(_of_stated(source))
     check_one_mechanism(source)
     if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
         source = _with_arms_as_motors(source)
-    return source
+    return completed(source)
 
 
 def _check_stated(source: Source, base: str | None, platform: str | None) -> None:
@@ -268,6 +275,15 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
     return replaced
 
 
+TRIALS = 24
+STEPS = 200
+CLOSED = 1e-10  # largest residual of a closed loop [m, rad]
+TRAVEL_OF_SIZE = 0.05  # assumed travel of sliders to either side, relative to the machine
+_DRAWN_CLOSED = 1e-4  # gap of drawn loops, relative to the machine, that is rounding
+_OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
+_RIGID = 1e-3  # tolerance of determinants of rotations
+_SPREAD = 0.1  # start offset of a trial per trial number [rad], and relative to the machine
+_MAX_STEP = 0.3  # largest step [rad], and relative to the machine
 _SHOWN = 6  # joints named in a note
 
 
@@ -364,3 +380,209 @@ def _note(names: Sequence[str]) -> str:
     if len(names) == 1:
         return f"the joint {shown} closes no loop and is held as drawn."
     return f"the joints {shown}{more} close no loop and are held as drawn."
+
+
+def completed(source: Source) -> Source:
+    """Return a mechanism without a block, completed with the closed poses and all travels."""
+    chain = _closed_chain(source)
+    start = chain.neutral()
+    for joint, value in source.values.items():
+        start[chain.q_index(joint)] = value
+    drawn_at = [chain.pose(start, source.urdf.root, link).translation for link in source.urdf.links]
+    unit = chain.column_units(float(np.ptp(drawn_at, axis=0).max()) or 1.0)
+    closed = closed_near(chain, start, source.urdf.links, unit)
+    configuration = start if closed is None else closed
+    urdf = source.urdf
+    sliders = [
+        joint.name
+        for joint in urdf.joints.values()
+        if joint.type == "prismatic" and joint.limits is None
+    ]
+    off = _loop_error(chain, start)
+    if sliders and closed is not None and off > CLOSED:
+        configuration = closed = _levelled(chain, closed, source, unit)
+    elif closed is not None and off > CLOSED:
+        configuration = closed = _at_drawn_motors(chain, closed, start, source, unit)
+    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
+    size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
+    if sliders:
+        readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
+        source = _with_travel(source, readings, size)
+    if closed is None:
+        return source
+    drawn = {
+        name: float(configuration[chain.q_index(name)])
+        for name in source.file.name_mot
+        if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
+    }
+    is_open = not sliders and off > _OPEN * size
+    return replace(source, poses=poses, drawn=drawn, is_drawn_open=is_open)
+
+
+def _at_drawn_motors(
+    chain: ClosedChain, closed: Array, start: Array, source: Source, unit: Array
+) -> Array:
+    """Return a closed configuration with the motors where the file draws them, if there is one."""
+    moved = [source.urdf.joints[name].type in ("prismatic", "revolute")
+             for name in source.file.name_mot if name in source.urdf.joints]  # fmt: skip
+    if len(moved) < len(source.file.name_mot) or not all(moved):
+        return closed
+    values = [chain.q_index(name) for name in source.file.name_mot]
+    rates = np.zeros((len(values), chain.nv))
+    rates[range(len(values)), [chain.v_index(name) for name in source.file.name_mot]] = 1.0
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        off = points[0][values] - start[values]
+        return np.concatenate([residual, off])[None], np.concatenate([jacobian, rates])[None]
+
+    there = _solved(chain, equations, closed, unit)
+    return closed if there is None else there
+
+
+def _levelled(chain: ClosedChain, configuration: Array, source: Source, unit: Array) -> Array:
+    """Return a closed configuration with a level platform, or the given one if there is none.
+
+    A file without a closed drawing and without slider limits leaves the pose undetermined. Among
+    the level poses the one with sliders nearest to their drawn positions is taken.
+    """
+    urdf = source.urdf
+    try:
+        block = propose_block(source, source.file.name_mot)
+    except OutOfClass:
+        return configuration  # refused later
+    bodies = rigid_bodies(urdf, source.closures, block.platform_joint)
+    motors = source.file.name_mot
+    chains = find_chains(bodies, urdf, block.base, block.platform, motors)
+    A, B = (
+        np.array(points) @ bodies.T_body_link[link][:3, :3]
+        for link, points in (
+            (block.base, [leg.A for leg in chains]),
+            (block.platform, [leg.B_platform for leg in chains]),
+        )
+    )
+    level = RigidTransform.from_rotation(level_rotation(A, B))
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        turned, by_joints = chain.welded(block.base, block.platform, level)
+        rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
+        return rows[0][None], rows[1][None]
+
+    closed = _solved(chain, equations, configuration, unit)
+    if closed is None:
+        return configuration
+    sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
+    values = [chain.q_index(name) for name in sliders]
+    rates = [chain.v_index(name) for name in sliders]
+    for _ in range(STEPS):
+        free = null_space(equations(closed[None])[1][0], rcond=1e-9)
+        step = -free @ np.linalg.lstsq(free[rates], closed[values], rcond=1e-6)[0]
+        nearer = _solved(chain, equations, chain.integrate(closed, _shortened(step, unit)), unit)
+        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(closed[values]):
+            break
+        closed = nearer
+    return closed
+
+
+def closed_near(
+    chain: ClosedChain, start: Array, links: Sequence[str], unit: Array
+) -> Array | None:
+    """Return a closed configuration near a given one, or None.
+
+    Of the results of several starts, the one with the smallest rotations of links is taken. *unit*
+    (nv,) is the size of the machine [m], 1 for angles.
+    """
+    if _loop_error(chain, start) <= CLOSED:
+        return start
+    rng = np.random.default_rng(1965)
+    best: tuple[float, Array] | None = None
+    drawn = chain.turns(start, links[0], links)
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        return residual[None], jacobian[None]
+
+    for trial in range(TRIALS):
+        away = chain.integrate(start, _SPREAD * trial * unit * rng.normal(size=chain.nv))
+        closed = _solved(chain, equations, away, unit)
+        if closed is None:
+            continue
+        turned = _turned(drawn, chain.turns(closed, links[0], links))
+        if best is None or turned < best[0] - 1e-6:
+            best = turned, closed
+    return None if best is None else best[1]
+
+
+def _turned(before: Array, after: Array) -> float:
+    """Return the total difference of rotations (n, 3, 3) [rad]."""
+    apart = np.swapaxes(before, 1, 2) @ after
+    if not np.all(np.abs(np.linalg.det(apart) - 1.0) < _RIGID):  # degenerate or not finite
+        return math.inf
+    return float(Rotation.from_matrix(apart).magnitude().sum())
+
+
+def _shortened(step: Array, unit: Array) -> Array:
+    """Return a step (nv,), shortened to ``_MAX_STEP``."""
+    longest = float(np.abs(step / unit).max(initial=0.0))
+    return np.asarray(step * min(1.0, _MAX_STEP / max(longest, 1e-300)))
+
+
+def _solved(
+    chain: ClosedChain, equations: Equations, configuration: Array, unit: Array
+) -> Array | None:
+    """Return the solution of equations near a configuration, or None."""
+    solution = solve(
+        equations,
+        lambda points, step: chain.integrate(points[0], _shortened(step[0], unit))[None],
+        configuration[None],
+        tolerance=CLOSED,
+        unit=unit,
+        damped=True,
+        steps=STEPS,
+    )
+    return solution.points[0] if solution.worst[0] <= CLOSED else None
+
+
+def is_drawn_closed(source: Source) -> bool:
+    """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
+    chain = _closed_chain(source)
+    poses = source.urdf.poses.values()
+    size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
+    return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
+
+
+def _closed_chain(source: Source) -> ClosedChain:
+    try:
+        return ClosedChain(source.urdf.text, source.closures)
+    except ModelError as error:
+        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
+
+
+def _loop_error(chain: ClosedChain, configuration: Array) -> float:
+    """Return the largest residual of the loops."""
+    residual = chain.residual(configuration)
+    return float(np.abs(residual).max()) if len(residual) else 0.0
+
+
+def _with_travel(source: Source, readings: Mapping[str, float], size: float) -> Source:
+    """Return a mechanism of a size [m] with an assumed travel of sliders about readings [m]."""
+    reach = float(f"{TRAVEL_OF_SIZE * size:.0e}") if size > 0.0 else TRAVEL_OF_SIZE
+    robot = source.urdf.robot()
+    for element in robot.findall("joint"):
+        name = str(element.get("name"))
+        if name in readings:
+            limit = element.find("limit")
+            if limit is None:
+                limit = etree.SubElement(element, "limit")
+            limit.set("lower", repr(readings[name] - reach))
+            limit.set("upper", repr(readings[name] + reach))
+            for key in ("effort", "velocity"):
+                limit.set(key, limit.get(key, "1000"))
+    names = ", ".join(f"'{name}'" for name in list(readings)[:_SHOWN])
+    note = (
+        f"The file gives no travel for {len(readings)} sliders ({names}): {reach:g} m to either "
+        "side of the closed pose was assumed; add their limits."
+    )
+    urdf = source.urdf.edited(robot, travel_needed=True)
+    return replace(source, urdf=urdf, notes=(*source.notes, note))

@@ -5,17 +5,16 @@ machine is built. Up to :data:`MAX_OUTSIDE` of the travel that is a note. Furthe
 not reachable, and results there would be irrelevant.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, ModelError, Problems
+from legcal.errors import DidNotConverge, ModelError
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.schema import closest
-from legcal.geometry.motions import motion_of, pose_distance
+from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array
 from legcal.machine.closing import close_at, project_pose
 from legcal.machine.equations import (
@@ -28,14 +27,12 @@ from legcal.machine.equations import (
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import B_at, Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
-from legcal.machine.rods import actuator_index, both_readings, rod_mode
+from legcal.machine.rods import actuator_index
 from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
 
 TRIALS = 200
 MIN_TRIALS = 20  # least number of trials, even if one finds a pose above the base
-APART = 0.1  # least distance of two poses that are not the same [reach, rad]
-LIKELY = 1.2  # turn of a pose that is as likely as home, relative to that of home
 MIN_APART = 0.05  # least height above or below the base, relative to the reach
 BATCH = 21  # trials solved at once
 MAX_STALLED = 5  # consecutive steps with little improvement before a trial is given up
@@ -45,7 +42,6 @@ _CLOSED = 1e-9  # residual of a closed pose, in leg lengths
 _REGULAR = 1e-4  # singularity measure above which motors hold the platform
 # A home is refused if it is outside the travel by more than both.
 MAX_OUTSIDE = 1.0  # relative to the travel
-_ROUNDED = 2.5e-9  # excess that is rounding [rad], and relative to the leg length
 _MAX_OUTSIDE_OF_LEG = 0.01  # relative to the leg length at home, for sliders with little travel
 
 
@@ -77,7 +73,13 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
 
 
 def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None) -> RigidTransform:
-    """Return the best of :func:`homes_at_mid_travel`.
+    """Return a pose where every leg is at the middle of its travel, or at readings (n_legs,).
+
+    Redundant motors are as near to it as possible, in least squares. Among the poses reached from
+    seeded starts, the one with the smallest rotation of the platform is taken, measured from the
+    rotation with its joints over those of the base, and of mirror images in the plane of the base
+    joints the one on the positive side of the base z. Lengths of legs without a motor follow,
+    within their travel if possible.
 
     Raises
     ------
@@ -85,34 +87,6 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
         If there is no such pose.
     ModelError
         If rods on motors reach the platform on both sides of the base, so that home is ambiguous.
-    """
-    (home, *_), mirrored = homes_at_mid_travel(machine, readings)
-    if mirrored is not None:
-        poses, wording = f"{_in_yaml(home)} and {_in_yaml(mirrored)}", machine.urdf.wording
-        raise ModelError(
-            "the assembly at home is ambiguous",
-            f"that {wording.no_home}, and that at the same readings of the motors the "
-            f"rods reach the platform at {poses}",
-            "one",
-            f"{wording.state_home}, as the machine is assembled",
-            machine.yaml_path,
-        )
-    return home
-
-
-def homes_at_mid_travel(
-    machine: Machine, readings: Sequence[float] | None = None
-) -> tuple[list[RigidTransform], RigidTransform | None]:
-    """Return poses where every leg is at the middle of its travel, or at readings (n_legs,).
-
-    Redundant motors are as near to it as possible, in least squares. Among the poses reached from
-    seeded starts, the one with the smallest rotation of the platform comes first, measured from the
-    rotation with its joints over those of the base, and of mirror images in the plane of the base
-    joints the one on the positive side of the base z. Lengths of legs without a motor follow,
-    within their travel if possible. Others that are about as likely come after it. The second
-    result is the pose on the other side of the base, if rods on motors reach the platform there.
-
-    Raises DidNotConverge if there is no such pose.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     if readings is not None:
@@ -122,7 +96,7 @@ def homes_at_mid_travel(
     centre = A.mean(axis=0)
     level = level_rotation(A, machine.B_platform)
     reach = float(np.abs(machine.lengths_at(middle)).mean())
-    ranked: list[tuple[float, RigidTransform]] = []
+    best: tuple[float, RigidTransform] | None = None
     at_readings = partial(_at_readings, machine, readings=middle[list(machine.motors)], reach=reach)
     for first in range(0, TRIALS, BATCH):
         trials = np.arange(first, min(first + BATCH, TRIALS))
@@ -131,40 +105,40 @@ def homes_at_mid_travel(
             for trial in trials
         ]
         starts = [(t, (level * Rotation.from_rotvec(turn)).as_rotvec()) for t, turn in starts]
-        for T in at_readings(starts):
-            if T is not None:
-                turned = float((level.inv() * T.rotation).magnitude())
-                ranked.append((_unlikely(machine, T) + turned, T))
-        if trials[-1] >= MIN_TRIALS and min(ranked, default=(5.0,), key=_rank)[0] < 5.0:
+        reached = at_readings(starts)
+        for T in reached:
+            if T is None:
+                continue
+            rank = _unlikely(machine, T) + float((level.inv() * T.rotation).magnitude())
+            if best is None or rank < best[0] - 1e-6:
+                best = rank, T
+        if trials[-1] >= MIN_TRIALS and best is not None and best[0] < 5.0:
             break
-    if not ranked:
+    if best is None:
         raise DidNotConverge(
             f"no home pose was found: with all legs at mid-travel the "
             f"loops did not close from {TRIALS} starts, needed a closed pose; "
             f"{machine.urdf.wording.state_home}.",
             file=machine.yaml_path,
         )
-    ranked.sort(key=_rank)
-    least, home = ranked[0]
-    homes = [home]
-    for rank, T in ranked:
-        apart = [max(np.divide(pose_distance(T, other), (reach, 1.0))) for other in homes]
-        if rank < LIKELY * least + APART and min(apart) > APART:
-            homes.append(T)
-    mirrored = None
+    home = best[1]
     if machine.actuators:
         mirror = np.diag([1.0, 1.0, -1.0])
         R, t = mirror @ home.rotation.as_matrix() @ mirror, mirror @ (home.translation - centre)
-        (mirrored,) = at_readings([(centre + t, Rotation.from_matrix(R).as_rotvec())])
-        sides = [_height(machine, T, centre) for T in (home, mirrored) if T is not None]
-        if len(sides) < 2 or np.prod(sides) >= 0.0 or min(map(abs, sides)) <= MIN_APART * reach:
-            mirrored = None
-    return homes, mirrored
-
-
-def _rank(ranked: tuple[float, RigidTransform]) -> float:
-    """Return the rank of a pose, without rounding."""
-    return round(ranked[0], 6)
+        (other,) = at_readings([(centre + t, Rotation.from_matrix(R).as_rotvec())])
+        sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
+        if len(sides) == 2 and np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
+            poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
+            wording = machine.urdf.wording
+            raise ModelError(
+                "the assembly at home is ambiguous",
+                f"that {wording.no_home}, and that at the same readings of the motors the "
+                f"rods reach the platform at {poses}",
+                "one",
+                f"{wording.state_home}, as the machine is assembled",
+                machine.yaml_path,
+            )
+    return home
 
 
 def _height(machine: Machine, T: RigidTransform, centre: Array) -> float:
@@ -177,83 +151,6 @@ def _in_yaml(T: RigidTransform) -> str:
     xyz, quat = T.translation, T.rotation.as_quat()
     numbers = [", ".join(f"{x + 0.0:.4g}" for x in part.round(6)) for part in (xyz, quat)]
     return f"{{xyz: [{numbers[0]}], quat_xyzw: [{numbers[1]}]}}"
-
-
-def in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[float]) -> Machine:
-    """Return the machine with its rods on actuators in the mode of a pose and joint values."""
-    B = B_at(machine, T_base_platform.as_matrix()[None])[0]
-    legs = tuple(
-        leg if leg.actuator is None else replace(leg, mode=rod_mode(leg, float(q_j), B_j))
-        for leg, q_j, B_j in zip(machine.legs, q, B, strict=True)
-    )
-    return replace(machine, legs=legs)
-
-
-def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
-    """Refuse readings at home of joints that are no actuators."""
-    joints, problems = sorted(a.joint for a in machine.actuators), Problems(machine.yaml_path)
-    for name in given:
-        if name not in joints:
-            problems.add(
-                f"legcal.home_readings.{name} could not be used",
-                "no actuator of that name",
-                f"one of {', '.join(joints)}",
-                closest(name, joints),
-            )
-    problems.raise_if_any()
-
-
-def stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
-    """Return the readings of legs for a search for home: as *given*, else mid-travel."""
-    _check_home_readings(machine, given)
-    return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
-
-
-def readings_at_home(
-    machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
-) -> list[float]:
-    """Return the joint values at home: as *given* for actuators, else those within the travel.
-
-    If both readings at which a rod reaches the platform are within the travel, the one *drawn* in
-    the file is taken; without one they are refused.
-    """
-    path = machine.yaml_path
-    _check_home_readings(machine, given)
-    B = B_at(machine, machine.home.as_matrix()[None])[0]
-    q = [0.0] * machine.n_legs
-    for j, leg in enumerate(machine.legs):
-        if leg.actuator is None:
-            continue
-        joint = leg.actuator.joint
-        readings = both_readings(leg, B[j])
-        size, unit = SHOWN_IN[leg.reading_unit]
-        choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
-        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
-        near = given.get(joint)
-        if near is not None and not leg.in_travel(np.array([near]))[0]:
-            raise ModelError(
-                f"{machine.urdf.wording.readings}.{joint} could not be used",
-                f"{near:g} {leg.reading_unit}",
-                f"the one of {choices} at home that is in the travel of "
-                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
-                f"correct it{', in radians' * leg.reads_angle}",
-                path,
-            )
-        if near is None and all(inside):
-            near = drawn.get(joint)
-            if near is None and abs(np.diff(readings)[0]) > 1e-6 * np.ptp(leg.travel):
-                raise ModelError(
-                    f"the assembly of leg '{leg.name}' at home is ambiguous",
-                    f"that its rod reaches the platform at {choices} of '{joint}', both inside "
-                    "its travel",
-                    "one",
-                    f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
-                    path,
-                )
-        if near is None:
-            near = readings[inside.index(True)] if any(inside) else 0.5 * sum(leg.travel)
-        q[j] = min(readings, key=lambda x: abs(x - near))
-    return q
 
 
 def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:
@@ -358,24 +255,24 @@ def _unlikely(machine: Machine, T: RigidTransform) -> float:
     return penalty
 
 
-def check_home_travel(machine: Machine, share: float = MAX_OUTSIDE) -> None:
+def check_home_travel(machine: Machine) -> None:
     """Check that a stated home is not far outside the travel of its motors.
 
     Raises
     ------
     ModelError
-        If an actuated leg is outside its travel by more than a *share* of the travel, and of 1 % of
-        its length, or a motor that carries rods by more than that share of its travel.
+        If an actuated leg is outside its travel by more than the travel itself and by more than
+        1 % of its length, or a motor that carries rods by more than its travel.
     """
     far: dict[int, float] = {}
     q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)
-    for j, excess in legs_outside(machine, share).items():
+    for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
         if leg.actuator is not None:  # rods may share an actuator
-            is_far = actuators[j] not in {actuators[k] for k in far} and excess > _ROUNDED
+            is_far = actuators[j] not in {actuators[k] for k in far}
         else:
-            allowed = max(share * _MAX_OUTSIDE_OF_LEG, _ROUNDED) * leg.length_at(float(q[j]))
-            is_far = leg.kind is LegKind.ACTUATED and excess > abs(allowed)
+            allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
+            is_far = leg.kind is LegKind.ACTUATED and excess > allowed
         if is_far:
             far[j] = excess
     if not far:
@@ -388,14 +285,11 @@ def check_home_travel(machine: Machine, share: float = MAX_OUTSIDE) -> None:
         more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
         others = f" ({len(far) - 1} more {more} as far off)"
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
-    if leg.actuator is None:
-        reading += f", {1e3 * leg.length_at(float(q[worst])):.6g} mm long,"
     raise ModelError(
-        f"{machine.urdf.wording.home} could not be used",
+        "legcal.home could not be used",
         f"{name} at {reading} there{others}",
-        f"a reading {'near' if share else 'in'} its travel of {travel}",
-        f"{machine.urdf.wording.correct_home} or the limits of the "
-        f"{'slider' if leg.actuator is None else 'motor'}",
+        f"a reading near its travel of {travel}",
+        f"correct legcal.home or the limits of the {'slider' if leg.actuator is None else 'motor'}",
         machine.yaml_path,
     )
 

@@ -320,10 +320,21 @@ def _motor_notes(machine: Machine) -> list[str]:
 
 
 def _spin_notes(machine: Machine) -> list[str]:
-    """Return a note on idle spins: legs with an S joint at both ends, redundant revolutes."""
-    n = sum(leg.idle_spins for leg in machine.legs)
-    freedoms = "1 freedom only spins a leg" if n == 1 else f"{n} freedoms only spin legs"
-    return [
-        f"{freedoms} about themselves, between S joints or by revolutes that repeat a motion; "
-        "this is not counted as mobility."
-    ] * (n > 0)
+    """Return notes on idle spins: legs with an S joint at both ends, redundant revolutes."""
+    notes = []
+    n_spinning = sum(
+        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
+    )
+    if n_spinning:
+        legs, spin = "1 leg has", "spins about itself"
+        if n_spinning > 1:
+            legs, spin = f"{n_spinning} legs have", "spin about themselves"
+        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
+    others = sum(leg.idle_spins for leg in machine.legs) - n_spinning
+    if others:
+        joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
+        notes.append(
+            f"{joints} the motion of an S joint of the leg, or of another revolute; this is not "
+            "counted as mobility."
+        )
+    return notes

@@ -18,6 +18,7 @@ from legcal.geometry.motions import motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import (
     CLOSED,
+    ROUNDING,
     TOLERANCE,
     close_at,
     closure_equations,
@@ -53,7 +54,6 @@ LONG_STEP = 1.0 / 16.0  # least step of a first attempt, with a fallback
 MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit is wrong
 MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
 FEW_STEPS = 12  # largest number of Newton steps
-REACHED = 1e-9  # residual of a reached pose [leg lengths]
 NEAR = 0.01  # largest distance of the pose at which a chain closes [leg lengths, rad]
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
@@ -465,9 +465,7 @@ def follow(
     T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
         if is_redundant:
-            (near,), _ = poses_at_readings(machine, readings[None], T.as_matrix()[None, :3])
-            T = motion_of(near[:, :3], near[:, 3])
-            failure = _disagreement(machine, T, readings, which)
+            failure = _disagreement(machine, _nearest(machine, T, readings), readings, which)
             if failure is not None:
                 raise failure
         raise DidNotConverge(
@@ -497,6 +495,14 @@ def follow(
     return closed
 
 
+def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
+    """Return the pose near T_base_platform with the smallest residuals of readings (n_motors,)."""
+    equations = equations_of_readings(machine, readings[None])
+    tolerance = ROUNDING * machine.size
+    solution = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
+    return motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
+
+
 def equations_of_readings(machine: Machine, readings: Array) -> Equations:
     """Return the equations of poses at readings of the motors (k, n_motors) [m, rad]."""
     n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
@@ -508,19 +514,6 @@ def equations_of_readings(machine: Machine, readings: Array) -> Equations:
         return rows.values, rows.by_pose
 
     return equations
-
-
-def poses_at_readings(machine: Machine, readings: Array, near: Array) -> tuple[Array, BoolArray]:
-    """Return the poses (k, 3, 4) at readings of the motors, near others, and which were reached."""
-    scale = machine.size
-    solution = solve(
-        equations_of_readings(machine, readings),
-        poses_after,
-        near,
-        tolerance=0.1 * TOLERANCE * scale,
-        unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
-    )
-    return solution.points, solution.worst <= REACHED * scale
 
 
 def follow_poses(

@@ -5,16 +5,17 @@ converted). The links are grouped into rigid bodies, chains of joints between ba
 classified as legs, and a closed pose is found; every check below names the mistake in the file.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problems
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
+from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
@@ -40,14 +41,7 @@ from legcal.machine.equations import (
 )
 from legcal.machine.files import LegcalBlock, MechanismFile
 from legcal.machine.formats import read_source
-from legcal.machine.home import (
-    check_home_travel,
-    closed_home,
-    home_at_mid_travel,
-    in_modes,
-    readings_at_home,
-    stated_or_middle,
-)
+from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.inspection import mechanism_notes, proposal_notes
 from legcal.machine.leg import (
     MAX_LEGS,
@@ -57,13 +51,13 @@ from legcal.machine.leg import (
     MIN_RADIUS,
     EquationKind,
     JointType,
-    Leg,
     LegChain,
     redirected,
 )
-from legcal.machine.model import Machine, joint_values, readings_at, vectors_A_to_B
+from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
+from legcal.machine.rods import reading_of_rod, rod_mode
 from legcal.machine.shapes import (
     at_visible_heights,
     occluders_of,
@@ -89,14 +83,11 @@ from legcal.machine.topology import (
     propose_block,
     propose_frame,
 )
-from legcal.machine.urdf import Urdf, Wording, parse_urdf
+from legcal.machine.urdf import Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
-TRAVEL_OF_SIZE = 0.05  # assumed travel of sliders to either side, in mean leg lengths
-_ROUNDED = 1e-4  # gap of drawn loops, relative to the machine, that is rounding
-_OPEN = 0.01  # gap of drawn loops, relative to the machine, above which they define no home
-_SHOWN = 6  # sliders named in a note
+_METRES = "write all lengths in metres (are they millimetres?)"
 _NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 _DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
@@ -140,17 +131,16 @@ def load_mechanism(
     if without:
         left = [name for name in source.file.name_mot if name not in without]
         source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
-    return load_source(replace(source, leg_radius=leg_radius))
+    return _load(replace(source, leg_radius=leg_radius))
 
 
-def load_source(source: Source) -> Machine:
-    """Return the mechanism of a file that has been read; see :func:`load_mechanism`."""
+def _load(source: Source) -> Machine:
     file, urdf = source.file, source.urdf
     # Beyond, rounding would hide the relative position of joints.
     for joint in urdf.joints.values():
         words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        _check_length(away, words, MAX_ORIGIN, urdf)
+        _check_length(away, words, MAX_ORIGIN, urdf.path)
     _check_names(file, urdf, source.path)
     closures = sorted(  # in a fixed order, since sums depend on it
         source.closures, key=lambda closure: (closure.frame_1, closure.frame_2, closure.kind)
@@ -160,7 +150,8 @@ def load_source(source: Source) -> Machine:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
     try:
         block = file.legcal or propose_block(source, file.name_mot)
-        if block.home is None and (T := _drawn_home(source, block)) is not None:
+        if block.home is None and source.poses is not None:
+            T = source.poses[block.base].inv() * source.poses[block.platform]
             drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
             block = block.model_copy(update={"home": drawn_home})
         machine = _assemble(source, block, closures)
@@ -179,18 +170,22 @@ def load_source(source: Source) -> Machine:
         machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
     # A closed home.
     given = machine.home if block.home is not None else None
+    if given is not None and source.is_drawn_open and not machine.actuators:
+        _check_spread(machine)
+        with suppress(DidNotConverge):  # travels are better evidence than the poses of open loops
+            given = home_at_mid_travel(machine)
+            machine = replace(machine, home=given)
+            block = block.model_copy(update={"home": None})
     if given is None:
         _check_spread(machine)  # before a search for home in kilometres
         if machine.actuators:
-            at_home = source.drawn if file.legcal is None else {}
-            q = stated_or_middle(machine, block.home_readings or at_home)
+            q = _stated_or_middle(machine, block.home_readings or {})
             given = home_at_mid_travel(machine, q)
-            machine = in_modes(machine, given, q)
+            machine = _in_modes(machine, given, q)
     else:
         if machine.actuators:
-            at_home = {} if file.legcal is not None and file.legcal.home else source.drawn
-            q = readings_at_home(machine, block.home_readings or {}, at_home)
-            machine = in_modes(machine, machine.home, q)
+            q = _readings_at_home(machine, block.home_readings or {}, source.drawn)
+            machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
@@ -202,7 +197,6 @@ def load_source(source: Source) -> Machine:
             _check_dependence(machine, closes=False)
         raise
     machine = replace(machine, home=pose, home_configuration=configuration)
-    machine, assumed = _with_travel(machine)
     _check_unit(machine)
     # The geometry must agree with Pinocchio.
     _check_across(machine)
@@ -214,90 +208,7 @@ def load_source(source: Source) -> Machine:
     _check_ties(machine)
     proposed = proposal_notes(file.legcal, machine)
     notes = mechanism_notes(machine, home_is_given=block.home is not None)
-    return replace(machine, diagnostics=(*source.notes, *assumed, *proposed, *notes))
-
-
-def _drawn_home(source: Source, block: LegcalBlock) -> RigidTransform | None:
-    """Return the pose that a file draws, None if its loops are open there.
-
-    Without a block ``legcal`` they may be open by what a rough drawing leaves.
-    """
-    urdf = source.urdf
-    try:
-        chain = ClosedChain(urdf.text, source.closures)
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(urdf.path)) from error
-    drawn = chain.neutral()
-    for joint, value in source.values.items():
-        drawn[chain.q_index(joint)] = value
-    places = [chain.pose(drawn, urdf.root, link).translation for link in urdf.links]
-    most = (_OPEN if source.file.legcal is None else _ROUNDED) * np.ptp(places, axis=0).max()
-    gap = np.abs(chain.residual(drawn)).max(initial=0.0)
-    return chain.pose(drawn, block.base, block.platform) if gap <= most else None
-
-
-def _with_travel(machine: Machine) -> tuple[Machine, list[str]]:
-    """Return a machine with an assumed travel of sliders without limits in the file, and a note."""
-    sliding = {
-        str(leg.prismatic): float(q)
-        for leg, q in zip(machine.legs, readings_at(machine, machine.home), strict=True)
-        if leg.prismatic is not None
-        and not leg.reads_angle
-        and machine.urdf.joints[leg.prismatic].limits is None
-    }
-    if not sliding:
-        return machine, []
-    reach = float(f"{TRAVEL_OF_SIZE * machine.size:.0e}")
-    travels = {name: (q - reach, q + reach) for name, q in sliding.items()}
-    robot, legs = machine.urdf.robot(), list(machine.legs)
-    for element in robot.findall("joint"):
-        if (ends := travels.get(str(element.get("name")))) is not None:
-            limit = element.find("limit")
-            limit = etree.SubElement(element, "limit") if limit is None else limit
-            for key, value in zip(("lower", "upper"), ends, strict=True):
-                limit.set(key, repr(value))
-            for key in ("effort", "velocity"):
-                limit.set(key, limit.get(key, "1000"))
-    for j, leg in enumerate(legs):
-        if (ends := travels.get(str(leg.prismatic))) is not None:
-            actuator = None if leg.actuator is None else replace(leg.actuator, travel=ends)
-            legs[j] = replace(leg, travel=ends, actuator=actuator)
-    names = ", ".join(f"'{name}'" for name in [*sliding][:_SHOWN])
-    note = (
-        f"The file gives no travel for {len(sliding)} sliders ({names}): {reach:g} m to either "
-        "side of the closed pose was assumed; add their limits."
-    )
-    urdf = machine.urdf.edited(robot, travel_needed=True)
-    return replace(machine, urdf=urdf, legs=tuple(legs)), [note]
-
-
-def machine_of_legs(
-    path: Path,
-    legs: Sequence[Leg],
-    frame_legs: Sequence[int],
-    normals: Normals | None,  # of a plane of motion, in the links of base and platform
-    wording: Wording,
-) -> Machine:
-    """Return a machine of legs alone, without a URDF, for a search of its home."""
-    urdf = parse_urdf(path, b'<robot name="legs"><link name="base"/></robot>')
-    base_normal, platform_normal = normals or (None, None)
-    return Machine(
-        name=path.stem,
-        yaml_path=path,
-        urdf_path=path,
-        base=urdf.root,
-        platform=urdf.root,
-        platform_joint=None,
-        legs=tuple(legs),
-        frame_legs=tuple(frame_legs),
-        spatial=normals is None,
-        home=RigidTransform.identity(),
-        home_configuration=np.zeros(0),
-        chain=ClosedChain(urdf.text, []),
-        urdf=replace(urdf, wording=wording),
-        base_normal=base_normal,
-        platform_normal=platform_normal,
-    )
+    return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
 
 
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
@@ -323,13 +234,13 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         chains = at_visible_heights(chains, shown, bodies)
     chain = _closed_chain(urdf, closures, in_plane, block, chains)
     home = None if block.home is None else block.home.motion()
-    actuators = _actuators(chains, block, source, ends[0])
+    actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
     legs = tuple(
         leg_of(
             name,
             leg_chain,
             ends,
-            travel=_travel(leg_chain, source),
+            travel=_travel(leg_chain, urdf),
             actuated=leg_chain.motor in file.name_mot,
             spatial=normals is None,
             home=home,
@@ -388,17 +299,17 @@ def _closed_chain(
 
 
 def _actuators(
-    chains: Sequence[LegChain], block: LegcalBlock, source: Source, T_body_base: Array
+    chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
 ) -> dict[str | None, Actuator | None]:
     """Return the actuators by joint, with their numbers from the YAML."""
     stated = {
         chain.motor: actuator_of(
-            chain, T_body_base, _travel(chain, source), source.urdf.joints[str(chain.motor)].child
+            chain, T_body_base, _travel(chain, urdf), urdf.joints[str(chain.motor)].child
         )
         for chain in reversed(chains)  # its point is on the first leg
         if chain.actuator is not None
     }
-    problems = Problems(source.path)
+    problems = Problems(path)
     motors = sorted(str(motor) for motor in stated)
     for name, entry in (block.motors or {}).items():
         actuator, entry_name = stated.get(name), f"legcal.motors.{name}"
@@ -422,15 +333,87 @@ def _actuators(
     return stated
 
 
-def _travel(chain: LegChain, source: Source) -> tuple[float, float]:
-    """Return the limits of the slider or actuator of a leg [m or rad], zero for a rod.
+def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
+    """Return the limits of the slider or actuator of a leg [m or rad], zero for a rod."""
+    limits = None if chain.motor is None else urdf.joints[chain.motor].limits
+    return (0.0, 0.0) if limits is None else limits
 
-    Without limits both are its drawn value.
+
+def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[float]) -> Machine:
+    """Return the machine with its rods on actuators in the mode of a pose and joint values."""
+    B = B_at(machine, T_base_platform.as_matrix()[None])[0]
+    legs = tuple(
+        leg if leg.actuator is None else replace(leg, mode=rod_mode(leg, float(q_j), B_j))
+        for leg, q_j, B_j in zip(machine.legs, q, B, strict=True)
+    )
+    return replace(machine, legs=legs)
+
+
+def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
+    """Refuse readings at home of joints that are no actuators."""
+    joints, problems = sorted(a.joint for a in machine.actuators), Problems(machine.yaml_path)
+    for name in given:
+        if name not in joints:
+            problems.add(
+                f"legcal.home_readings.{name} could not be used",
+                "no actuator of that name",
+                f"one of {', '.join(joints)}",
+                closest(name, joints),
+            )
+    problems.raise_if_any()
+
+
+def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
+    """Return the readings of legs for a search for home: as *given*, else mid-travel."""
+    _check_home_readings(machine, given)
+    return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
+
+
+def _readings_at_home(
+    machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
+) -> list[float]:
+    """Return the joint values at home: as *given* for actuators, else those within the travel.
+
+    If both readings at which a rod reaches the platform are within the travel, the one *drawn* in
+    the file is taken; without one they are refused.
     """
-    if chain.motor is None:
-        return 0.0, 0.0
-    drawn = source.values.get(chain.motor, 0.0)
-    return source.urdf.joints[chain.motor].limits or (drawn, drawn)
+    path = machine.yaml_path
+    _check_home_readings(machine, given)
+    B = B_at(machine, machine.home.as_matrix()[None])[0]
+    q = [0.0] * machine.n_legs
+    for j, leg in enumerate(machine.legs):
+        if leg.actuator is None:
+            continue
+        joint = leg.actuator.joint
+        readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        size, unit = SHOWN_IN[leg.reading_unit]
+        choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
+        inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
+        near = given.get(joint)
+        if near is not None and not leg.in_travel(np.array([near]))[0]:
+            raise ModelError(
+                f"legcal.home_readings.{joint} could not be used",
+                f"{near:g} {leg.reading_unit}, outside the travel of "
+                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} {leg.reading_unit}",
+                f"the one of {choices} at home",
+                f"correct it{', in radians' * leg.reads_angle}",
+                path,
+            )
+        if near is None and all(inside):
+            near = drawn.get(joint)
+            if near is None and abs(np.diff(readings)[0]) > 1e-6 * np.ptp(leg.travel):
+                raise ModelError(
+                    f"the assembly of leg '{leg.name}' at home is ambiguous",
+                    f"that its rod reaches the platform at {choices} of '{joint}', both inside "
+                    "its travel",
+                    "one",
+                    f"{machine.urdf.wording.state_readings}, or narrow the limits of the joint",
+                    path,
+                )
+        if near is None:
+            near = readings[inside.index(True)] if any(inside) else 0.5 * sum(leg.travel)
+        q[j] = min(readings, key=lambda x: abs(x - near))
+    return q
 
 
 def _legs_in_order(
@@ -680,15 +663,15 @@ def _check_frames(machine: Machine) -> None:
     problems.raise_if_any()
 
 
-def _check_length(length: float, words: str, most: float, urdf: Urdf) -> None:
+def _check_length(length: float, words: str, most: float, path: Path) -> None:
     """Refuse a length [m] that is most likely in another unit, with *words* for it."""
     if length > most:
         raise ModelError(
             "the lengths could not be used",
             words.format(f"{length:.4g}"),
             f"at most {most:g} m",
-            urdf.wording.correct_unit,
-            urdf.path,
+            _METRES,
+            path,
         )
 
 
@@ -696,7 +679,7 @@ def _check_spread(machine: Machine) -> None:
     """Check that the joints are within metres of each other, before the search for home."""
     for side, joints in (("base", machine.A_base), ("platform", machine.B_platform)):
         size = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf)
+        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf_path)
 
 
 def _check_unit(machine: Machine) -> None:
@@ -710,7 +693,7 @@ def _check_unit(machine: Machine) -> None:
             "the lengths could not be used",
             f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
             "1 mm to 20 m",
-            machine.urdf.wording.correct_unit,
+            _METRES,
             path,
         )
     for leg in machine.legs:
@@ -720,7 +703,7 @@ def _check_unit(machine: Machine) -> None:
                 f"the travel of leg '{leg.name}' could not be used",
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
                 "at most 20 m",
-                machine.urdf.wording.correct_unit,
+                "write the limits of its slider in metres (are they millimetres?)",
                 path,
             )
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):

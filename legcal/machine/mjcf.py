@@ -32,10 +32,11 @@ from legcal.machine.spanning_tree import (
     UrdfBuilder,
     close_loops,
     mesh_xml,
+    moving_groups,
     origin_xml,
     visual_xml,
 )
-from legcal.machine.urdf import MJCF, XmlProblems, number_list, parse_urdf, parse_xml
+from legcal.machine.urdf import MJCF, Urdf, XmlProblems, number_list, parse_urdf, parse_xml
 
 WORLD = "world"
 MAX_PARTS = 5000
@@ -91,8 +92,11 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     frames, kinds = close_loops(loops, reader.tree, path)
     name = root.get("model", "").strip() or path.stem
     urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
+    urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)
+    notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
+    values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
     file = MechanismFile(closed_loop=frames, type=kinds, name_mot=motors)
-    return Source(path, file, replace(urdf, wording=MJCF), values=reader.references)
+    return Source(path, file, replace(urdf, wording=MJCF), notes * bool(dropped), values)
 
 
 class MjcfReader:
@@ -110,6 +114,8 @@ class MjcfReader:
         self._joints: dict[str, str] = {}  # type of every joint
         self.sites: dict[str, LinkFrame] = {}
         self._names: set[str] = set()  # taken names of links and joints
+        named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
+        self._driven = frozenset(str(element.get("joint")) for element in named)
         self._defaults: dict[str, Defaults] = {"main": {}}
         for top in root.iterfind("default"):
             self._read_defaults(top, "main", {})
@@ -189,6 +195,9 @@ class MjcfReader:
         inside = BodyElement(element, name, EYE, self._childclass(part))
         joints, bodies, visuals = self._contents(inside)
         at, T_at_body = part.body, T_parent_body
+        if at == WORLD and self._is_free(joints):
+            self.tree.joint(self._unused(f"{name}_free"), "floating", at, name, T_at_body)
+            at, joints = name, []
         for i, joint in enumerate(joints):
             only, last = len(joints) == 1, i + 1 == len(joints)
             at, T_at_body = self._joint(joint, at, T_at_body, last=last, only=only)
@@ -196,6 +205,20 @@ class MjcfReader:
             self.tree.joint(self._unused(f"{name}_fixed"), "fixed", at, name, T_at_body)
         self.tree.link(name, visuals)
         return bodies
+
+    def _is_free(self, joints: list[BodyElement]) -> bool:
+        """Return whether the joints of a body are passive and leave it all six freedoms."""
+        axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
+        for part in joints:
+            attributes = self._attributes(part)
+            kind = attributes.get("type", "hinge")
+            axis = number_list(attributes.get("axis", "0 0 1"), 3)
+            driven = attributes.get("name") in self._driven
+            if part.element.tag != "joint" or kind not in axes or axis is None or driven:
+                return False
+            axes[kind].append(np.array(axis))
+        turns_freely = len(axes["ball"]) == 1 if axes["ball"] else _span_space(axes["hinge"])
+        return _span_space(axes["slide"]) and turns_freely and len(axes["hinge"]) in (0, 3)
 
     def _joint(
         self, part: BodyElement, at: str, T_at_body: RigidTransform, *, last: bool, only: bool
@@ -608,6 +631,33 @@ class MjcfReader:
 
 def _attributes_of(element: etree._Element) -> dict[str, str]:
     return {str(key): str(value) for key, value in element.attrib.items()}
+
+
+def _span_space(axes: list[Array]) -> bool:
+    """Return whether there are three linearly independent axes."""
+    return len(axes) == 3 and int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) == 3
+
+
+def _without_loose_bodies(
+    urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
+) -> tuple[Urdf, list[str]]:
+    """Return the tree without free bodies outside all closures, and the names of these."""
+    moved = {j.child for j in urdf.joints.values() if j.moves and j.type != "floating"}
+    loose = {
+        link
+        for links, closed in moving_groups(urdf, frames)
+        if not closed and moved.isdisjoint(links)
+        for link in links
+    }
+    if not loose:
+        return urdf, []
+    joints = [j for j in urdf.joints.values() if j.child in loose]
+    for joint in joints:
+        del tree.joints[joint.name]
+    for link in loose:
+        del tree.links[link]
+    freed = [f"'{j.child}'" for j in joints if j.type == "floating"]
+    return parse_urdf(urdf.path, tree.robot(name), travel_needed=False), freed
 
 
 def _z_onto(direction: Array) -> Rotation:

@@ -38,23 +38,11 @@ _BLOCKS = (
     *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
     *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # those of its actuator
 )
-# Name and unit of each of LegColumns, after the name of the leg or of the joint of its motor.
-_COLUMNS = (
-    *((f"{side}.{axis}", "m") for side in ("base", "platform") for axis in "xyz"),
-    ("offset", "m"),
-    *((f"{side}_axis.{angle}", "rad") for side in ("base", "platform") for angle in (1, 2)),
-    ("twist", "rad"),
-    *(
-        (f"{part}.{k}", unit)
-        for part, unit in (("axis", "rad"), ("axis_point", "m"))
-        for k in (1, 2)
-    ),
-    ("gain", ""),
-    *(
-        (f"{part}.{k}", unit)
-        for part, unit in (("arm_axis", "rad"), ("arm_point", "m"))
-        for k in (1, 2)
-    ),
+_LOCAL_NAMES = (
+    *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
+    "offset",
+    *(f"{side}_axis.{angle}" for side in ("base", "platform") for angle in (1, 2)),
+    "twist",
 )
 
 
@@ -109,21 +97,49 @@ def parametrize(
             for column in block:
                 if not free[j, column]:
                     continue
-                parameter = _name_of(names[j], leg, column), _COLUMNS[column][1]
-                if parameter not in parameters:  # legs on one motor share its numbers
-                    parameters.append(parameter)
-                place[j, column] = parameters.index(parameter)
+                if column < columns.OWN:
+                    name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
+                else:
+                    name, unit = _name_of_actuator(leg, column)
+                    shared = next((i for i, (n, _) in enumerate(parameters) if n == name), None)
+                    if shared is not None:
+                        place[j, column] = shared
+                        continue
+                place[j, column] = len(parameters)
+                parameters.append((name, unit))
     return Parametrization(tuple(n for n, _ in parameters), tuple(u for _, u in parameters), place)
 
 
-def _name_of(name: str, leg: Leg, column: int) -> str:
-    """Return the name of a parameter of a leg, or of its motor."""
-    number, motor = _COLUMNS[column][0], leg.actuator
-    if column < LegColumns.OWN or motor is None:
-        is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
-        return f"{name}.{'length' if is_length else number}"
-    is_direction = column < ActuatorColumns.AXIS.stop and not motor.turns
-    return f"{motor.joint}.{number.replace('axis', 'direction') if is_direction else number}"
+def _local_name(leg: Leg, column: int) -> str:
+    """Return the name of a number of the leg itself."""
+    is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
+    return "length" if is_length else _LOCAL_NAMES[column]
+
+
+def _unit(column: int) -> str:
+    """Return the unit of a number."""
+    return "m" if column <= LegColumns.LENGTH else "rad"
+
+
+def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
+    """Return the name and the unit of a number of the actuator of a leg."""
+    actuator = leg.actuator
+    if actuator is None:
+        raise ValueError("a leg that hangs on no actuator has no numbers of one")
+    if column == ActuatorColumns.GAIN:
+        return f"{actuator.joint}.gain", ""
+    axis = "axis" if actuator.turns else "direction"
+    vector, columns, unit = next(
+        (vector, columns, unit)
+        for vector, columns, unit in (
+            (axis, ActuatorColumns.AXIS, "rad"),
+            ("axis_point", ActuatorColumns.POINT, "m"),
+            ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
+            ("arm_point", ActuatorColumns.ARM_POINT, "m"),
+        )
+        if columns.start <= column < columns.stop
+    )
+    return f"{actuator.joint}.{vector}.{column - columns.start + 1}", unit
 
 
 def is_held_by_default(name: str) -> bool:

@@ -19,7 +19,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
-from legcal.files.schema import closest, unused_name
+from legcal.files.schema import closest
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.chain import Closure
@@ -43,15 +43,13 @@ class Source:
     file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
     notes: tuple[str, ...] = ()  # notes on the conversion, one sentence each
-    values: Mapping[str, float] = field(default_factory=dict)  # drawn joint values [rad or m]
+    values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
+    poses: Mapping[str, RigidTransform] | None = None
+    is_drawn_open: bool = False  # the drawing is open (but has all travels) and was closed
+    drawn: Mapping[str, float] = field(default_factory=dict)  # drawn values of motors [m, rad]
     base: str | None = None  # stated links of a file without a block
     platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
-
-    @property
-    def drawn(self) -> dict[str, float]:
-        """The drawn values of the motors [rad or m]."""
-        return {motor: self.values.get(motor, 0.0) for motor in self.file.name_mot}
 
     @property
     def closures(self) -> list[Closure]:
@@ -73,7 +71,12 @@ class UrdfBuilder:
 
     def unused(self, name: str, others: Set[str] = frozenset()) -> str:
         """Return a name unused by links and joints: the given one, or it with a number."""
-        return unused_name(name, self.links.keys() | self.joints.keys() | others)
+        taken = self.links.keys() | self.joints.keys() | others
+        number, unused = 1, name
+        while unused in taken:
+            number += 1
+            unused = f"{name}_{number}"
+        return unused
 
     def link(self, name: str, visuals: str = "") -> None:
         """Add or replace a link with its visuals."""

@@ -24,9 +24,9 @@ from legcal.geometry.types import Array
 from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
 from legcal.machine.classification import (
     classify_leg,
-    gap,
     is_actuator,
     joint_tolerance,
+    nearest,
     off_square,
     parallel,
     undirected,
@@ -252,25 +252,21 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
     count = n_frame_legs(spatial=normals is None)
     if len(names) <= count:
         return list(names)
-    A, B = (np.array([getattr(c, end) for c in chains]) for end in ("A", "B_platform"))
+    ends = (
+        np.array([chain.A for chain in chains]),
+        np.array([chain.B_platform for chain in chains]),
+    )
     if normals is not None:
-        A, B = _flat(A, normals[0]), _flat(B, normals[1])
-    motors = [
-        name if c.actuator is None else c.motor for name, c in zip(names, chains, strict=True)
+        ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
+    chosen = list(combinations(range(len(names)), count))
+    of_motors = [
+        [chains[j].motor if chains[j].actuator is not None else names[j] for j in c] for c in chosen
     ]
-    return [names[j] for j in widest(A, B, motors, count)]
-
-
-def widest(A: Array, B: Array, motors: Sequence[str | None], count: int) -> tuple[int, ...]:
-    """Return a number of legs with the largest span of joints on base and platform, (n, 3) each.
-
-    If possible each is on a motor of its own.
-    """
-    chosen = list(combinations(range(len(A)), count))
-    n_motors = [len({motors[j] for j in legs}) for legs in chosen]
-    chosen = [legs for legs, n in zip(chosen, n_motors, strict=True) if n == max(n_motors)]
-    spans = np.array([_span(A[list(legs)]) * _span(B[list(legs)]) for legs in chosen])
-    return chosen[int(np.argmax(spans >= spans.max() * (1.0 - TIE)))]
+    most = max(len(set(of_legs)) for of_legs in of_motors)  # one leg per actuator, if possible
+    chosen = [c for c, m in zip(chosen, of_motors, strict=True) if len(set(m)) == most]
+    spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
+    first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
+    return [names[j] for j in chosen[first]]
 
 
 def level_rotation(A: Array, B: Array) -> Rotation:
@@ -545,10 +541,15 @@ def _is_an_arm(steps: list[Step], within: float) -> bool:
     """Return whether joints form an arm whose end moves: one revolute, or several apart."""
     if any(step.connection.type != "revolute" for step in steps):
         return False
-    return len(steps) == 1 or any(
-        gap(Axis("", *lower.line(lower.far)), Axis("", *upper.line(upper.near))) > within
-        for lower, upper in pairwise(steps)
-    )
+    if len(steps) == 1:
+        return True
+    for lower, upper in pairwise(steps):
+        near, far = nearest(
+            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
+        )
+        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
+            return True
+    return False
 
 
 def _name(connection: Connection) -> str:

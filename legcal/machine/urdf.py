@@ -262,11 +262,9 @@ class Wording:
     no_home: str = "legcal.home is not given"
     state_home: str = "write legcal.home"
     correct_home: str = "correct legcal.home"
-    readings: str = "legcal.home_readings"
     state_readings: str = "write legcal.home_readings with the reading of each actuator at home"
     state_ends: str = "write legcal.base, legcal.platform and legcal.legs"
     correct_ends: str = "correct legcal.base or legcal.platform"
-    correct_unit: str = "write all lengths in metres (are they millimetres?)"
 
 
 BLOCK = Wording()

@@ -21,12 +21,15 @@ from legcal.estimation.problem import Linearization
 from legcal.estimation.solver import NormalEquations, normal_equations
 from legcal.estimation.uncertainty import Scores, response
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.machine.leg import ParameterId
 from legcal.vision.camera import shared_cameras
 
 FITTED_CAMERA = (
     "the camera corrections that the measurements suggest"  # where they contradict their files
 )
 INTRINSICS = "what the fit leaves unknown of the intrinsics, a part of this,"
+EXACT_CAMERAS = "an error of focal lengths that files give without covariance, by one sigma"
+SIGMA_EXACT = 3e-3  # of such a focal length, relative: refocused, or known from a few photographs
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
@@ -54,6 +57,28 @@ def sensitivity_to_cameras(
     steps = response(problem, linear, normal, changes)
     steps += normal.kept_covariance() @ linear.prior_J.T @ pull[:, None]
     return {FITTED_CAMERA: kinematic_steps(problem, steps)}
+
+
+def sensitivity_to_exact_cameras(cameras: CameraResiduals) -> dict[str, Array]:
+    """Return the change of parameters with the error that each exact focal length may have.
+
+    Of cameras whose files state no covariance, unless somebody fixed them; the measurements say as
+    much as they know, by their score.
+    """
+    problem, state = cameras.problem, cameras.state
+    names = problem.outlines.views
+    owners = np.array(shared_cameras(names, problem.first_cameras))
+    chosen = {ParameterId.parse(name).owner for name in problem.choices.fixed}
+    free = np.array([owner in chosen for owner in owners])
+    free |= (_camera_columns(problem)[:, :2] < problem.n_kept).any(axis=1)
+    unit, moved = _camera_error(state, _FOCAL, {}), list[Array]()
+    for owner in dict.fromkeys(owners[~free].tolist()):
+        error = unit * (owners == owner)[:, None]
+        scores = cameras.scores([error])
+        variance = 1.0 / (SIGMA_EXACT**-2 + max(float(scores.information[0, 0]), 0.0))
+        off = float(np.hypot(scores.score[0] * variance, np.sqrt(variance)))
+        moved.append(off * kinematic_steps(problem, cameras.response(error)))
+    return {EXACT_CAMERAS: np.hstack(moved)} if moved else {}
 
 
 def sensitivity_to_intrinsics(problem: FitProblem, covariance: Array) -> dict[str, Array]:
@@ -218,6 +243,11 @@ class CameraResiduals:
             for name, by in self.derivatives.items()
         }
 
+    def response(self, error: Array) -> Array:
+        """Return the steps (n_kept, 1) of the unknowns with errors (n_views, 5) of cameras."""
+        columns = {name: change[..., None] for name, change in self.changes(error).items()}
+        return response(self.problem, self.linear, self._plain, columns)
+
     def zoomed(self, view: int) -> dict[str, Array]:
         """Return the change of whitened residuals (n, q) by an error of a view's focal length."""
         error = _camera_error(self.state, _FOCAL, {})
@@ -265,7 +295,7 @@ class CameraResiduals:
             columns.append(len(errors) + np.arange(len(units), dtype=np.intp))
             errors += units
         selected = dict[int, float]()
-        scores = given = self._scores(errors) if errors else None
+        scores = given = self.scores(errors) if errors else None
         while given is not None and len(selected) < len(kinds):
             left = {k: given.estimate(columns[k]) for k in range(len(kinds)) if k not in selected}
             best = max(left, key=lambda k: left[k].square)
@@ -298,7 +328,7 @@ class CameraResiduals:
         if len(views) < 2:
             return None
         in_view = [error * (np.arange(len(error)) == v)[:, None] for v in views]
-        scores, columns = self._scores(in_view), np.arange(len(views))
+        scores, columns = self.scores(in_view), np.arange(len(views))
         given, zoomed = scores.given(scores.estimate(columns, np.ones((len(views), 1)))), []
         for i, v in enumerate(views):
             number = given.estimate(columns[[i]])
@@ -317,7 +347,7 @@ class CameraResiduals:
         is_known = np.all(np.isin(_camera_columns(problem)[:, wrong], known_columns), axis=1)
         return np.asarray(is_known & np.isin(np.arange(len(error)), problem.outlines.view))
 
-    def _scores(self, errors: Sequence[Array]) -> Scores:
+    def scores(self, errors: Sequence[Array]) -> Scores:
         """Return the scores of errors (n_views, 5) of cameras."""
         changes = [self.changes(error) for error in errors]
         columns = {

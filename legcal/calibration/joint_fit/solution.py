@@ -38,6 +38,7 @@ from legcal.calibration.joint_fit.sensitivity import (
     CameraResiduals,
     WrongIntrinsic,
     sensitivity_to_cameras,
+    sensitivity_to_exact_cameras,
     sensitivity_to_intrinsics,
 )
 from legcal.calibration.joint_fit.variables import State
@@ -268,6 +269,7 @@ def assemble_solution(
         },
         gammas=gammas,
         sensitivities=sensitivity_to_cameras(cameras, normal, contradicted)
+        | sensitivity_to_exact_cameras(cameras)
         | sensitivity_to_scale(problem, state, linear, kept)
         | sensitivity_to_intrinsics(problem, kept),
         outlines=_with_rejections(outlines, fit),
