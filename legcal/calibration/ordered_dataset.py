@@ -298,7 +298,7 @@ def nominal_poses(
             [
                 f"The readings of {images_in_words(measurements, rows)} could not be used: {cause} "
                 f"the image{'s' * (len(rows) > 1)} out (--leave-out "
-                f"{images_to_name(measurements, np.array(rows)[:, None])})."
+                f"{images_to_name(measurements, list(np.array(rows)[:, None]))})."
                 for cause, rows in by_cause(causes)
             ]
         )
