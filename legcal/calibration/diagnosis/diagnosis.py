@@ -272,9 +272,8 @@ class _Judge:
         for g, group in enumerate(self.groups):
             now = self.of_groups[g]
             of = [k for k, m in enumerate(some) if not m.true.is_as(self.given, group.rows)]
-            gain[
-                np.array(of, dtype=np.intp)[:, None], now.row
-            ] = -now.support  # where all agree, nothing is to be gained
+            # Where all agree, nothing is to be gained.
+            gain[np.array(of, dtype=np.intp)[:, None], now.row] = -now.support
             if now.images < len(now.row):
                 then = self.compare([some[k].true for k in of], g, group.rows, ())
                 for k, one in zip(of, then, strict=True):
