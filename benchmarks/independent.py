@@ -21,6 +21,7 @@ A line a calibration:
 
     views      placed, of those there are
     legs       used in an image, of those half visible there [%]
+    width      sightings of parts with both edges whose width is not the cylinder's [%]
     used       outlines; ends of these off the true contour [px]: median, 90 %, and the share
                that is more than 1 px off
     off        error of the platform at the session's poses, rms [mm]; and what is stated of it
@@ -35,6 +36,7 @@ import argparse
 import json
 import shutil
 import time
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,6 +50,8 @@ from scipy.spatial.transform import RigidTransform
 from legcal import LegcalError, calibrate, load_dataset, load_mechanism
 from legcal.calibration.result import Calibration
 from legcal.data.landmarks import LANDMARKS_NAME
+from legcal.data.outlines import Outlines
+from legcal.data.reasons import Reason
 from legcal.geometry.motions import components, pose_distance
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
@@ -57,7 +61,8 @@ CLICK_PX = 3.0  # noise of clicks
 OF_RADIUS = 0.3  # part of a radius within which a part is the rod whose contours are known
 VISIBLE = 0.5  # share of a leg above which it ought to be used
 HEADER = (
-    f"{'set':18}{'as':8}{'views':>6}{'legs':>6}{'used':>10}{'median':>8}{'90 %':>7}{'>1 px':>7}"
+    f"{'set':18}{'as':8}{'views':>6}{'legs':>6}{'width':>7}{'used':>9}{'median':>8}"
+    f"{'90 %':>7}{'>1 px':>7}"
     f"{'off':>9}{'stated':>8}{'e`C^-1e':>9}{'trusted':>9}{'seconds':>9}"
 )
 
@@ -75,6 +80,7 @@ class Outcome:
     n_placed: int = 0
     legs: float = 0.0  # share of the half visible ones that are used
     n_used: int = 0
+    width: float = 0.0  # share of the parts with both edges that have another width
     median: float = 0.0  # [px]
     most: float = 0.0  # 90 % [px]
     wrong: float = 0.0  # share of more than 1 px
@@ -89,7 +95,8 @@ class Outcome:
             return f"{start}{self.seconds:8.1f} s refused: {self.refusal[:300]}"
         return (
             f"{start}{f'{self.n_placed}/{self.n_views}':>6}{100 * self.legs:6.0f}"
-            f"{self.n_used:10d}{self.median:8.3f}{self.most:7.2f}{100 * self.wrong:7.1f}"
+            f"{100 * self.width:7.0f}{self.n_used:9d}{self.median:8.3f}{self.most:7.2f}"
+            f"{100 * self.wrong:7.1f}"
             f"{1e3 * self.off:9.3f}{1e3 * self.sigma:8.3f}{self.square:9.2f}"
             f"{'yes' if self.trusted else 'no':>9}{self.seconds:9.1f}"
         )
@@ -237,6 +244,7 @@ def judged(
         n_placed=len({int(m.view[row]) for row, _ in used}),
         legs=len(used.intersection(visible)) / max(len(visible), 1),
         n_used=len(errors),
+        width=other_widths(o),
         median=float(np.median(errors)),
         most=float(np.percentile(errors, 90)),
         wrong=float(np.mean(np.array(errors) > 1.0)),
@@ -244,6 +252,19 @@ def judged(
         sigma=sigma,
         square=normalised_square(by_pose, C, step, machine.B_platform),
     )
+
+
+def other_widths(outlines: Outlines) -> float:
+    """Return the share of the sightings of parts with both edges that have another width."""
+    of_width = outlines.rejected_for(Reason.WIDTH)
+    edges, wide = Counter[tuple[int, int, str]](), set[tuple[int, int, str]]()
+    for i in np.flatnonzero(outlines.used | of_width).tolist():
+        part = int(outlines.row[i]), int(outlines.leg[i]), outlines.part[i]
+        edges[part] += 1
+        if of_width[i]:
+            wide.add(part)
+    both = {part for part, n in edges.items() if n > 1} | wide
+    return len(wide) / max(len(both), 1)
 
 
 def main() -> None:

@@ -111,6 +111,7 @@ def test_wrong_edges_are_rejected_and_bodies_may_lean() -> None:
     sigma = [s for name, s in zip(estimates.names, estimates.sigma, strict=True) if name in truth]
     assert np.abs(np.divide(off, sigma)).max() < 4.0
     assert np.median(np.abs(off)) < 2e-4
+    assert np.abs(off).max() < 1e-3  # leg 1 shows nothing but edges
 
 
 @pytest.fixture(scope="module")

@@ -66,13 +66,10 @@ def without_motors(machine: Path, *left: str) -> Path:
     ("kind", "n_views", "n_images", "rank"),
     [("3-SPS + passive UPS", 2, 6, 15), ("5-SPS", 1, 1, 13)],
 )
-def test_ranks_are_those_of_all_equations_written_out(
+def test_ranks_are_those_of_a_dense_jacobian(
     kind: str, n_views: int, n_images: int, rank: int, tmp_path: Path
 ) -> None:
-    """Those of a dense Jacobian, by differences, of outlines, readings and radii known to 2 %.
-
-    It had joints, offsets, radii, poses and cameras as unknowns; the last three are left out here.
-    """
+    """It was computed once, by differences, of outlines, readings and radii known to 2 %."""
     machine = load_mechanism(write_machine(tmp_path, drawn(kind), Layout()))
     found = legcal.identifiability(machine, [machine.leg_names] * n_views, images=n_images)
     assert found.full.of == 6 * machine.n_legs - 12 + len(machine.motors)

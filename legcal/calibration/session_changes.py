@@ -345,7 +345,7 @@ def _forward_selection(
 ) -> tuple[list[_Solved], _Scores]:
     """Return the numbers that the fit lacks, the most certain first, and the scores given them."""
     lacking = list[_Solved]()
-    while solved and len(lacking) < MAX_FINDINGS:
+    while solved and sum(one.test.of.kind != "camera_file" for one in lacking) < MAX_FINDINGS:
         best = min(solved, key=lambda number: (number.p_value, -number.square))
         if best.p_value * n_tests > DOUBT_BY_CHANCE:
             break

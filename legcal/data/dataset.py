@@ -67,7 +67,9 @@ PLAN_NAME = "plan.json"  # plan in the folder of a planned session
 POSES_NAME = "poses.csv"  # its poses
 CACHE_NAME = ".legcal-cache.json"
 MAX_KEPT = 128 * 2**20  # size of the cache of decoded images [bytes]
-FARTHEST = 50.0  # sizes of the machine from base to camera, in metres
+# Sizes of the machine from the base to a camera: one that stands farther is stated in millimetres,
+# if it then stands far enough
+FARTHEST, NEAREST = 50.0, 0.5
 MIN_CORNERS = 4  # corners in an image that must place its camera
 
 
@@ -319,7 +321,9 @@ def load_dataset(
     in_mm = [
         name
         for name, view in entry.views.items()
-        if (T := view.T_base_camera) and np.linalg.norm(T.xyz) > FARTHEST * machine.size
+        if (T := view.T_base_camera)
+        and (far := float(np.linalg.norm(T.xyz)) / machine.size) > FARTHEST
+        and 1e-3 * far > NEAREST
     ]
     views = tuple(
         _view(name, view, cameras[path], 1e-3 if name in in_mm else 1.0)

@@ -526,11 +526,11 @@ def _hidden(bodies: Bodies, P: Array, body: IntArray, radius: Array) -> BoolArra
     hides = _before(flat, bodies.A, *bodies.axes, largest_radius, beside)
     hides &= np.repeat(body, P.shape[2])[:, None] != np.arange(bodies.A.shape[1])
     hidden: BoolArray = np.any(hides, axis=-1).reshape(P.shape[:-1])
-    own_leg, beside = (
+    own_leg, reach = (
         np.repeat(x, N_ALONG_PART) for x in (np.where(body < bodies.n_legs, body, -1), radius)
     )
     for k, placed in enumerate(bodies.occluders):
-        hides = placed.hide(P[k].reshape(-1, 3), own_leg, beside, beside) >= 0
+        hides = placed.hide(P[k].reshape(-1, 3), own_leg, reach, reach) >= 0
         hidden[k] |= hides.reshape(hidden.shape[1:])
     thick, n = _IN_PLATE * float(largest_radius[: bodies.n_legs].max(initial=0.0)), bodies.n_legs
     hidden |= behind_plate(P, bodies.A[:, :n][:, ~bodies.is_moved], thick)
