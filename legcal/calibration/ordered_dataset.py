@@ -288,20 +288,20 @@ def nominal_poses(
         for k in unreached
         if not residual[k] <= limit and k not in contradicting
     }
-    causes = {
-        row: refused[pose]
-        for row, pose in enumerate(measurements.pose.tolist())
-        if pose in refused and row not in unused
-    }
-    if causes:
-        raise DatasetError(
-            [
-                f"The readings of {images_in_words(measurements, rows)} could not be used: {cause} "
-                f"the image{'s' * (len(rows) > 1)} out (--leave-out "
-                f"{images_to_name(measurements, list(np.array(rows)[:, None]))})."
-                for cause, rows in by_cause(causes)
-            ]
+    of_pose = dict[int, list[int]]()  # rows
+    for row, pose in enumerate(measurements.pose.tolist()):
+        if pose in refused and row not in unused:
+            of_pose.setdefault(pose, []).append(row)
+    problems = list[str]()
+    for cause, first in by_cause({rows[0]: refused[pose] for pose, rows in of_pose.items()}):
+        rows = np.array([row for k in measurements.pose[list(first)] for row in of_pose[k]])
+        problems.append(
+            f"The readings of {images_in_words(measurements, first)} could not be used: {cause} "
+            f"the image{'s' * (len(rows) > 1)} out "
+            f"(--leave-out {images_to_name(measurements, list(rows[:, None]))})."
         )
+    if problems:
+        raise DatasetError(problems)
     return tuple(T), residual
 
 
