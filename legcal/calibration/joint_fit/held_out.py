@@ -11,8 +11,9 @@ neighbouring poses, so that a fit has to extrapolate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -25,9 +26,9 @@ from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.estimation.problem import linearize
-from legcal.estimation.solver import NormalEquations, information, minimise, normal_equations
-from legcal.estimation.uncertainty import left_out_blocks, leverage, marginal
+from legcal.estimation.problem import Residuals, linearize
+from legcal.estimation.solver import NormalEquations, information, minimise
+from legcal.estimation.uncertainty import left_out_blocks, leverage
 from legcal.geometry.types import Array, IntArray
 
 
@@ -193,7 +194,8 @@ class CrossValidation:
         (n_blocks,) their expectations.
     gain : float or None
         By how much the squares of the nominal model are larger, cameras and poses fitted again,
-        over what the change of the model claims; None where that could not be fitted.
+        over what they would be with the measurements that the fit predicts; None where that could
+        not be fitted.
     gain_sigma : float
         Its standard deviation about one, if the claim is right.
     """
@@ -221,29 +223,43 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     left_out = left_out_blocks(problem, state, linear, block)
     squares = np.array([one.squares for one in left_out])
     dof = np.array([one.dof for one in left_out], dtype=np.intp)
-    n = problem.n_kinematic
-    nominal = problem.legs.vector(problem.legs.nominal)[problem.free]
-    change = problem.coordinates(state)[:n] - nominal
-    everything = normal_equations(problem, state, linear).reduced()
-    # What blocks add to the information of all else, cameras unknown.
-    of_all, *of_rest = (
-        float(change @ marginal(information, np.arange(n)) @ change)
-        for information in (everything, *(one.information for one in left_out))
-    )
-    claimed = len(of_rest) * of_all - sum(of_rest)
-    held = problem.changed(held_directions=np.eye(n))
+    held = problem.changed(held_directions=np.eye(problem.n_kinematic))
     begin = replace(state, legs=problem.parameters.at_fixed(problem.legs.nominal))
-    gain, gain_sigma = None, 2.0 / float(np.sqrt(claimed)) if claimed > 0.0 else 0.0
+    gain, gain_sigma = None, 0.0
     try:
-        minimum = minimise(
-            held, begin, max_iterations=_STEPS_TO_NOMINAL, tolerance=_NEARLY, must_converge=False
+        of_nominal, claimed = (
+            _squares_near(measured, begin, block) for measured in (held, _as_if_true(held, state))
         )
-        by_nominal = left_out_blocks(held, minimum.state, minimum.linear, block)
         if claimed > 0.0:
-            gain = float(sum(one.squares for one in by_nominal) - squares.sum()) / claimed
+            gain = (of_nominal - float(squares.sum())) / claimed
+            gain_sigma = 2.0 / float(np.sqrt(claimed))
     except DidNotConverge:  # the nominal model does not close at these readings
         pass
     return CrossValidation(squares, dof, gain, gain_sigma)
+
+
+def _squares_near(problem: FitProblem, begin: State, block: IntArray) -> float:
+    """Return the squares of blocks that are left out, near the minimum from a state."""
+    minimum = minimise(
+        problem, begin, max_iterations=_STEPS_TO_NOMINAL, tolerance=_NEARLY, must_converge=False
+    )
+    left_out = left_out_blocks(problem, minimum.state, minimum.linear, block)
+    return float(sum(one.squares for one in left_out))
+
+
+def _as_if_true(problem: FitProblem, state: State) -> FitProblem:
+    """Return the problem with the measurements that a state predicts, without noise."""
+
+    def less(rows: Callable[[State], Residuals], off: Array, at: State) -> Residuals:
+        found = rows(at)
+        return replace(found, r=found.r - off)
+
+    return problem.with_factors(
+        *(
+            replace(factor, rows=partial(less, factor.rows, factor.rows(state).r))
+            for factor in problem.factors
+        )
+    )
 
 
 def with_weights(problem: FitProblem, state: State) -> FitProblem:
