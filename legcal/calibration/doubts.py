@@ -267,11 +267,8 @@ def _not_round(legs: Sequence[Leg], outlines: Outlines) -> list[Doubt]:
     for j, leg in enumerate(legs):
         for part, radius in leg.radius_along.items():
             alike.setdefault(round(radius, 6), []).append((j, part))
-    is_wide, part_of, doubts = (
-        outlines.rejected_for(Reason.WIDTH),
-        np.array(outlines.part),
-        list[Doubt](),
-    )
+    is_wide, part_of = outlines.rejected_for(Reason.WIDTH), np.array(outlines.part)
+    doubts = list[Doubt]()
     for radius, parts in alike.items():
         of_part = [(outlines.leg == j) & (part_of == part) for j, part in parts]
         is_wrong = [len(np.unique(outlines.row[of & is_wide])) for of in of_part]

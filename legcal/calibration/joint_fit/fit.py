@@ -176,7 +176,7 @@ def _fit_without_wrong_arms(
 def _gain_by_edges(fit: Posterior) -> float:
     """Return the part by which edges of bodies lower the predicted error of the platform.
 
-    One where the rest does not determine it; zero without such edges.
+    One where the rest does not determine it, or nothing is estimated; zero without such edges.
     """
     problem, state, n = fit.problem, fit.state, fit.problem.n_kinematic
     factor, legs = problem.factor("edges"), problem.legs
@@ -197,7 +197,7 @@ def _gain_by_edges(fit: Posterior) -> float:
             errors.append(expected_error(by_parameters, covariance).mean_displacement)
     except NotIdentifiable:
         return 1.0
-    return 1.0 - errors[0] / errors[1]
+    return 1.0 - errors[0] / errors[1] if errors[1] > 0.0 else 1.0
 
 
 def _with_edges(solution: Solution, edges: Outlines, gain: float) -> Solution:
