@@ -290,6 +290,15 @@ class Estimated(NamedTuple):
     square: float  # of the score over its variance: chi-squared of that rank if all are zero
 
 
+def size_left(score: float, information: float, sigma: float) -> float:
+    """Return how large a number that a fit takes as zero may be, by its score and a prior.
+
+    The root mean square of its distribution with the standard deviation *sigma* as prior.
+    """
+    variance = 1.0 / (sigma**-2 + max(information, 0.0))
+    return float(np.hypot(score * variance, np.sqrt(variance)))
+
+
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Rao's scores of numbers that a fit lacks, and their information (:func:`score_test`)."""

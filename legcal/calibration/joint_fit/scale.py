@@ -27,7 +27,7 @@ from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
-from legcal.estimation.uncertainty import residual_changes, response, score_test
+from legcal.estimation.uncertainty import residual_changes, response, score_test, size_left
 from legcal.geometry.types import Array
 from legcal.machine.leg import LINKS, LegColumns, ParameterId
 
@@ -93,8 +93,7 @@ def sensitivity_to_scale(
         columns = {"readings": _whitened_travel(problem, travel)[..., None]}
         normal = normal_equations(problem, state, linear)
         (score,), ((information,),) = score_test(problem, linear, normal, columns)
-        variance = 1.0 / (problem.legs.sigma_travel**-2 + information)
-        off = float(np.hypot(score * variance, np.sqrt(variance)))
+        off = size_left(score, information, problem.legs.sigma_travel)
         moved = kinematic_steps(problem, response(problem, linear, normal, columns))
         return {ALL_READINGS: off * moved}
     parametrization = problem.legs.parametrization

@@ -19,7 +19,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State, intrinsic_of
 from legcal.estimation.problem import Linearization
 from legcal.estimation.solver import NormalEquations, normal_equations
-from legcal.estimation.uncertainty import Scores, response
+from legcal.estimation.uncertainty import Scores, response, size_left
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import ParameterId
 from legcal.vision.camera import shared_cameras
@@ -75,8 +75,7 @@ def sensitivity_to_exact_cameras(cameras: CameraResiduals) -> dict[str, Array]:
     for owner in dict.fromkeys(owners[~free].tolist()):
         error = unit * (owners == owner)[:, None]
         scores = cameras.scores([error])
-        variance = 1.0 / (SIGMA_EXACT**-2 + max(float(scores.information[0, 0]), 0.0))
-        off = float(np.hypot(scores.score[0] * variance, np.sqrt(variance)))
+        off = size_left(scores.score[0], scores.information[0, 0], SIGMA_EXACT)
         moved.append(off * kinematic_steps(problem, cameras.response(error)))
     return {EXACT_CAMERAS: np.hstack(moved)} if moved else {}
 
