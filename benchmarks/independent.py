@@ -36,7 +36,6 @@ import argparse
 import json
 import shutil
 import time
-from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,10 +47,10 @@ from real_cameras import normalised_square
 from scipy.spatial.transform import RigidTransform
 
 from legcal import LegcalError, calibrate, load_dataset, load_mechanism
+from legcal.calibration.doubts import width_counts
 from legcal.calibration.result import Calibration
 from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.outlines import Outlines
-from legcal.data.reasons import Reason
 from legcal.geometry.motions import components, pose_distance
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
@@ -256,15 +255,9 @@ def judged(
 
 def other_widths(outlines: Outlines) -> float:
     """Return the share of the sightings of parts with both edges that have another width."""
-    of_width = outlines.rejected_for(Reason.WIDTH)
-    edges, wide = Counter[tuple[int, int, str]](), set[tuple[int, int, str]]()
-    for i in np.flatnonzero(outlines.used | of_width).tolist():
-        part = int(outlines.row[i]), int(outlines.leg[i]), outlines.part[i]
-        edges[part] += 1
-        if of_width[i]:
-            wide.add(part)
-    both = {part for part, n in edges.items() if n > 1} | wide
-    return len(wide) / max(len(both), 1)
+    parts = set(zip(outlines.leg.tolist(), outlines.part, strict=True))
+    wrong, right = np.sum([width_counts(outlines, *part) for part in parts], axis=0).tolist()
+    return float(wrong / max(wrong + right, 1))
 
 
 def main() -> None:

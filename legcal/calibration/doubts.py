@@ -49,7 +49,7 @@ from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import components
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.parameters import geometries, vector_of
@@ -267,16 +267,13 @@ def _not_round(legs: Sequence[Leg], outlines: Outlines) -> list[Doubt]:
     for j, leg in enumerate(legs):
         for part, radius in leg.radius_along.items():
             alike.setdefault(round(radius, 6), []).append((j, part))
-    is_wide, part_of = outlines.rejected_for(Reason.WIDTH), np.array(outlines.part)
     doubts = list[Doubt]()
     for radius, parts in alike.items():
-        of_part = [(outlines.leg == j) & (part_of == part) for j, part in parts]
-        is_wrong = [len(np.unique(outlines.row[of & is_wide])) for of in of_part]
-        is_right = [_rows_with_both(outlines, of & outlines.used) for of in of_part]
-        n, n_wrong = sum(is_wrong) + sum(is_right), sum(is_wrong)
+        counts = np.array([width_counts(outlines, j, part) for j, part in parts])
+        n, n_wrong = int(counts.sum()), int(counts[:, 0].sum())
         if n_wrong < max(MIN_WIDTHS, MOST_WIDTHS * n):
             continue
-        names = [part for (_, part), wrong in zip(parts, is_wrong, strict=True) if wrong]
+        names = [part for (_, part), (wrong, _) in zip(parts, counts, strict=True) if wrong]
         what = (
             f"the edges of {few(names)} are not as far apart as those of a cylinder of radius "
             f"{1e3 * radius:.3g} mm in {n_wrong} of the {n} times that both were seen"
@@ -289,9 +286,15 @@ def _not_round(legs: Sequence[Leg], outlines: Outlines) -> list[Doubt]:
     return doubts
 
 
-def _rows_with_both(outlines: Outlines, of: BoolArray) -> int:
-    """Return the number of images with both outlines of a part."""
-    return int(np.sum(np.bincount(outlines.row[of]) > 1))
+def width_counts(outlines: Outlines, leg: int, part: str) -> tuple[int, int]:
+    """Return in how many images a part has another width than its cylinder, and in how many not.
+
+    Of those that show both edges.
+    """
+    of = (outlines.leg == leg) & (np.array(outlines.part) == part)
+    is_wide = of & outlines.rejected_for(Reason.WIDTH)
+    both = np.bincount(outlines.row[of & outlines.used]) > 1
+    return len(np.unique(outlines.row[is_wide])), int(both.sum())
 
 
 def _few_outlines(outlines: Outlines) -> list[Doubt]:
