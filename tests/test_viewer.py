@@ -17,8 +17,9 @@ from layouts import Layout, write_machine
 from machines import of_types
 
 from legcal import inverse_kinematics, load_mechanism
+from legcal.exports.subject import Subject
 from legcal.viewer.server import Address
-from legcal.viewer.source import Photographs, Source, open_source
+from legcal.viewer.source import Photographs, open_source
 from legcal.viewer.view_server import Motion, ViewServer
 
 MODELS = ["hexapod-rod", "3-rpr", "3-upu", "tricept", "delta"]
@@ -70,12 +71,12 @@ def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def result(example_run: Run) -> Source:
+def result(example_run: Run) -> Subject:
     return open_source(example_run.output, example_run.folder)
 
 
 @contextmanager
-def served(source: Source) -> Iterator[ViewServer]:
+def served(source: Subject) -> Iterator[ViewServer]:
     server = ViewServer(source, Address("127.0.0.1", 0))
     try:
         yield server
@@ -90,7 +91,7 @@ def move(server: ViewServer, slider: str, value: float) -> dict[str, Any]:
     return answer
 
 
-def test_nominal_and_calibrated_stand_at_the_same_readings(result: Source) -> None:
+def test_nominal_and_calibrated_stand_at_the_same_readings(result: Subject) -> None:
     assert result.nominal is not None
     with served(result) as server:
         before = move(server, "pose", 2)["values"]
@@ -114,7 +115,7 @@ def test_nominal_and_calibrated_stand_at_the_same_readings(result: Source) -> No
 
 
 def test_photographs_come_with_their_outlines_and_say_where_they_are_missing(
-    result: Source, tmp_path: Path
+    result: Subject, tmp_path: Path
 ) -> None:
     assert result.dataset is not None
     with served(result) as server:

@@ -16,8 +16,9 @@ from browser import PATIENCE, chromium, errors
 from hexapod_example import Run
 from selenium.webdriver.common.keys import Keys
 
+from legcal.exports.subject import Subject
 from legcal.viewer.server import Address
-from legcal.viewer.source import Source, open_source
+from legcal.viewer.source import open_source
 from legcal.viewer.view_server import ViewServer
 
 pytestmark = pytest.mark.system
@@ -30,7 +31,7 @@ def browser() -> Iterator[Any]:
 
 
 @contextmanager
-def _shown(source: Source, browser: Any) -> Iterator[ViewServer]:
+def _shown(source: Subject, browser: Any) -> Iterator[ViewServer]:
     """Serve a source, and open it."""
     server = ViewServer(source, Address("127.0.0.1", 0))
     loop = threading.Thread(target=server.run, daemon=True)

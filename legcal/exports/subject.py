@@ -19,6 +19,7 @@ from legcal.machine.parameters import geometries, legs_in_links, parametrization
 
 if TYPE_CHECKING:
     from legcal.calibration.result_folder import EarlierResult
+    from legcal.data.dataset import Dataset
 
 RESULT_NAME = "result.json"
 
@@ -32,12 +33,13 @@ class ExportOptions:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A mechanism, and the result that it comes from, if any."""
+    """A mechanism, with the result that it comes from and a session of it, if any."""
 
     machine: Machine
     given: str  # argument of the caller
     nominal: Machine | None = None  # nominal machine (legs only); None for a model
     result: EarlierResult | None = None
+    dataset: Dataset | None = None  # with readings in the order of the legs
 
     @property
     def name(self) -> str:

@@ -176,7 +176,7 @@ class Crop:
     """A piece of an image with lines over it."""
 
     name: str  # its anchor
-    picture: str  # as a data URL
+    picture: str  # :func:`data_url`
     width: int  # [px] of the image
     height: int
     lines: Sequence[tuple[str, str]]  # class, and points "x,y x,y"
@@ -199,7 +199,7 @@ class Picture:
     """An image, beside the page or in it."""
 
     kind: ClassVar = "picture"
-    file: str  # its place, relative to the page; or a data URL
+    file: str  # its place, relative to the page; or :func:`data_url`
     caption: str
     warning: str = ""  # text in red
     edit: int | None = None  # its place in the editor of outlines of the page
@@ -209,6 +209,11 @@ class Picture:
     def is_inside(self) -> bool:
         """Whether the page holds it."""
         return self.file.startswith("data:")
+
+
+def data_url(jpeg: bytes) -> Markup:
+    """Return a JPEG as an address that holds it."""
+    return Markup("data:image/jpeg;base64," + base64.b64encode(jpeg).decode())
 
 
 @dataclass(frozen=True)

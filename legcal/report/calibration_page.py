@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import platform as system
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from markupsafe import Markup
 from scipy.special import ndtri
@@ -54,20 +52,21 @@ from legcal.pages.document import (
     Table,
     Text,
     Verdict,
+    data_url,
     number,
     page_html,
     time_of_page,
 )
 from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
 from legcal.report.calibration import next_steps, platform_table
-from legcal.scene.motions import MachineScene, PlacedModel, pyramid, scene_content
+from legcal.scene.motions import MachineScene
 from legcal.version import __version__
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
+from legcal.vision.image_file import small_jpeg
 
 MAX_POSES = 60  # largest number of poses of the slider
 MAX_CAMERAS = 60
-_DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
 _WORDS: dict[Light, str] = {
     "good": "Use it",
     "doubtful": "Do not trust it yet",
@@ -313,25 +312,23 @@ def machine_scene(calibration: Calibration) -> Scene:
     chosen = np.unique(np.linspace(0, n - 1, min(MAX_POSES, n)).astype(int))
     T = [solution.T_Rb_Re[k] for k in chosen.tolist()]
     q, by_readings = measurements.q_of_poses[chosen], calibration.platform is not None
-    nominal, parameters = geometries(machine), solution.kinematic.parametrization
-    scene = MachineScene(machine, solution.legs, nominal, result, parameters)
-
-    def placed(legs: Any) -> PlacedModel:
-        return scene.placed(legs, q, T, by_readings=by_readings)
-
-    calibrated = placed(solution.legs)
-    pairs = [("change by the calibration", ("nominal", "calibrated"),
-              placed(nominal), calibrated)]  # fmt: skip
-    pairs += [
-        (words, ("calibrated", "moved along the direction"), calibrated, placed(scene.moved(k)))
-        for k, (words, _) in enumerate(scene.directions)
-    ]
-    images = row_names(measurements)
-    platform = [machine.T_base_Rb * pose * machine.T_platform_Re.inv() for pose in T]
-    content = scene_content(scene, pairs, np.array([pose.as_matrix() for pose in platform]))
+    scene = MachineScene(
+        machine,
+        solution.legs,
+        geometries(machine),
+        result,
+        solution.kinematic.parametrization,
+    )
+    calibrated = scene.placed(solution.legs, q, T, by_readings=by_readings)
+    images, frame, views = row_names(measurements), machine.T_base_Rb, measurements.views
+    used = [v for v, view in enumerate(views) if view.name in result.views][:MAX_CAMERAS]
+    content = scene.content(scene.modes(calibrated, q, T, by_readings=by_readings), T)
     content |= {
         "poses": [printable(images[row]) for row in measurements.first_rows[chosen].tolist()],
-        "cameras": _cameras(calibration, _DEPTH * scene.size),
+        "cameras": scene.cameras(
+            (views[v].name, solution.cameras[v], frame * solution.T_camera_Rb[v].inv())
+            for v in used
+        ),
     }
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
@@ -344,60 +341,39 @@ def machine_scene(calibration: Calibration) -> Scene:
     return Scene("machine-scene", content, 560, caption)
 
 
-def _cameras(calibration: Calibration, depth: float) -> list[dict[str, Any]]:
-    """Return the cameras of used views as pyramids of their field of view."""
-    solution, views = calibration.solution, calibration.dataset.measurements.views
-    frame, used_views = calibration.dataset.machine.T_base_Rb, calibration.result.views
-    used = [v for v, view in enumerate(views) if view.name in used_views][:MAX_CAMERAS]
-    return [
-        {
-            "name": printable(views[v].name),
-            "points": _rounded(
-                pyramid(solution.cameras[v], frame * solution.T_camera_Rb[v].inv(), depth), 4
-            ),
-        }
-        for v in used
-    ]
-
-
-def _rounded(values: Array, digits: int) -> Any:
-    return np.round(values, digits).tolist()
-
-
 # Outlines
 
 
 def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]]]:
-    """Return the sections on residuals and on the outlines with the largest ones."""
-    if not len(calibration.residuals):
+    """Return the sections on residuals, and on the outlines with the largest and usual ones."""
+    residuals, overlays = calibration.residuals, calibration.overlays
+    if not len(residuals):
         return []
-    crops = outline_crops(calibration, calibration.overlays)
-    n = len(crops.missing)
-    missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] if n else []
-    lines = Text(
-        [
-            "Green: measured outline, red if rejected by the fit; dashed orange: predicted by the "
-            "fit. Click to enlarge, scroll to zoom, drag to move."
-        ],
-        dim=True,
-    )
+    order = np.argsort(-np.linalg.norm(residuals.whitened, axis=1), kind="stable")
+    middle = max(N_WORST, (len(order) - N_MEDIAN) // 2)
+    worst, median = order[:N_WORST], order[middle : middle + N_MEDIAN]
+    crops, n = _crops(calibration, np.concatenate([worst, median]).tolist())
+    rows = calibration.solution.outlines.row.tolist()
+    links = {i: overlays[row] for i, row in enumerate(rows) if row in overlays}
+    links |= {int(residuals.index[k]): f"#{crop.name}" for k, crop in crops.items()}
     galleries = [
-        Gallery(gallery, title)
-        for gallery, title in (
-            (
-                crops.worst,
-                f"The worst {len(crops.worst)}, by their distance in standard deviations",
-            ),
-            (crops.median, f"{len(crops.median)} typical ones (median distance)"),
+        Gallery(shown, f"{title[0]}{len(shown)}{title[1]}")
+        for numbers, title in (
+            (worst, ("The worst ", ", by their distance in standard deviations")),
+            (median, ("", " typical ones (median distance)")),
         )
-        if gallery
+        if (shown := [crops[k] for k in numbers.tolist() if k in crops])
     ]
-    sections: list[tuple[str, str, Sequence[Any]]] = [
-        ("residuals", "Residuals", [residual_charts(calibration, crops.links)])
+    missing = [Text([f"{n} image{'s' * (n != 1)} could not be read any more."])] * bool(n)
+    lines = (
+        "Green: measured outline, red if rejected by the fit; dashed orange: predicted by the fit. "
+        "Click to enlarge, scroll to zoom, drag to move."
+    )
+    pictures = [*missing, Text([lines], dim=True), *galleries] if galleries or missing else []
+    return [
+        ("residuals", "Residuals", [residual_charts(calibration, links)]),
+        ("outlines", "Outlines", pictures),
     ]
-    if galleries or missing:
-        sections.append(("outlines", "Outlines", [*missing, lines, *galleries]))
-    return sections
 
 
 # Evidence
@@ -493,107 +469,55 @@ _ASPECT = 0.8  # smallest ratio of the shorter to the longer side
 _SIDE = 360  # largest longer side of a picture [px]
 _QUALITY = 78  # JPEG quality [percent]
 _N_POINTS = 12  # points along a line
-_SMALLER = 0.7  # scale factor of each attempt to keep to MAX_BYTES
+_SMALLER = 0.7  # factor of the side in each attempt to keep to MAX_BYTES
 
 
-@dataclass(frozen=True)
-class Crops:
-    """The crops on a page."""
+def _crops(calibration: Calibration, numbers: Sequence[int]) -> tuple[dict[int, Crop], int]:
+    """Return pieces of images with the outlines of some residuals, by the numbers of these.
 
-    worst: list[Crop]
-    median: list[Crop]
-    links: dict[int, str]  # targets of links to outlines, by row of the table
-    missing: tuple[str, ...]  # images that could not be read any more
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """A crop of an image before encoding."""
-
-    outline: int
-    grey: Image
-    corner: tuple[int, int]
-
-
-def outline_crops(calibration: Calibration, overlays: Mapping[int, str]) -> Crops:
-    """Return the outlines with the largest and with median residuals in sigmas.
-
-    *overlays* are pictures of whole images in the folder of the page, by row of the measurements.
+    Also return how many of the images could not be read any more.
     """
     residuals, outlines = calibration.residuals, calibration.solution.outlines
-    dataset = calibration.dataset
-    size = np.linalg.norm(residuals.whitened, axis=1)
-    order = np.argsort(-size, kind="stable")
-    worst = residuals.index[order[:N_WORST]].tolist()
-    middle = max(N_WORST, (len(order) - N_MEDIAN) // 2)
-    median = residuals.index[order[middle : middle + N_MEDIAN]].tolist()
+    dataset, missing = calibration.dataset, 0
     reader = dataset.image_reader(range(dataset.measurements.n_rows))
-    pieces: dict[int, _Piece] = {}
-    missing: list[str] = []
     wanted: dict[int, list[int]] = {}
-    for i in (*worst, *median):
-        wanted.setdefault(int(outlines.row[i]), []).append(i)
+    for k in numbers:
+        wanted.setdefault(int(outlines.row[residuals.index[k]]), []).append(k)
+    pieces: dict[int, tuple[Image, Array]] = {}
     for row, of_row in wanted.items():
         if dataset.image_path(row) is None:
             continue
         try:
             image = reader(row)
         except LegcalError:
-            missing.append(dataset.measurements.image[row])
+            missing += 1
             continue
-        for i in of_row:
-            pieces[i] = _cut(i, image, outlines.ends[i])
-    scale, quality = 1.0, _QUALITY
-    pictures = {i: _picture(piece, scale, quality) for i, piece in pieces.items()}
-    while sum(map(len, pictures.values())) > MAX_BYTES:
-        scale *= _SMALLER
-        pictures = {i: _picture(piece, scale, quality) for i, piece in pieces.items()}
-    number = dict(zip(residuals.index.tolist(), range(len(residuals)), strict=True))
-    made = {
-        i: _crop(calibration, piece, pictures[i], number[i], overlays)
-        for i, piece in pieces.items()
-    }
-    links = {i: overlays[row] for i, row in enumerate(outlines.row.tolist()) if row in overlays} | {
-        i: f"#{crop.name}" for i, crop in made.items()
-    }
-    return Crops(
-        [made[i] for i in worst if i in made],
-        [made[i] for i in median if i in made],
-        links,
-        tuple(missing),
-    )
+        pieces |= {k: _cut(image, outlines.ends[residuals.index[k]]) for k in of_row}
+    side, jpegs = float(_SIDE), dict[int, Markup]()
+    while pieces and (not jpegs or sum(map(len, jpegs.values())) > MAX_BYTES):
+        jpegs = {
+            k: data_url(small_jpeg(grey, int(side), _QUALITY)) for k, (grey, _) in pieces.items()
+        }
+        side *= _SMALLER
+    return {k: _crop(calibration, k, *pieces[k], jpegs[k]) for k in pieces}, missing
 
 
-def _cut(outline: int, image: Image, ends: Array) -> _Piece:
-    """Return the crop of an image around an outline."""
+def _cut(image: Image, ends: Array) -> tuple[Image, Array]:
+    """Return the piece of an image around an outline, and the place of its first pixel."""
     middle, half = ends.mean(axis=0), 0.5 * np.ptp(ends, axis=0) + _MARGIN
     half = np.maximum(half, _ASPECT * half.max())
     low, high = np.floor(middle - half).astype(int), np.ceil(middle + half).astype(int) + 1
     height, width = image.shape
-    left, top = np.clip(low, 0, [width - 1, height - 1]).tolist()
-    right, bottom = np.clip(high, [left + 1, top + 1], [width, height]).tolist()
-    return _Piece(outline, image[top:bottom, left:right].copy(), (left, top))
+    left, top = corner = np.clip(low, 0, [width - 1, height - 1])
+    right, bottom = np.clip(high, corner + 1, [width, height])
+    return image[top:bottom, left:right].copy(), corner
 
 
-def _picture(piece: _Piece, scale: float, quality: int) -> str:
-    """Encode a crop as a data URL."""
-    grey = np.clip(np.rint(piece.grey), 0, 255).astype(np.uint8)
-    factor = scale * min(1.0, _SIDE / max(grey.shape))
-    if factor < 1.0:
-        grey = np.asarray(
-            cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8
-        )
-    _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
-
-
-def _crop(
-    calibration: Calibration, piece: _Piece, picture: str, k: int, overlays: Mapping[int, str]
-) -> Crop:
-    """Return a crop with its lines and caption."""
+def _crop(calibration: Calibration, k: int, grey: Image, corner: Array, picture: Markup) -> Crop:
+    """Return a piece of an image with the lines and the caption of residual k."""
     residuals, outlines = calibration.residuals, calibration.solution.outlines
     dataset, solution = calibration.dataset, calibration.solution
-    i, measurements = piece.outline, dataset.measurements
+    i, measurements = int(residuals.index[k]), dataset.measurements
     row, j = int(outlines.row[i]), int(outlines.leg[i])
     v, pose = int(measurements.view[row]), int(measurements.pose[row])
     leg, part = solution.legs[j], outlines.part[i]
@@ -607,7 +531,7 @@ def _crop(
     u = (B - A) / np.linalg.norm(B - A)
     fit = outlines_of_axis(u, A, solution.radii[j, part])[int(outlines.edge[i]) - 1]
     given = measurements.views[v].camera
-    origin = np.array(piece.corner) - 0.5  # pixel (0, 0) is the centre of the first one
+    origin = corner - 0.5  # pixel (0, 0) is the centre of the first one
     lines = [
         (
             "measured" if outlines.used[i] else "rejected",
@@ -618,16 +542,15 @@ def _crop(
     offset, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
     name = dataset.machine.leg_names[j]
     rejected = "" if outlines.used[i] else f"; rejected: {outlines.reason[i]}"
-    height, width = piece.grey.shape
     return Crop(
         name=f"outline-{i}",
-        picture=Markup(picture),
-        width=width,
-        height=height,
+        picture=picture,
+        width=grey.shape[1],
+        height=grey.shape[0],
         lines=lines,
         caption=f"{name}, edge {outlines.edge[i]}: {offset[0]:+.3f} and {offset[1]:+.3f} px",
         detail=f"{sigmas:.1f} sigma, {row_names(measurements)[row]}{rejected}",
-        link=overlays.get(row, ""),
+        link=calibration.overlays.get(row, ""),
     )
 
 

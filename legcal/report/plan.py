@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.configurations import poses_at
 from legcal.machine.picture import Mark, draw_machine
-from legcal.pages.document import Drawing, Items, Picture, Row, page_html
+from legcal.pages.document import Drawing, Items, Picture, Row, data_url, page_html
 from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
 from legcal.planning.session import Plan, poses_to_take, views_in_words
@@ -234,10 +232,7 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     """Return the pictures, the checklist and the page of a session, by their names."""
     places, in_page = (_draw_places(plan, in_page=x).markup() for x in (False, True))
     images = [
-        Picture(
-            Markup(f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"),
-            f"{name}: as the first image should look",
-        )
+        Picture(data_url(data), f"{name}: as the first image should look")
         for name, data in previews.items()
     ]
     header, rows = poses_to_take(plan)

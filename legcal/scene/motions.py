@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import printable
-from legcal.geometry.motions import components
+from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000)
 _SHOWN = 0.12  # default displayed size of the largest change, relative to the machine
 _RING = 0.06  # size of the median ellipsoid, relative to the machine
+_DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
 _HELD = 0.0025  # length of a step along a held direction, in leg lengths
 
 
@@ -35,6 +36,15 @@ class PlacedModel(NamedTuple):
     anchors: Array  # (n_motors, 3) positions of motors that move joints at A
     standing: Array  # (n_motors, 2, 3) their rails and axes
     moving: Array  # (k, m, 2, 3) carriages, arms, and bars between the joints of one motor
+
+
+class Mode(NamedTuple):
+    """Two models that are shown together; a machine alone stands for both."""
+
+    name: str
+    legend: tuple[str, str]
+    before: PlacedModel
+    after: PlacedModel
 
 
 class MachineScene:
@@ -81,7 +91,7 @@ class MachineScene:
         self._parameters = parameters or parametrization_of(machine, twists=True)
         length = float(np.mean(np.linalg.norm(B - A, axis=1)))
         self.directions = [] if result is None else _steps(result, self._parameters, length)
-        self.ellipsoids = {} if result is None else ellipsoids(result)
+        self.ellipsoids = {} if result is None else _ellipsoids(result)
 
     def placed(
         self,
@@ -107,12 +117,77 @@ class MachineScene:
         lines = motor_lines(legs, (A - frame.translation) @ turn)
         return PlacedModel(A, B, *(points @ turn.T + frame.translation for points in lines))
 
-    def moved(self, direction: int) -> tuple[Leg, ...]:
-        """Return the legs after a step along a direction."""
-        return moved_legs(self.legs, self._parameters.place, self.directions[direction][1])
+    def alone(self, shown: PlacedModel) -> list[Mode]:
+        """Return the machine beside no other model."""
+        return [Mode(self.machine.name, ("", "machine"), shown, shown)]
 
-    def first_step(self, before: PlacedModel, after: PlacedModel) -> int:
+    def modes(
+        self,
+        shown: PlacedModel,
+        q: Array,
+        near: Sequence[RigidTransform],
+        *,
+        by_readings: bool,
+    ) -> list[Mode]:
+        """Return the machine, *shown* at readings, beside the models of the same readings.
+
+        These are the nominal model, and the legs after a step along each of the directions.
+        """
+        if self.nominal is None:
+            return self.alone(shown)
+        nominal = self.placed(self.nominal, q, near, by_readings=by_readings)
+        modes = [Mode("change by the calibration", ("nominal", "calibrated"), nominal, shown)]
+        for words, step in self.directions:
+            legs = moved_legs(self.legs, self._parameters.place, step)
+            moved = self.placed(legs, q, near, by_readings=by_readings)
+            modes.append(Mode(words, ("calibrated", "moved along the direction"), shown, moved))
+        return modes
+
+    def content(self, modes: Sequence[Mode], near: Sequence[RigidTransform]) -> dict[str, Any]:
+        """Return the content of ``scene.js`` at poses T_Rb_Re: the modes that can be chosen.
+
+        Their difference is exaggerated, unless the machine is alone.
+        """
+        factor = _enlargement(self.ellipsoids, _RING * self.size)
+        to_link = self.machine.T_platform_Re.inv()
+        factors = FACTORS if modes[0].legend[0] else (1,)
+        turns = [
+            product(self.machine.T_base_Rb, T, to_link).rotation.as_matrix().round(6) for T in near
+        ]
+        rings = {side: np.round(factor * axes, 6) for side, axes in self.ellipsoids.items()}
+        return {
+            "unit": "m",
+            "flat": not self.machine.spatial,
+            "factors": factors,
+            "modes": [
+                {
+                    "name": printable(mode.name),
+                    "legend": mode.legend,
+                    "step": self._first_step(mode) if len(factors) > 1 else 0,
+                    "models": [_model(mode.before), _model(mode.after)],
+                }
+                for mode in modes
+            ],
+            "names": [printable(name) for name in self.machine.leg_names],
+            "rims": self.rims,
+            "rings": {
+                "name": f"1 sigma, {factor:g} times as large",
+                "turns": [turn.tolist() for turn in turns],
+                **{side: axes.tolist() for side, axes in rings.items()},
+            },
+        }
+
+    def cameras(self, views: Iterable[tuple[str, Camera, RigidTransform]]) -> list[dict[str, Any]]:
+        """Return names, cameras and T_base_camera as the pyramids of ``scene.js``."""
+        depth = _DEPTH * self.size
+        return [
+            {"name": printable(name), "points": pyramid(camera, T, depth).round(4).tolist()}
+            for name, camera, T in views
+        ]
+
+    def _first_step(self, mode: Mode) -> int:
         """Return the default index of ``FACTORS`` for the difference between two models."""
+        before, after = mode.before, mode.after
         moved = max(
             float(np.abs(after.A - before.A).max()), float(np.abs(after.B - before.B).max())
         )
@@ -144,7 +219,7 @@ def _steps(result: Result, parameters: Parametrization, length: float) -> list[t
     return steps
 
 
-def ellipsoids(result: Result) -> dict[str, Array]:
+def _ellipsoids(result: Result) -> dict[str, Array]:
     """Return half axes of one sigma at the joints of base and platform, (n, 3, 3) [m].
 
     Columns are axes, in the link; they are zero along fixed coordinates and those that define a
@@ -157,7 +232,7 @@ def ellipsoids(result: Result) -> dict[str, Array]:
     return half_axes
 
 
-def enlargement(axes: Mapping[str, Array], radius: float) -> float:
+def _enlargement(axes: Mapping[str, Array], radius: float) -> float:
     """Return the factor 1, 2, 5, 10, ... that enlarges the median ellipsoid to nearly *radius*."""
     longest = [np.linalg.norm(of_side, axis=1).max(axis=1) for of_side in axes.values()]
     seen = np.concatenate([*longest, np.zeros(0)])
@@ -173,44 +248,6 @@ def pyramid(camera: Camera, T_base_camera: RigidTransform, depth: float) -> Arra
     corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
     rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
     return np.asarray(T_base_camera.apply(np.concatenate([np.zeros((1, 3)), rays])))
-
-
-def scene_content(
-    scene: MachineScene,
-    modes: Sequence[tuple[str, tuple[str, str], PlacedModel, PlacedModel]],
-    T_base_platform: Array,
-    *,
-    factors: Sequence[int] = FACTORS,
-) -> dict[str, Any]:
-    """Return the content of ``scene.js`` at k poses (k, 4, 4) of the platform.
-
-    *modes* are the pairs of models that can be chosen: name, legend of both, and both. Without
-    *factors* their difference is not exaggerated.
-    """
-    factor = enlargement(scene.ellipsoids, _RING * scene.size)
-    return {
-        "unit": "m",
-        "flat": not scene.machine.spatial,
-        "factors": factors or (1,),
-        "modes": [
-            {
-                "name": printable(name),
-                "legend": legend,
-                "step": scene.first_step(before, after) if factors else 0,
-                "models": [_model(before), _model(after)],
-            }
-            for name, legend, before, after in modes
-        ],
-        "names": [printable(name) for name in scene.machine.leg_names],
-        "rims": scene.rims,
-        "rings": {
-            "name": f"1 sigma, {factor:g} times as large",
-            "turns": np.round(T_base_platform[:, :3, :3], 6).tolist(),
-            **{
-                side: np.round(factor * axes, 6).tolist() for side, axes in scene.ellipsoids.items()
-            },
-        },
-    }
 
 
 def _model(model: PlacedModel) -> dict[str, Any]:

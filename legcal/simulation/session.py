@@ -16,7 +16,6 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from uuid import uuid4
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
@@ -63,6 +62,7 @@ from legcal.simulation.settings import Distribution, Level, Sampling, Simulation
 from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
 from legcal.vision.board import FixedBoard
 from legcal.vision.camera import Camera
+from legcal.vision.image_file import small_jpeg
 from legcal.workers import Workers, worker_pool
 
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
@@ -715,4 +715,4 @@ def preview(
     rng = np.random.default_rng(0)
     look = replace(Appearance(), clutter=0)
     image = prepare_view(posed.solids, small, T_base_camera, look, rng).render(posed.solids, rng)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return small_jpeg(image, _WIDTH, quality=85)

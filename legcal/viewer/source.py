@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, UsageError, printable
-from legcal.exports.subject import load_subject
+from legcal.exports.subject import Subject, load_subject
 from legcal.machine.files import DATASET_YAML, shipped_names
 from legcal.machine.model import Machine
+from legcal.vision.image_file import small_jpeg
 
 if TYPE_CHECKING:
     from legcal.calibration.result_folder import EarlierResult
@@ -22,29 +22,12 @@ if TYPE_CHECKING:
     from legcal.vision.camera import Camera
 
 MAX_CAMERAS = 200
-SIDE = 960  # largest longer side of a displayed photograph [px]
-
-Picture = NDArray[np.uint8]
+_SIDE, _QUALITY = 960, 85  # longer side of a displayed photograph [px], of its JPEG [percent]
 _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A machine, with its calibration and its session, if any."""
-
-    machine: Machine  # the calibrated machine of a result
-    nominal: Machine | None = None  # nominal machine (legs only); None without a result
-    result: EarlierResult | None = None
-    dataset: Dataset | None = None  # session, with readings in the order of the legs
-
-    @property
-    def name(self) -> str:
-        """The name of the machine."""
-        return self.machine.name if self.result is None else self.machine.urdf.name
-
-
-def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
-    """Return the source at a path, or with the name of a shipped model.
+def open_source(given: str | Path, dataset: str | Path | None = None) -> Subject:
+    """Return what is at a path, or with the name of a shipped model.
 
     Parameters
     ----------
@@ -83,16 +66,11 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Source:
         from legcal.data.dataset import load_dataset
 
         loaded = load_dataset(path, check_images=False)
-        return Source(loaded.machine, dataset=loaded)
+        return Subject(loaded.machine, str(given), dataset=loaded)
     subject = load_subject(given)
     if dataset is None:
-        return Source(subject.machine, subject.nominal, subject.result)
-    return Source(
-        subject.machine,
-        subject.nominal,
-        subject.result,
-        _session(subject.machine, dataset, subject.result),
-    )
+        return subject
+    return replace(subject, dataset=_session(subject.machine, dataset, subject.result))
 
 
 def _session(machine: Machine, given: str | Path, result: EarlierResult | None) -> Dataset:
@@ -116,7 +94,7 @@ def _session(machine: Machine, given: str | Path, result: EarlierResult | None) 
 
 
 class Photographs:
-    """The session of a source.
+    """The session of a subject, if it has one.
 
     Attributes
     ----------
@@ -130,7 +108,7 @@ class Photographs:
         Readings at these poses [m].
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Subject) -> None:
         self._dataset = source.dataset
         self.cameras: list[tuple[str, Camera, RigidTransform]] = []
         self.names: tuple[str, ...] = ()
@@ -171,19 +149,14 @@ class Photographs:
             )
         return photographs
 
-    def picture(self, row: int) -> Picture | None:
-        """Return the photograph of a row, at most :data:`SIDE` pixels wide; None without one."""
+    def picture(self, row: int) -> bytes | None:
+        """Return the photograph of a row as a small JPEG; None without one."""
         if self._dataset is None or self._dataset.image_path(row) is None:
             return None
         try:
-            grey = self._dataset.image_reader([row])(0)
+            return small_jpeg(self._dataset.image_reader([row])(0), _SIDE, _QUALITY)
         except LegcalError:
             return None
-        import cv2
-
-        scale = min(1.0, SIDE / max(grey.shape))
-        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        return np.clip(np.rint(small), 0, 255).astype(np.uint8)
 
     def _outlines(self, row: int) -> list[tuple[str, list[list[float]]]]:
         """Return the outlines of an image: class of the line, and both ends [px]."""

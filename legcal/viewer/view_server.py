@@ -13,11 +13,11 @@ from functools import partial
 from threading import Lock
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, printable
+from legcal.exports.subject import Subject
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
@@ -32,9 +32,9 @@ from legcal.machine.model import Machine, joint_values, readings_at, readings_at
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import consistent_readings
 from legcal.pages.document import Page, Scene, Section, Sliders, page_html, time_of_page
-from legcal.scene.motions import FACTORS, MachineScene, PlacedModel, pyramid, scene_content
+from legcal.scene.motions import MachineScene
 from legcal.viewer.server import HTML, Address, PageServer
-from legcal.viewer.source import Photographs, Source
+from legcal.viewer.source import Photographs
 
 _AT_END = 2.5e-6  # distance from the end of a travel that counts as none, in mean leg lengths
 _TICKS = 40  # steps of the search for the range of a coordinate, on either side of home
@@ -206,8 +206,6 @@ class Motion:
 
 
 _SCENE = "machine-scene"
-_DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
-_QUALITY = 85  # JPEG quality [percent]
 _HOME = "home"  # the button that moves the machine home
 
 
@@ -248,7 +246,7 @@ class ViewServer(PageServer):
         The machine and its posture.
     """
 
-    def __init__(self, source: Source, address: Address) -> None:
+    def __init__(self, source: Subject, address: Address) -> None:
         super().__init__(address)
         self.source, self.motion = source, Motion(source.machine)
         self.scene = MachineScene(
@@ -274,10 +272,7 @@ class ViewServer(PageServer):
         if not 0 <= row < len(self._photographs.names):
             return None
         picture = self._photographs.picture(row)
-        if picture is None:
-            return None
-        data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-        return "image/jpeg", data.tobytes()
+        return None if picture is None else ("image/jpeg", picture)
 
     def answer(self, path: str, query: dict[str, list[str]], text: bytes) -> dict[str, Any] | None:
         """Move the machine by a posted ``{"slider": NAME, "value": NUMBER}``; return its state."""
@@ -345,21 +340,21 @@ class ViewServer(PageServer):
     def _state(self) -> dict[str, Any]:
         """Return all that the page shows at the posture."""
         problems = [self.motion.posture.problem] * bool(self.motion.posture.problem)
+        scene, machine, q = self.scene, self.source.machine, self.motion.posture.q[None]
+        near = [platform_in_base(machine, self.motion.posture.T)]
+        here = scene.placed(scene.legs, q, near, by_readings=False)
         try:
-            modes = self._modes()
+            modes = scene.modes(here, q, near, by_readings=machine.is_determined)
         except LegcalError as error:
             problems += error.problems
-            here = self._here()
-            modes = [(printable(self.source.name), ("", "machine"), here, here)]
-        machine = self.source.machine
+            modes = scene.alone(here)
         ends = dict.fromkeys(
             machine.legs[j].motor_label for j in np.flatnonzero(self.motion.at_end).tolist()
         )
         if ends:
             problems.append(f"At the end of the travel: {', '.join(ends)}.")
-        T = self.motion.posture.T.as_matrix()[None]
         return {
-            "scene": scene_content(self.scene, modes, T, factors=FACTORS if modes[0][1][0] else ()),
+            "scene": scene.content(modes, near),
             "values": {
                 name: round(slider.size * slider.value(), 2)
                 for name, slider in self._controls.items()
@@ -368,37 +363,10 @@ class ViewServer(PageServer):
             "photographs": self._photographs.at(self._pose),
         }
 
-    def _here(self) -> PlacedModel:
-        """Return the machine at its posture."""
-        near = platform_in_base(self.source.machine, self.motion.posture.T)
-        q = self.motion.posture.q[None]
-        return self.scene.placed(self.scene.legs, q, [near], by_readings=False)
-
-    def _modes(self) -> list[tuple[str, tuple[str, str], PlacedModel, PlacedModel]]:
-        """Return the pairs of models to compare: name, legend, both models."""
-        scene, here = self.scene, self._here()
-        machine, q = self.source.machine, self.motion.posture.q[None]
-        near = [platform_in_base(machine, self.motion.posture.T)]
-        if scene.nominal is None:
-            return [(printable(self.source.name), ("", "machine"), here, here)]
-        determined = machine.is_determined
-        nominal = scene.placed(scene.nominal, q, near, by_readings=determined)
-        moved = [
-            (words, ("calibrated", "moved along the direction"), here,
-             scene.placed(scene.moved(k), q, near, by_readings=determined))
-            for k, (words, _) in enumerate(scene.directions)
-        ]  # fmt: skip
-        pair = ("change by the calibration", ("nominal", "calibrated"), nominal, here)
-        return [pair, *moved]
-
     def _document(self) -> Page:
         """Return the page at the first posture."""
         state = self._state()
-        cameras = [
-            {"name": printable(name), "points": np.round(points, 4).tolist()}
-            for name, camera, T in self._photographs.cameras
-            for points in [pyramid(camera, T, _DEPTH * self.scene.size)]
-        ]
+        cameras = self.scene.cameras(self._photographs.cameras)
         caption = "Drag to turn, scroll to zoom."
         if self.scene.nominal is not None:
             caption += (

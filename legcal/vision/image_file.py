@@ -567,6 +567,13 @@ def rescaled(image: NDArray[_Level], scale: float) -> NDArray[_Level]:
     return np.asarray(cv2.resize(image, size, interpolation=method), dtype=image.dtype)
 
 
+def small_jpeg(image: NDArray[_Level], side: int, quality: int) -> bytes:
+    """Return a grey image as a JPEG of a quality [percent], at most *side* pixels long and wide."""
+    small = rescaled(image, min(1.0, side / max(image.shape)))
+    levels = np.clip(np.rint(small), 0, 255).astype(np.uint8)
+    return cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
 def reduced(px: Array, scale: float) -> Array:
     """Return the coordinates in the image of pixels of a rescaled image; centres are integers."""
     return np.asarray((px + 0.5) / scale - 0.5)
