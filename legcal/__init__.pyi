@@ -19,7 +19,6 @@ from .data.new_dataset import init as init
 from .descriptions.new_model import new as new
 from .errors import LegcalError as LegcalError
 from .exports.formats import export as export
-from .exports.subject import ExportOptions as ExportOptions
 from .machine.closing import singularity as singularity
 from .machine.configurations import random_configurations as random_configurations
 from .machine.kinematics import Follower as Follower

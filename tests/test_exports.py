@@ -26,7 +26,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
 from legcal import (
-    ExportOptions,
     Machine,
     ParameterErrors,
     Spread,
@@ -349,7 +348,7 @@ def test_corrected_commands_bring_the_machine_where_it_should_be(
     subject = calibrated(name)
     machine, nominal = subject.machine, subject.nominal
     assert nominal is not None
-    found = export(subject, "correction", tmp_path / "table.csv", options=ExportOptions(nodes=3))
+    found = export(subject, "correction", tmp_path / "table.csv", nodes=3)
     own, figures = found.figures["coordinates"], found.figures
     assert len(own) == machine.mobility
     assert figures["nodes"] == 3**machine.mobility

@@ -414,15 +414,8 @@ def export(
 ) -> None:
     """Write a calibration or a model for another program or a controller."""
     from legcal.exports import formats
-    from legcal.exports.subject import ExportOptions
 
-    exported = formats.export(
-        source,
-        to,
-        output,
-        options=ExportOptions(nodes=nodes),
-        force=force,
-    )
+    exported = formats.export(source, to, output, nodes=nodes, force=force)
     lines = [f"written: {path}" for path in exported.paths] + list(exported.notes)
     show(
         as_json,

@@ -10,15 +10,16 @@ FK_calibrated(IK_nominal(X')) against X.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass, UsageError
-from legcal.exports.subject import ExportedFile, ExportOptions, Rendered, Subject, comment
+from legcal.exports.subject import Rendered, Subject, comment
+from legcal.geometry.motions import motions_of
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import (
     COORDINATES,
@@ -28,7 +29,11 @@ from legcal.machine.closing import (
     turned_back,
 )
 from legcal.machine.configurations import workspace
-from legcal.machine.kinematics import equations_of_readings
+from legcal.machine.kinematics import (
+    equations_of_readings,
+    platforms_in_base,
+    pose_differences,
+)
 from legcal.machine.model import Machine, readings_at_poses
 from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__
@@ -59,26 +64,6 @@ def correction_refusal(subject: Subject) -> str | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class _Models:
-    """Both machines, and the independent coordinates of their poses."""
-
-    calibrated: Machine
-    nominal: Machine
-    columns: IntArray  # indices into COORDINATES
-
-    def poses(self, machine: Machine, coordinates: Array) -> tuple[Array, BoolArray]:
-        """Return poses (k, 3, 4) at coordinates (k, m), and which were reached."""
-        home = self.calibrated.home.as_matrix()[:3]
-        return poses_at_coordinates(machine, self.columns, coordinates, home)
-
-
-def _readings(machine: Machine, poses: Array) -> Array:
-    """Return the readings (k, n_legs) at poses, zero for legs without a motor."""
-    moved = [leg.is_motor for leg in machine.legs]
-    return np.where(moved, readings_at_poses(machine, poses), 0.0)
-
-
 def poses_at_readings(machine: Machine, q: Array, near: Array) -> tuple[Array, BoolArray]:
     """Return the poses (k, 3, 4) at readings (k, n_legs), near others, and which were reached."""
     scale = machine.size
@@ -92,26 +77,38 @@ def poses_at_readings(machine: Machine, q: Array, near: Array) -> tuple[Array, B
     return solution.points, solution.worst <= REACHED * scale
 
 
-def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
-    """Return the CSV of the correction table."""
-    nominal = subject.nominal
+def correction_files(subject: Subject, path: Path, nodes: int | None = None) -> Rendered:
+    """Return the CSV of the correction table, with a number of nodes along each coordinate."""
+    calibrated, nominal = subject.machine, subject.nominal
     if nominal is None:
         raise ValueError("a model without a result has no correction")
-    calibrated = subject.machine
     columns = independent_coordinates(calibrated)
-    n_nodes = _number_of_nodes(options.nodes, len(columns))
-    models = _Models(calibrated, nominal, columns)
-    ticks, nodes, corrected = _grid(models, n_nodes)
-    shape = (n_nodes,) * len(columns)
-    left, raw = _residuals(models, ticks, corrected.reshape(*shape, len(columns)))
-    figures = {
+    m = len(columns)
+    n = _number_of_nodes(nodes, m)
+    ticks, commands, corrected = _grid(calibrated, nominal, columns, n)
+    left, raw = _residuals(calibrated, nominal, columns, ticks, corrected.reshape(*(n,) * m, m))
+    figures: dict[str, Any] = {
         "coordinates": [COORDINATES[k] for k in columns],
-        "nodes": len(nodes),
-        "residual": _figures(left),
-        "uncorrected": _figures(raw),
+        "nodes": len(commands),
         "tested": len(left),
     }
-    sentences = _sentences(figures)
+    sentences = []
+    for key, errors, label in (
+        ("residual", left, "Between nodes the interpolated table leaves"),
+        ("uncorrected", raw, "Without it the platform is off by"),
+    ):
+        (rms_dX, rms_dE), (max_dX, max_dE) = np.sqrt((errors**2).mean(axis=0)), errors.max(axis=0)
+        figures[key] = {
+            "rms_dX_m": float(rms_dX),
+            "max_dX_m": float(max_dX),
+            "rms_dE_rad": float(rms_dE),
+            "max_dE_rad": float(max_dE),
+        }
+        sentences.append(
+            f"{label} {1e3 * rms_dX:.3g} mm and {np.degrees(rms_dE):.3g} deg rms, "
+            f"{1e3 * max_dX:.3g} mm and {np.degrees(max_dE):.3g} deg at most (middles of "
+            f"{len(left)} cells)."
+        )
     names = [f"{COORDINATES[k]}_{UNITS[k]}" for k in columns]
     lines = [
         f"# Correction of {comment(subject.name)}, written by legcal {__version__}.",
@@ -122,10 +119,10 @@ def correction_files(subject: Subject, options: ExportOptions, path: Path) -> Re
         ",".join([*names, *(f"corrected_{name}" for name in names)]),
     ]
     scale = TO_FILE[columns]
-    rows = np.concatenate([nodes * scale, corrected * scale], axis=1)
+    rows = np.concatenate([commands * scale, corrected * scale], axis=1)
     lines += [",".join(f"{x:.9f}" for x in row) for row in rows.tolist()]
     content = ("\n".join(lines) + "\n").encode()
-    return Rendered((ExportedFile("", content),), tuple(sentences), figures)
+    return Rendered({"": content}, tuple(sentences), figures)
 
 
 def _number_of_nodes(given: int | None, m: int) -> int:
@@ -140,12 +137,13 @@ def _number_of_nodes(given: int | None, m: int) -> int:
     return n
 
 
-def _grid(models: _Models, n_nodes: int) -> tuple[list[Array], Array, Array]:
+def _grid(
+    machine: Machine, nominal: Machine, columns: IntArray, n_nodes: int
+) -> tuple[list[Array], Array, Array]:
     """Return ticks, nodes (k, m) and corrected nodes (k, m) of the largest grid in the travel.
 
     The grid is about the middle of the workspace and has its proportions.
     """
-    machine, columns = models.calibrated, models.columns
     centre = coordinates_of(machine.home.as_matrix()[None, :3])[0][0, columns]
     there = coordinates_of(stacked(workspace(machine)[1]))[0][:, columns]
     there = centre + turned_back(there - centre, columns)
@@ -154,34 +152,46 @@ def _grid(models: _Models, n_nodes: int) -> tuple[list[Array], Array, Array]:
         for n in sorted({2, min(n_nodes, 3), n_nodes}):  # corners first: most likely outside
             ticks = list(np.linspace(middle - part * reach, middle + part * reach, n).T)
             nodes = np.array(list(product(*ticks)))
-            corrected, reached = _corrected(models, nodes)
+            corrected, reached = _corrected(machine, nominal, columns, nodes)
             if not reached.all():
                 break
         else:
             return ticks, nodes, corrected
-    raise OutOfClass(_no_grid(machine))
+    raise OutOfClass(
+        f"{machine.yaml_path}: the correction could not be tabulated: found no box of poses about "
+        "the middle of the workspace that both models reach inside the travel, needed one; check "
+        "the travel of the motors."
+    )
 
 
-def _corrected(models: _Models, commands: Array) -> tuple[Array, BoolArray]:
+def _corrected(
+    calibrated: Machine, nominal: Machine, columns: IntArray, commands: Array
+) -> tuple[Array, BoolArray]:
     """Return corrected coordinates (k, m) of commands, and which both machines reach.
 
     If the calibrated machine does not reach all commands in its travel, they are not corrected.
     """
-    calibrated, columns = models.calibrated, models.columns
-    X, reached = models.poses(calibrated, commands)
-    q, motors = _readings(calibrated, X), list(calibrated.motors)
+    home = calibrated.home.as_matrix()[:3]
+    X, reached = poses_at_coordinates(calibrated, columns, commands, home)
+    q, motors = readings_at_poses(calibrated, X), list(calibrated.motors)
     ends = np.array([calibrated.legs[j].travel for j in motors]).reshape(-1, 2)
     reached &= ((q[:, motors] >= ends[:, 0]) & (q[:, motors] <= ends[:, 1])).all(axis=1)
     if not reached.all():
         return commands, reached
-    moved, there = poses_at_readings(models.nominal, q, X)
+    moved, there = poses_at_readings(nominal, q, X)
     coordinates = coordinates_of(moved)[0][:, columns]
     return commands + turned_back(coordinates - commands, columns), reached & there
 
 
-def _residuals(models: _Models, ticks: list[Array], corrected: Array) -> tuple[Array, Array]:
+def _residuals(
+    calibrated: Machine,
+    nominal: Machine,
+    columns: IntArray,
+    ticks: list[Array],
+    corrected: Array,
+) -> tuple[Array, Array]:
     """Return displacement [m] and rotation [rad] (k, 2) in the middle of cells, and uncorrected."""
-    calibrated, nominal = models.calibrated, models.nominal
+    home = calibrated.home.as_matrix()[:3]
     m, n = len(ticks), len(ticks[0])
     cells = np.array(list(np.ndindex(*(n - 1,) * m)))
     if len(cells) > TESTED:
@@ -189,63 +199,15 @@ def _residuals(models: _Models, ticks: list[Array], corrected: Array) -> tuple[A
         cells = cells[np.sort(chosen)]
     commands = np.stack([0.5 * (t[c] + t[c + 1]) for t, c in zip(ticks, cells.T, strict=True)], 1)
     corners = [corrected[tuple((cells + corner).T)] for corner in product((0, 1), repeat=m)]
-    X, _ = models.poses(calibrated, commands)
+    X, _ = poses_at_coordinates(calibrated, columns, commands, home)
+    wanted = platforms_in_base(calibrated, motions_of(X[:, :, :3], X[:, :, 3]))
     residuals = []
     for asked in (np.mean(corners, axis=0), commands):
-        asked_poses, _ = models.poses(nominal, asked)
-        reached, _ = poses_at_readings(calibrated, _readings(nominal, asked_poses), X)
-        residuals.append(_pose_errors(calibrated, reached, X))
+        there, _ = poses_at_coordinates(nominal, columns, asked, home)
+        there, _ = poses_at_readings(calibrated, readings_at_poses(nominal, there), X)
+        reached = platforms_in_base(calibrated, motions_of(there[:, :, :3], there[:, :, 3]))
+        residuals.append(np.stack(pose_differences(reached, wanted), axis=1))
     return residuals[0], residuals[1]
-
-
-def _pose_errors(machine: Machine, poses: Array, references: Array) -> Array:
-    """Return the displacement of the origin of R_e, and the rotation, (k, 2) [m, rad]."""
-    point = machine.T_platform_Re.as_matrix()[:3, 3]
-    off = (poses[:, :, :3] - references[:, :, :3]) @ point + poses[:, :, 3] - references[:, :, 3]
-    between = np.swapaxes(references[:, :, :3], 1, 2) @ poses[:, :, :3]
-    across = between - np.swapaxes(between, 1, 2)
-    sine = 0.5 * np.linalg.norm(
-        np.stack([across[:, 2, 1], across[:, 0, 2], across[:, 1, 0]], axis=1), axis=1
-    )
-    cosine = 0.5 * (np.einsum("kii->k", between) - 1.0)
-    return np.stack([np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)], axis=1)
-
-
-def _figures(apart: Array) -> dict[str, float]:
-    """Return root mean squares and maxima of displacements and rotations."""
-    rms, most = np.sqrt((apart**2).mean(axis=0)), apart.max(axis=0)
-    return {
-        "rms_dX_m": float(rms[0]),
-        "max_dX_m": float(most[0]),
-        "rms_dE_rad": float(rms[1]),
-        "max_dE_rad": float(most[1]),
-    }
-
-
-def _sentences(figures: dict[str, object]) -> list[str]:
-    """Return the residuals of the table in words."""
-    sentences = []
-    for key, label in (
-        ("residual", "Between nodes the interpolated table leaves"),
-        ("uncorrected", "Without it the platform is off by"),
-    ):
-        f = figures[key]
-        if isinstance(f, dict):
-            sentences.append(
-                f"{label} {1e3 * f['rms_dX_m']:.3g} mm and {np.degrees(f['rms_dE_rad']):.3g} deg "
-                f"rms, {1e3 * f['max_dX_m']:.3g} mm and {np.degrees(f['max_dE_rad']):.3g} deg "
-                f"at most (middles of {figures['tested']} cells)."
-            )
-    return sentences
-
-
-def _no_grid(machine: Machine) -> str:
-    """Return the error of a machine without a grid."""
-    return (
-        f"{machine.yaml_path}: the correction could not be tabulated: found no box of poses about "
-        "the middle of the workspace that both models reach inside the travel, needed one; check "
-        "the travel of the motors."
-    )
 
 
 def stacked(poses: list[RigidTransform]) -> Array:

@@ -12,8 +12,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,8 +23,6 @@ from legcal.descriptions.controllers import SIDES, STRUTS, Rig, read_delta, rig_
 from legcal.descriptions.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
 from legcal.exports.correction import poses_at_readings, stacked
 from legcal.exports.subject import (
-    ExportedFile,
-    ExportOptions,
     Rendered,
     Subject,
     comment,
@@ -71,29 +70,29 @@ def firmware_refusal(name: str, subject: Subject) -> str | None:
     return None
 
 
-def firmware_files(name: str, subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def firmware_files(name: str, subject: Subject, path: Path) -> Rendered:
     """Return the lines for a firmware, and a picture of what remains."""
     machine = subject.machine
     turns = machine.actuators[0].turns
     firmware = next(f for f in FIRMWARES if f.name == name and f.turns is turns)
     mount = _mounted(machine, firmware)
     readings, poses = _poses_to_print(mount)
-    seen = _Seen(mount.steps(readings), mount.nozzle(poses))
-    fit = _nearest(firmware, mount.start, seen)
+    errors = mount.errors_at(readings, poses)
+    fit = _nearest_delta(firmware, mount, errors)
     texts = {key: number_text(value) for key, value in firmware.values(fit).items()}
     texts["M669 A0"] = number_text(mount.lowest)
     lines = re.sub(r"\{(.+?)\}", lambda key: texts[key[1]], firmware.lines)
     mark = ";" if "M66" in lines else "#"
     head = f"{mark} {firmware.title} of {comment(subject.name)}, written by legcal {__version__}.\n"
-    ideal = read_delta(path, f"{head}{lines}")
-    after, frame = _placed(ideal, seen)
+    after, frame = _in_best_frame(errors, read_delta(path, f"{head}{lines}"))
     before = None
     if subject.nominal is not None:
         there, reached = poses_at_readings(subject.nominal, readings, poses)
         then = _mounted(subject.nominal, firmware)
-        nominal = _Seen(then.steps(readings)[reached], then.nozzle(there)[reached])
-        before, _ = _placed(_nearest(firmware, then.start, nominal), seen)
-    sentences, figures = in_words(firmware.title, "over the workspace", after, before)
+        of_nominal = then.errors_at(readings[reached], there[reached])
+        before, _ = _in_best_frame(errors, _nearest_delta(firmware, then, of_nominal))
+    remaining = _Remaining(firmware.title, mount.nozzle(poses), after, before)
+    sentences = remaining.sentences("over the workspace")
     moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
     ways = [f"{moved:.3g} mm and {turned:.3g} deg away"] * bool(moved > 1e-3 or turned > 1e-3)
     ways += ["turned so that its towers stand as in the firmware"] * mount.is_turned
@@ -110,7 +109,7 @@ def firmware_files(name: str, subject: Subject, options: ExportOptions, path: Pa
         )
     sentences.append(f"To use it, {firmware.after}.")
     text = head + "".join(f"{mark} {line}\n" for line in sentences) + f"\n{lines}"
-    return with_picture(text, firmware.title, seen.nozzle, after, before, sentences, figures)
+    return remaining.rendered(text, sentences)
 
 
 def number_text(value: float) -> str:
@@ -162,6 +161,17 @@ class _Mounted:
     def nozzle(self, poses: Array) -> Array:
         """Return the origin of the platform link (k, 3) at poses [mm]."""
         return np.asarray(_MM * poses[:, :, 3] @ self.frame + [0.0, 0.0, self.lift])
+
+    def errors_at(self, readings: Array, poses: Array) -> Errors[IdealDelta]:
+        """Return the errors of the nozzle (k, 3) [mm] at readings and poses of the machine."""
+        steps, nozzle, size = self.steps(readings), self.nozzle(poses), np.mean(self.start.rod)
+
+        def errors(ideal: IdealDelta, frame: Array) -> Array:
+            commanded = ideal.positions(ideal.at_stops - steps)
+            turn = Rotation.from_rotvec(frame[3:] / size)
+            return np.asarray(turn.apply(commanded) + frame[:3] - nozzle)
+
+        return errors
 
     def over_bed(self) -> _Mounted:
         """Return it with z = 0 under the whole workspace, where its motors are not above z = 0."""
@@ -296,36 +306,26 @@ def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:
 # --- least squares ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Where a machine has its nozzle, in the frame of a firmware."""
-
-    steps: Array  # (k, 3) of the motors below their endstops [mm or deg]
-    nozzle: Array  # (k, 3) [mm]
-
-    def errors(self, ideal: IdealDelta, frame: Array) -> Array:
-        """Return the errors (k, 3) of a firmware [mm] in a frame: translation [mm], turn [rad]."""
-        commanded = ideal.positions(ideal.at_stops - self.steps)
-        turn = Rotation.from_rotvec(frame[3:])
-        return np.asarray(turn.apply(commanded) + frame[:3] - self.nozzle)
+# The errors of an ideal machine in a frame (6,), translation and turn [mm]; turns at its size.
+Ideal = TypeVar("Ideal")
+Errors = Callable[[Ideal, Array], Array]
 
 
-def _nearest(firmware: Firmware, start: IdealDelta, seen: _Seen) -> IdealDelta:
+def _nearest(errors: Errors[Ideal], ideal: Callable[[Array], Ideal], n: int) -> Ideal:
+    """Return the ideal machine of n unknowns that is nearest to a machine, in any frame."""
+    x = least_squares(lambda x: errors(ideal(x[:n]), x[n:]).ravel(), n + 6)
+    return ideal(x[:n])
+
+
+def _in_best_frame(errors: Errors[Ideal], ideal: Ideal) -> tuple[Array, Array]:
+    """Return the errors of an ideal machine in the frame where they are least, and this frame."""
+    frame = least_squares(lambda x: errors(ideal, x).ravel(), 6)
+    return errors(ideal, frame), frame
+
+
+def _nearest_delta(firmware: Firmware, mount: _Mounted, errors: Errors[IdealDelta]) -> IdealDelta:
     """Return the Delta of a firmware that is nearest to a machine."""
-    n = len(firmware.free())
-    unit = np.array([1.0] * (n + 3) + [1.0 / np.mean(start.rod)] * 3)
-
-    def errors(x: Array) -> Array:
-        return seen.errors(firmware.moved(start, x[:n]), (unit * x)[n:]).ravel()
-
-    return firmware.moved(start, least_squares(errors, n + 6)[:n])
-
-
-def _placed(ideal: IdealDelta, seen: _Seen) -> tuple[Array, Array]:
-    """Return the errors (k, 3) [mm] of a Delta in its best frame, and the frame (6,)."""
-    unit = np.array([1.0] * 3 + [1.0 / np.mean(ideal.rod)] * 3)
-    frame = unit * least_squares(lambda x: seen.errors(ideal, unit * x).ravel(), 6)
-    return seen.errors(ideal, frame), frame
+    return _nearest(errors, partial(firmware.moved, mount.start), len(firmware.free()))
 
 
 def least_squares(errors: Callable[[Array], Array], n: int) -> Array:
@@ -344,6 +344,36 @@ def least_squares(errors: Callable[[Array], Array], n: int) -> Array:
 # --- figures ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class _Remaining:
+    """What remains between a machine and the nearest one that a controller can express [mm]."""
+
+    title: str  # of the controller
+    points: Array  # (..., 3) of the machine
+    after: Array  # (..., 3) errors there
+    before: Array | None  # with the nominal model
+
+    def sentences(self, where: str) -> list[str]:
+        """Return the errors in words."""
+        sentences = [f"{self.title} is off by {describe_errors(self.after)} {where}."]
+        if self.before is not None:
+            sentences.append(
+                "With the numbers of the nominal model it is off by "
+                f"{describe_errors(self.before)}."
+            )
+        return sentences
+
+    def rendered(self, text: str, sentences: Sequence[str]) -> Rendered:
+        """Return a file with the picture of its errors beside it."""
+        figures = {"remaining_mm": figures_of(self.after)}
+        if self.before is not None:
+            figures["nominal_mm"] = figures_of(self.before)
+        first = None if self.before is None else self.before.reshape(-1, 3)
+        points, after = self.points.reshape(-1, 3), self.after.reshape(-1, 3)
+        picture = _picture(self.title, points, after, first)
+        return Rendered({"": text.encode(), ".svg": picture.encode()}, tuple(sentences), figures)
+
+
 def figures_of(errors: Array) -> dict[str, float]:
     """Return the sizes of errors (..., 3)."""
     sizes = np.linalg.norm(errors, axis=-1)
@@ -354,36 +384,6 @@ def describe_errors(errors: Array) -> str:
     """Return the sizes of errors (..., 3) [mm] in words."""
     figures = figures_of(errors)
     return f"{figures['rms']:.3g} mm rms and {figures['max']:.3g} mm at most"
-
-
-def in_words(
-    title: str, where: str, after: Array, before: Array | None
-) -> tuple[list[str], dict[str, Any]]:
-    """Return the errors that remain, and with the nominal model: in words, and as figures."""
-    sentences = [f"{title} is off by {describe_errors(after)} {where}."]
-    figures = {"remaining_mm": figures_of(after)}
-    if before is not None:
-        figures["nominal_mm"] = figures_of(before)
-        sentences.append(
-            f"With the numbers of the nominal model it is off by {describe_errors(before)}."
-        )
-    return sentences, figures
-
-
-def with_picture(
-    text: str,
-    title: str,
-    points: Array,  # (..., 3) of the machine [mm]
-    after: Array,  # (..., 3) errors there [mm]
-    before: Array | None,
-    sentences: Sequence[str],
-    figures: dict[str, Any],
-) -> Rendered:
-    """Return a file with the picture of its errors beside it."""
-    first = None if before is None else before.reshape(-1, 3)
-    picture = _picture(title, points.reshape(-1, 3), after.reshape(-1, 3), first).encode()
-    files = ExportedFile("", text.encode()), ExportedFile(".svg", picture)
-    return Rendered(files, tuple(sentences), figures)
 
 
 def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> str:
@@ -419,7 +419,7 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
         f"{longest:g} mm across (blue) and of height (brown, upwards on paper)",
         colour=DIM,
     )
-    return str(canvas.markup()).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    return str(canvas.markup())
 
 
 # LinuxCNC
@@ -442,7 +442,7 @@ def hexapod_refusal(subject: Subject) -> str | None:
     return f"found the leg {others[0]}, {needed}" if others else None
 
 
-def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def linuxcnc_files(subject: Subject, path: Path) -> Rendered:
     """Return the HAL file; lines for the INI file are in its comments."""
     machine = subject.machine
     home = readings_at(machine, machine.home)
@@ -496,7 +496,6 @@ def linuxcnc_files(subject: Subject, options: ExportOptions, path: Path) -> Rend
 # actuators: least squares over the workspace, in a frame of the base that is chosen with it.
 
 _NEWTON = 8  # steps of the forward kinematics of a rig
-_N = len(SIDES) + 1 + 3  # unknowns of a rig: sides, length, centre of rotation
 
 
 def flypt_refusal(subject: Subject) -> str | None:
@@ -507,28 +506,29 @@ def flypt_refusal(subject: Subject) -> str | None:
     )
 
 
-def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def flypt_files(subject: Subject, path: Path) -> Rendered:
     """Return the numbers of the rig, and a picture of what remains."""
     machine = subject.machine
     readings, motions = workspace(machine)
     poses = stacked(motions)
     places = _Places(machine, readings, poses)
     x = places.nearest()
-    numbers = dict(zip((*SIDES, "Middle", "COR X", "COR Y", "COR Z"), x[:_N], strict=True))
+    numbers = dict(zip((*SIDES, "Middle", "COR X", "COR Y", "COR Z"), x, strict=True))
     stroke = np.ptp([leg.travel for leg in machine.legs], axis=1).min()
     numbers["Range"] = 0.5 * _MM * stroke
     text = "".join(f"{key}: {number_text(float(value))}\n" for key, value in numbers.items())
     rig, centre = rig_in(path, text)[:2]
     written = np.array([*(getattr(rig, side) for side in SIDES), rig.Middle, *centre])
-    after = places.placed(written)
+    after, _ = _in_best_frame(places.errors, written)
     before = None
     if subject.nominal is not None:
         there, reached = poses_at_readings(subject.nominal, readings, poses)
         of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
-        before = places.placed(of_nominal.nearest()[:_N])
-    sentences, figures = in_words("FlyPT Mover", "at the joints of the platform", after, before)
+        before, _ = _in_best_frame(places.errors, of_nominal.nearest())
+    remaining = _Remaining("FlyPT Mover", places.joints, after, before)
     legs = ", ".join(f"'{comment(machine.leg_names[j])}'" for j in places.order)
-    sentences += [
+    sentences = [
+        *remaining.sentences("at the joints of the platform"),
         f"Actuators counterclockwise from the right one of the short side in front: {legs}.",
         "To use it, write the numbers into the rig (LinearHexapod) and start the rig from its "
         "lowest position; actuators have no offsets there, so that what they need is set in their "
@@ -536,9 +536,7 @@ def flypt_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     ]
     head = f"FlyPT Mover rig of {comment(subject.name)}, written by legcal {__version__}."
     comments = "".join(f"# {line}\n" for line in [head, *sentences])
-    return with_picture(
-        f"{comments}\n{text}", "FlyPT Mover", places.joints, after, before, sentences, figures
-    )
+    return remaining.rendered(f"{comments}\n{text}", sentences)
 
 
 class _Places:
@@ -580,34 +578,21 @@ class _Places:
         centre = -B.mean(axis=0) @ self._of_platform
         self._start = np.array([*sides, lengths.mean(), *centre])
 
-    def errors(self, x: Array) -> Array:
-        """Return the errors (k, 6, 3) of the joints, with a rig and the frame of its base (14,)."""
-        rig = Rig(*x[: len(SIDES) + 1])
-        frame = self._turn * Rotation.from_rotvec(x[_N + 3 :] / self._start[4])
-        origin = self._middle + x[_N : _N + 3]
-        near_R = frame.as_matrix().T @ self.poses[:, :, :3] @ self._of_platform
-        near = (self.joints.mean(axis=1) - origin) @ frame.as_matrix()
-        R, t = _forward(rig, rig.Middle + self.moves, near_R, near)
-        joints = rig.platform @ np.swapaxes(R, 1, 2) + t[:, None]
-        return np.asarray(joints @ frame.as_matrix().T + origin - self.joints)
+    def errors(self, rig: Array, frame: Array) -> Array:
+        """Return the errors (k, 6, 3) of the joints, with a rig (8,) and the frame of its base."""
+        sides = Rig(*rig[: len(SIDES) + 1])
+        R_base = (self._turn * Rotation.from_rotvec(frame[3:] / self._start[4])).as_matrix()
+        origin = self._middle + frame[:3]
+        near_R = R_base.T @ self.poses[:, :, :3] @ self._of_platform
+        near = (self.joints.mean(axis=1) - origin) @ R_base
+        R, t = _forward(sides, sides.Middle + self.moves, near_R, near)
+        joints = sides.platform @ np.swapaxes(R, 1, 2) + t[:, None]
+        return np.asarray(joints @ R_base.T + origin - self.joints)
 
     def nearest(self) -> Array:
-        """Return the rig (8,) and its frame (6,) of least errors."""
-        start = np.concatenate([self._start, np.zeros(6)])
-        free = [*range(len(SIDES) + 1), *range(_N, _N + 6)]
-
-        def errors(step: Array) -> Array:
-            x = start.copy()
-            x[free] += step
-            return self.errors(x).ravel()
-
-        start[free] += least_squares(errors, len(free))
-        return start
-
-    def placed(self, rig: Array) -> Array:
-        """Return the errors (k, 6, 3) of a rig (8,) in its best frame."""
-        frame = least_squares(lambda y: self.errors(np.concatenate([rig, y])).ravel(), 6)
-        return self.errors(np.concatenate([rig, frame]))
+        """Return the rig (8,) of least errors; its centre of rotation stays."""
+        n, centre = len(SIDES) + 1, np.zeros(3)
+        return _nearest(self.errors, lambda x: self._start + np.append(x, centre), n)
 
 
 def _sides(joints: Array, first: int) -> tuple[float, float]:

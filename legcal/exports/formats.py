@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from legcal.exports.firmware import (
 from legcal.exports.kinematics_code import c_files, kinematics_refusal, matlab_files, python_files
 from legcal.exports.parameter_files import csv_files, json_files, table_files
 from legcal.exports.robot_files import mjcf_files, mjcf_refusal, ros_files, urdf_files
-from legcal.exports.subject import RESULT_NAME, ExportOptions, Rendered, Subject, load_subject
+from legcal.exports.subject import RESULT_NAME, Rendered, Subject, load_subject
 from legcal.files.folder import OutputFile, OutputKind, result_folder
 from legcal.files.schema import Document, Number, SparseDocument
 from legcal.machine.model import Machine
@@ -30,18 +30,18 @@ from legcal.machine.model import Machine
 if TYPE_CHECKING:
     from legcal.calibration.result_folder import EarlierResult
 
-Render = Callable[[Subject, ExportOptions, Path], Rendered]
+Render = Callable[..., Rendered]
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format: its renderer, its restrictions and its options."""
+    """A format: its renderer and its restrictions."""
 
-    render: Render  # files from a subject, options and the requested path
+    render: Render  # files from a subject and the requested path
     # reason for refusing a machine, or None
     refusal: Callable[[Subject], str | None] = lambda _: None
     is_folder: bool = False
-    options: tuple[str, ...] = ()  # supported fields of ExportOptions
+    has_nodes: bool = False  # whether it is rendered with a number of nodes, if one is given
 
 
 FORMATS: dict[str, Format] = {
@@ -60,7 +60,7 @@ FORMATS: dict[str, Format] = {
     "c": Format(c_files, kinematics_refusal),
     "matlab": Format(matlab_files, kinematics_refusal),
     "ros": Format(ros_files, is_folder=True),
-    "correction": Format(correction_files, correction_refusal, options=("nodes",)),
+    "correction": Format(correction_files, correction_refusal, has_nodes=True),
 }
 _FILE = OutputFile("the export", "export", "", "a new file or --force")
 _FOLDER = OutputKind("export", "", "")
@@ -119,7 +119,7 @@ def export(
     to: str,
     path: str | Path,
     *,
-    options: ExportOptions | None = None,
+    nodes: int | None = None,
     force: bool = False,
 ) -> Exported:
     """Write a model or a result in another format.
@@ -133,21 +133,29 @@ def export(
         One of ``FORMATS``.
     path : path
         The file to write, or the folder for ``ros``.
-    options : ExportOptions, optional
-        Options of some formats.
+    nodes : int, optional
+        Nodes of a ``correction`` along each coordinate.
     force : bool
         Replace existing files.
 
     Raises
     ------
     UsageError
-        If the format is unknown, does not have an option, or the path cannot be written.
+        If the format is unknown, has no nodes, or the path cannot be written.
     OutOfClass
         If the format does not support the type of machine.
     """
-    given = ExportOptions() if options is None else options
-    format = _format(to)
-    _check_options(to, format, given)
+    if to not in FORMATS:
+        raise UsageError(
+            f"The export could not be written: found the format '{to}', needed one of "
+            f"{', '.join(FORMATS)}; give one of them with --to."
+        )
+    format, with_nodes = FORMATS[to], [name for name in FORMATS if FORMATS[name].has_nodes]
+    if nodes is not None and to not in with_nodes:
+        raise UsageError(
+            f"--nodes could not be used: found it with --to {to}, needed "
+            f"{' or '.join(with_nodes)}; leave it out."
+        )
     destination = Path(path)
     if str(path) == "":
         raise UsageError(
@@ -162,54 +170,28 @@ def export(
             f"{subject.given}: --to {to} could not be written: {refusal}; this machine has "
             f"{', '.join(formats_of(subject))}."
         )
-    rendered = format.render(subject, given, destination)
-    places = [_beside(destination, file.name) for file in rendered.files]
-    if format.is_folder:
-        places = [destination / file.name for file in rendered.files]
+    options = {} if nodes is None else {"nodes": nodes}
+    rendered = format.render(subject, destination, **options)
+    places = tuple(
+        destination / name
+        if format.is_folder
+        else destination.with_name(destination.name + name)  # a picture stands beside
+        for name in rendered.files
+    )
     _keep_sources(subject, places)
     if format.is_folder:
-        paths = _write_folder(destination, rendered, force=force)
+        _write_folder(destination, rendered.files, force=force)
     else:
-        paths = tuple(places)
-        for place in paths:
+        for place in places:
             _FILE.check_place(place, force=force)
-        for place, file in zip(paths, rendered.files, strict=True):
-            _FILE.write(place, file.content, force=force)
-    return Exported(to, paths, rendered.notes, dict(rendered.figures))
-
-
-def _beside(destination: Path, ending: str) -> Path:
-    """Return the place of a file of an export: a picture stands beside, under its name."""
-    return destination.with_name(destination.name + ending) if ending else destination
+        for place, content in zip(places, rendered.files.values(), strict=True):
+            _FILE.write(place, content, force=force)
+    return Exported(to, places, rendered.notes, dict(rendered.figures))
 
 
 def formats_of(subject: Subject) -> tuple[str, ...]:
     """Return the formats that support the type of machine."""
     return tuple(name for name, format in FORMATS.items() if format.refusal(subject) is None)
-
-
-def _format(to: str) -> Format:
-    """Return a format by name."""
-    if to not in FORMATS:
-        raise UsageError(
-            f"The export could not be written: found the format '{to}', needed one of "
-            f"{', '.join(FORMATS)}; give one of them with --to."
-        )
-    return FORMATS[to]
-
-
-def _check_options(to: str, format: Format, given: ExportOptions) -> None:
-    """Refuse options that the format does not support."""
-    nothing = ExportOptions()
-    for name in vars(nothing):
-        if getattr(given, name) != getattr(nothing, name) and name not in format.options:
-            takes = [
-                other for other, other_format in FORMATS.items() if name in other_format.options
-            ]
-            raise UsageError(
-                f"--{name} could not be used: found it with --to {to}, needed "
-                f"{' or '.join(takes)}; leave it out."
-            )
 
 
 def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:
@@ -226,16 +208,14 @@ def _keep_sources(subject: Subject, places: Sequence[Path]) -> None:
             )
 
 
-def _write_folder(destination: Path, rendered: Rendered, *, force: bool) -> tuple[Path, ...]:
-    names = [Path(file.name) for file in rendered.files]
-    there = [str(name) for name in names if os.path.lexists(destination / name)]
+def _write_folder(destination: Path, files: Mapping[str, bytes], *, force: bool) -> None:
+    there = [name for name in files if os.path.lexists(destination / name)]
     if there and not force:
         raise UsageError(
             f"{destination}: the export could not be written: found {' and '.join(there)} already "
             "there, needed a new folder or --force; give another folder."
         )
     with result_folder(destination, _FOLDER) as folder:
-        for name, file in zip(names, rendered.files, strict=True):
+        for name, content in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(file.content)
-    return tuple(destination / name for name in names)
+            (folder / name).write_bytes(content)

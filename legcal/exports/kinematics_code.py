@@ -17,7 +17,6 @@ import numpy as np
 
 from legcal.errors import UsageError
 from legcal.exports.subject import (
-    ExportOptions,
     Rendered,
     Subject,
     c_string,
@@ -57,17 +56,17 @@ def kinematics_refusal(subject: Subject) -> str | None:
     return None
 
 
-def python_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def python_files(subject: Subject, path: Path) -> Rendered:
     """Return a Python module."""
     return one_file(_rendered("kinematics.py.jinja", subject.machine, subject.name, repr))
 
 
-def c_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def c_files(subject: Subject, path: Path) -> Rendered:
     """Return a C99 source file."""
     return one_file(_rendered("kinematics.c.jinja", subject.machine, subject.name, c_string))
 
 
-def matlab_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def matlab_files(subject: Subject, path: Path) -> Rendered:
     """Return a MATLAB function file, named like its function."""
     name = path.stem
     if not is_identifier(name) or path.suffix != ".m":

@@ -17,7 +17,7 @@ import numpy as np
 
 from legcal.calibration.documents import JointInLink
 from legcal.calibration.summary import FRAMES, Quantity, parameters_of
-from legcal.exports.subject import ExportOptions, Rendered, Subject, one_file
+from legcal.exports.subject import Rendered, Subject, one_file
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, LegKind
@@ -30,7 +30,7 @@ COLUMNS = ("name", "frame", "unit", "value", "nominal", "change", "sigma", "stat
 _DIGITS = 6  # decimals in the table
 
 
-def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def csv_files(subject: Subject, path: Path) -> Rendered:
     """Return a CSV with a row for each number, read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -40,7 +40,7 @@ def csv_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
     return one_file(text.getvalue())
 
 
-def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def table_files(subject: Subject, path: Path) -> Rendered:
     """Return a text table with aligned columns."""
     rows = [
         ["" if getattr(row, c) is None else _shown(getattr(row, c)) for c in COLUMNS]
@@ -58,7 +58,7 @@ def table_files(subject: Subject, options: ExportOptions, path: Path) -> Rendere
     return one_file("\n".join([title, "", *lines]) + "\n")
 
 
-def json_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def json_files(subject: Subject, path: Path) -> Rendered:
     """Return legs in links and in R_b and R_e, and the parameters with their covariance."""
     machine, joints = subject.machine, _joints(subject)
     document: dict[str, Any] = {

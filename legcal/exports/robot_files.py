@@ -15,8 +15,6 @@ from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.exports.subject import (
-    ExportedFile,
-    ExportOptions,
     Rendered,
     Subject,
     comment,
@@ -33,13 +31,13 @@ STUB_MASS, STUB_INERTIA = 1.0, 1e-3  # [kg], [kg m^2] about each axis of the lin
 _SHAPES = ("visual", "collision")
 
 
-def urdf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def urdf_files(subject: Subject, path: Path) -> Rendered:
     """Return the URDF file."""
     content, notes = urdf_text(subject.machine)
-    return Rendered((ExportedFile("", content),), notes)
+    return Rendered({"": content}, notes)
 
 
-def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def ros_files(subject: Subject, path: Path) -> Rendered:
     """Return the URDF and the numbers of the calibration."""
     content, notes = urdf_text(subject.machine)
     name = identifier(subject.name)
@@ -51,8 +49,7 @@ def ros_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
         **_calibration(subject),
     }
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    files = ExportedFile(f"{name}.urdf", content), ExportedFile("calibration.yaml", text.encode())
-    return Rendered(files, notes)
+    return Rendered({f"{name}.urdf": content, "calibration.yaml": text.encode()}, notes)
 
 
 def urdf_text(machine: Machine) -> tuple[bytes, tuple[str, ...]]:
@@ -175,14 +172,14 @@ def mjcf_refusal(subject: Subject) -> str | None:
     return None
 
 
-def mjcf_files(subject: Subject, options: ExportOptions, path: Path) -> Rendered:
+def mjcf_files(subject: Subject, path: Path) -> Rendered:
     """Return the MJCF file."""
     machine = subject.machine
     root = _Writer(machine).model(subject.name)
     etree.indent(root)
     title = f" {comment(subject.name)}, written by legcal {__version__} "
     content = f"<!--{title.replace('--', '__')}-->\n".encode()
-    return Rendered((ExportedFile("", content + etree.tostring(root, encoding="utf-8") + b"\n"),))
+    return Rendered({"": content + etree.tostring(root, encoding="utf-8") + b"\n"})
 
 
 class _Writer:

@@ -24,13 +24,6 @@ if TYPE_CHECKING:
 RESULT_NAME = "result.json"
 
 
-@dataclass(frozen=True)
-class ExportOptions:
-    """Options of some formats."""
-
-    nodes: int | None = None  # correction: nodes of the grid along each coordinate
-
-
 @dataclass(frozen=True, eq=False)
 class Subject:
     """A mechanism, with the result that it comes from and a session of it, if any."""
@@ -48,25 +41,18 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class ExportedFile:
-    """A file of an export."""
-
-    name: str  # relative to a folder; "" for a single file
-    content: bytes
-
-
-@dataclass(frozen=True)
 class Rendered:
     """The files of a format, with notes and figures."""
 
-    files: tuple[ExportedFile, ...]
+    # contents by name: of a folder relative to it; else what follows the name asked for, "" if that
+    files: Mapping[str, bytes]
     notes: tuple[str, ...] = ()  # notes for the reader, one sentence each
     figures: Mapping[str, Any] = field(default_factory=dict)  # for ``--json``
 
 
 def one_file(text: str) -> Rendered:
     """Return the rendering of a format with a single text file."""
-    return Rendered((ExportedFile("", text.encode()),))
+    return Rendered({"": text.encode()})
 
 
 def other_gains(machine: Machine) -> str:
