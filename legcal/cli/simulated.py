@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from legcal.cli.options import (
     REPORT,
     ClusterOption,
+    HandHeldOption,
     JsonOption,
     ModelArgument,
     PageOfResult,
@@ -24,22 +24,15 @@ from legcal.cli.options import (
 )
 
 
-class _Level(StrEnum):
-    """The kind of observations in a dataset."""
-
-    PHOTOGRAPHS = "photographs"
-    OUTLINES = "outlines"
-
-
 def simulate(
     model: ModelArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to write.")
     ],
     level: Annotated[
-        _Level,
+        Literal["photographs", "outlines"],
         typer.Option(help="Rendered photographs, or outlines with noise (observations.csv)."),
-    ] = _Level.PHOTOGRAPHS,
+    ] = "photographs",
     camera: Annotated[
         list[str] | None,
         typer.Option(
@@ -78,12 +71,7 @@ def simulate(
             show_default="none",
         ),
     ] = None,
-    hand_held: Annotated[
-        bool,
-        typer.Option(
-            "--hand-held", help="A new camera pose for every image, with the board in view."
-        ),
-    ] = False,
+    hand_held: HandHeldOption = False,
     plan: Annotated[
         Path | None,
         typer.Option(
@@ -114,7 +102,7 @@ def simulate(
     nominal = load_mechanism(model)
     settings = requested(
         nominal,
-        level=level.value,
+        level=level,
         camera=camera or (),
         poses=poses,
         error=error or (),

@@ -14,6 +14,7 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -105,15 +106,33 @@ def simulate_session(
 ) -> SimulatedSession:
     """Return a session of a true machine with its nominal model."""
     simulator = _Simulator(truth, nominal, settings, rngs, progress)
-    setup = simulator.set_up(simulator.poses())
-    return simulator.observe(*simulator.shoot(setup))
+    poses, plan = simulator.poses(), simulator.plan
+    posed, boards, views, groups = simulator.set_up(poses)
+    images = simulator.shoot(posed, views, groups)
+    rows = list(range(len(images)))
+    if settings.level != Level.PHOTOGRAPHS:  # tables need a leg in every row
+        rows = [row for row in rows if images.seen(row)]
+    left_out, images = len(images) - len(rows), images.chosen(rows)
+    if groups:
+        images, views, groups = _numbered(images, views, groups)
+    A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
+    scene = Scene(A, B, views, images)
+    width = max(2, len(str(len(posed))))
+    labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(posed)))
+    hints = settings.hints and not groups
+    measurements = _recorded(truth, poses, labels, scene, settings, rngs, hints=hints)
+    if plan is not None and hints:  # hints are the planned poses of the tripods
+        view_pairs = zip(measurements.views, plan.measurements.views, strict=True)
+        hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in view_pairs)
+        measurements = replace(measurements, views=hinted)
+    return SimulatedSession(
+        measurements, truth, poses, labels, posed, scene, left_out, boards, groups
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Setup:
+class _Setup(NamedTuple):
     """The true machine in its poses, among boards and cameras."""
 
-    poses: Configurations
     posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
     boards: tuple[FixedBoard, ...]
     views: tuple[Viewpoint, ...]
@@ -122,7 +141,7 @@ class _Setup:
 
 @dataclass(frozen=True, eq=False)
 class _Simulator:
-    """The inputs of a simulated session, and the steps: poses, set-up, images, measurements."""
+    """The inputs of a simulated session, and the steps: poses, set-up, images."""
 
     truth: Machine
     nominal: Machine
@@ -252,7 +271,7 @@ class _Simulator:
                 for view in views
             }
             views = tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
-        return _Setup(poses, posed, boards, views, groups)
+        return _Setup(posed, boards, views, groups)
 
     def _in_hand(
         self, posed: tuple[PosedMachine, ...]
@@ -276,50 +295,22 @@ class _Simulator:
         self.progress("Camera places", n_images, n_images)
         return tuple(views), tuple(groups)
 
-    def shoot(self, setup: _Setup) -> tuple[_Setup, Images, int]:
-        """Return the set-up, the images, and the number left out: tables need a leg in every row.
-
-        The set-up is without those poses of hand-held cameras that show nothing.
-        """
-        plan, n_poses = self.plan, len(setup.posed_machines)
+    def shoot(
+        self,
+        posed: Sequence[PosedMachine],
+        views: Sequence[Viewpoint],
+        groups: Sequence[str],
+    ) -> Images:
+        """Return the images that the views take of the machine in their poses."""
+        plan, n_poses = self.plan, len(posed)
         poses_of: Sequence[Sequence[int]] = [
-            [v % n_poses] if setup.groups else self.poses_of(v, n_poses)
-            for v in range(len(setup.views))
+            [v % n_poses] if groups else self.poses_of(v, n_poses) for v in range(len(views))
         ]
         if plan is not None:
             poses_of = plan.poses_of
-        images = take_images(
-            self.truth.legs, setup.posed_machines, setup.views, poses_of, self.settings.images,
-            self.progress, all_views=plan is None or not plan.hand,
-        )  # fmt: skip
-        rows = list(range(len(images)))
-        if self.settings.level != Level.PHOTOGRAPHS:
-            rows = [row for row in rows if images.seen(row)]
-        kept = images.chosen(rows)
-        if setup.groups:
-            kept, views, groups = _numbered(kept, setup.views, setup.groups)
-            setup = replace(setup, views=views, groups=groups)
-        return setup, kept, len(images) - len(rows)
-
-    def observe(self, setup: _Setup, images: Images, left_out: int) -> SimulatedSession:
-        """Return the session: readings with their errors, and the truth."""
-        settings, rngs, posed = self.settings, self.rngs, setup.posed_machines
-        A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
-        scene = Scene(A, B, setup.views, images)
-        n_poses = len(setup.poses.poses)
-        width = max(2, len(str(n_poses)))
-        labels = tuple(f"p{k + 1:0{width}d}" for k in range(n_poses))
-        hints = settings.hints and not setup.groups
-        measurements = _recorded(
-            self.truth, setup.poses, labels, scene, settings, rngs, hints=hints
-        )
-        if self.plan is not None and hints:  # hints are the planned poses of the tripods
-            view_pairs = zip(measurements.views, self.plan.measurements.views, strict=True)
-            hinted = tuple(replace(view, T_base_camera=p.T_base_camera) for view, p in view_pairs)
-            measurements = replace(measurements, views=hinted)
-        return SimulatedSession(
-            measurements, self.truth, setup.poses, labels, posed, scene,
-            left_out, setup.boards, setup.groups,
+        return take_images(
+            self.truth.legs, posed, views, poses_of, self.settings.images, self.progress,
+            all_views=plan is None or not plan.hand,
         )  # fmt: skip
 
 
