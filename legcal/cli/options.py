@@ -96,7 +96,7 @@ ClusterOption = Annotated[
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from legcal.pages.document import Verdict
+    from legcal.pages.document import Block, Verdict
     from legcal.report.render import Report
 
 
@@ -105,7 +105,7 @@ def write_page(
     title: str,
     report: Report,
     verdict: Verdict | None = None,
-    blocks: Sequence[Any] = (),
+    blocks: Sequence[Block] = (),
 ) -> None:
     """Write the printed text as a page, with further blocks, if *page* is set."""
     from legcal.pages.document import PAGE, page_html

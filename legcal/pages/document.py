@@ -33,6 +33,18 @@ PAGE = OutputFile(
 )
 
 
+class Block:
+    """A block of a section: the template has a macro for each class."""
+
+    script: ClassVar[str] = ""  # that the page needs for it
+    token = ""  # identifies the page to the server of the block
+
+    @property
+    def kind(self) -> str:
+        """The name of the macro."""
+        return type(self).__name__
+
+
 @dataclass(frozen=True)
 class Number:
     """A number of a table."""
@@ -53,10 +65,9 @@ Cell = str | Number | Link
 
 
 @dataclass(frozen=True)
-class Text:
+class Text(Block):
     """Paragraphs."""
 
-    kind: ClassVar = "text"
     paragraphs: Sequence[str]
     dim: bool = False
 
@@ -70,28 +81,25 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Items:
+class Items(Block):
     """A list."""
 
-    kind: ClassVar = "items"
     items: Sequence[str | Step]
     ordered: bool = False
     title: str = ""
 
 
 @dataclass(frozen=True)
-class Facts:
+class Facts(Block):
     """Names and values, a line each."""
 
-    kind: ClassVar = "facts"
     facts: Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Block):
     """A table, sortable by its columns or not; the first :data:`MAX_ROWS` rows are shown."""
 
-    kind: ClassVar = "table"
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     title: str = ""
@@ -114,41 +122,38 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class Drawing(Block):
     """A drawing (SVG)."""
 
-    kind: ClassVar = "drawing"
     svg: Markup
     caption: str = ""
     title: str = ""
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(Block):
     """Blocks side by side where there is room."""
 
-    kind: ClassVar = "row"
-    blocks: Sequence[Any]
+    blocks: Sequence[Block]
 
 
 @dataclass(frozen=True)
-class Charts:
+class Charts(Block):
     """Drawings side by side whose points stand for things with a label, and maybe a link.
 
     The paths of their points have the numbers of these things in ``data-points``.
     """
 
-    kind: ClassVar = "charts"
     charts: Sequence[Drawing]
     labels: Mapping[int, str]  # by number
     links: Mapping[int, str]
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Block):
     """A scene in space on a canvas; its content is described in ``scene.js``."""
 
-    kind: ClassVar = "scene"
+    script: ClassVar = "scene.js"
     name: str
     content: Mapping[str, Any]
     height: int
@@ -156,7 +161,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Sliders:
+class Sliders(Block):
     """Sliders that move the machine of a scene by its server, and photographs of its poses.
 
     A slider has ``name``, ``label``, ``low``, ``high`` and ``step``, or is a ``button``; posts of
@@ -164,7 +169,7 @@ class Sliders:
     ``scene``, and ``photographs`` with ``file``, ``size``, ``caption`` and ``lines``.
     """
 
-    kind: ClassVar = "sliders"
+    script: ClassVar = "sliders.js"
     scene: str  # the name of the scene
     sliders: Sequence[Mapping[str, Any]]
     state: Mapping[str, Any]
@@ -186,19 +191,17 @@ class Crop:
 
 
 @dataclass(frozen=True)
-class Gallery:
+class Gallery(Block):
     """Pieces of images; a click enlarges one."""
 
-    kind: ClassVar = "gallery"
     crops: Sequence[Crop]
     title: str = ""
 
 
 @dataclass(frozen=True)
-class Picture:
+class Picture(Block):
     """An image, beside the page or in it."""
 
-    kind: ClassVar = "picture"
     file: str  # its place, relative to the page; or :func:`data_url`
     caption: str
     warning: str = ""  # text in red
@@ -217,7 +220,7 @@ def data_url(jpeg: bytes) -> Markup:
 
 
 @dataclass(frozen=True)
-class OutlineEditor:
+class OutlineEditor(Block):
     """A table of outlines that people correct over their photographs and download.
 
     An image has ``view`` and ``image`` as in the table, a ``label``, its ``photograph`` relative to
@@ -227,7 +230,7 @@ class OutlineEditor:
     without a detail and with one in place of ``{}``.
     """
 
-    kind: ClassVar = "editor"
+    script: ClassVar = "editor.js"
     file: str  # the name of the table
     table: str  # its text
     images: Sequence[Mapping[str, Any]]
@@ -243,7 +246,7 @@ class OutlineEditor:
 
 
 @dataclass(frozen=True)
-class LandmarkEditor:
+class LandmarkEditor(Block):
     """Joints that people click in photographs, and a table of them to download.
 
     An image has ``view`` and ``image`` as in the table, a ``label``, its ``photograph`` relative to
@@ -252,7 +255,7 @@ class LandmarkEditor:
     joint, u and v [px], and sigma as in the table.
     """
 
-    kind: ClassVar = "landmarks"
+    script: ClassVar = "landmarks.js"
     file: str  # the name of the table
     images: Sequence[Mapping[str, Any]]
     joints: Sequence[Mapping[str, str]]
@@ -264,10 +267,10 @@ class LandmarkEditor:
 
 
 @dataclass(frozen=True)
-class Dialogue:
+class Dialogue(Block):
     """What a running command asks and says, with a field for answers; the page is served."""
 
-    kind: ClassVar = "dialogue"
+    script: ClassVar = "dialogue.js"
     token: str  # identifies the page to its server
 
 
@@ -277,7 +280,7 @@ class Section:
 
     name: str  # its anchor
     title: str
-    blocks: Sequence[Any]
+    blocks: Sequence[Block]
 
 
 @dataclass(frozen=True)
@@ -307,15 +310,6 @@ def number(value: float | None, digits: int, *, signed: bool = False) -> Number:
     return Number(float(value), f"{value:{'+' if signed else ''}z.{digits}f}")
 
 
-_SCRIPTS = {
-    Scene: "scene.js",
-    OutlineEditor: "editor.js",
-    LandmarkEditor: "landmarks.js",
-    Sliders: "sliders.js",
-    Dialogue: "dialogue.js",
-}
-
-
 def time_of_page() -> str:
     """Return the time on a page: now, or ``SOURCE_DATE_EPOCH`` if it is set.
 
@@ -330,6 +324,8 @@ def page_html(page: Page) -> str:
     """Return a page as HTML."""
     blocks = [block for section in page.sections for block in section.blocks]
     blocks += [inner for block in blocks if isinstance(block, Row) for inner in block.blocks]
+    scripts = dict.fromkeys(["page.js", *(block.script for block in blocks if block.script)])
+    pictures = any(isinstance(block, Picture) and not block.is_inside for block in blocks)
     return (
         _environment()
         .get_template("page.html")
@@ -338,19 +334,9 @@ def page_html(page: Page) -> str:
             mark=MARK,
             version=__version__,
             style=_asset("page.css"),
-            scripts=[
-                _asset("page.js"),
-                *(
-                    _asset(name)
-                    for kind, name in _SCRIPTS.items()
-                    if any(isinstance(block, kind) for block in blocks)
-                ),
-            ],
-            served=any(
-                isinstance(block, LandmarkEditor | Dialogue | Sliders) and block.token
-                for block in blocks
-            ),
-            pictures=any(isinstance(block, Picture) and not block.is_inside for block in blocks),
+            scripts=map(_asset, scripts),
+            served=any(block.token for block in blocks),
+            pictures=pictures,
         )
     )
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import platform as system
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -37,7 +35,7 @@ from legcal.machine.parameters import geometries
 from legcal.machine.rods import arms_at, ends_at_poses, measured_readings
 from legcal.pages.document import (
     PAGE,
-    Cell,
+    Block,
     Charts,
     Crop,
     Drawing,
@@ -49,18 +47,16 @@ from legcal.pages.document import (
     Row,
     Scene,
     Section,
-    Table,
     Text,
     Verdict,
     data_url,
-    number,
     page_html,
     time_of_page,
 )
 from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
 from legcal.report.calibration import next_steps, platform_table
+from legcal.report.render import record_section, table
 from legcal.scene.motions import MachineScene
-from legcal.version import __version__
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.vision.image_file import small_jpeg
@@ -127,31 +123,36 @@ def calibration_page(
     calibration: Calibration,
     folder: Path,
     command: str = "",
-    against: Sequence[Any] = (),
+    against: Sequence[Block] = (),
 ) -> Page:
     """Return the page of a calibration whose result folder this is, made by a command.
 
     *against* are the blocks of a section on the truth, if it is given.
     """
-    machine = calibration.dataset.machine
-    when = time_of_page()
-    sections = (
+    result, dataset, when = calibration.result, calibration.dataset, time_of_page()
+    sections: list[tuple[str, str, Sequence[Block]]] = [
         ("next", "What to do next", [Items(next_steps(calibration, str(folder), command), True)]),
         ("platform", "Platform error", platform_blocks(calibration)),
         ("truth", "Against the truth", against),
         ("parameters", "Parameters", parameter_blocks(calibration)),
         ("machine", "The machine", [machine_scene(calibration)]),
         *_outline_sections(calibration),
-        ("fit", "The fit", [Items(fit_lines(calibration.result, verbose=True))]),
+        ("fit", "The fit", [Items(fit_lines(result, verbose=True))]),
         ("identifiability", "Identifiability", identifiability_blocks(calibration)),
         ("notes", "Diagnosis and notes", note_blocks(calibration)),
-        ("record", "Reproducibility", reproducibility_blocks(calibration, command, when)),
-    )
+    ]
+    facts = {
+        "Dataset": str(dataset.folder),
+        "Start of the fit": f"{result.start}, {calibration.solution.iterations} iterations",
+    }
     return Page(
-        f"Calibration of {machine.name}",
-        f"{calibration.dataset.folder.name}, {when}",
+        f"Calibration of {dataset.machine.name}",
+        f"{dataset.folder.name}, {when}",
         verdict_of(calibration),
-        [Section(*section) for section in sections if section[2]],
+        [
+            *(Section(*section) for section in sections if section[2]),
+            record_section(command, when, facts),
+        ],
     )
 
 
@@ -171,7 +172,7 @@ def verdict_of(calibration: Calibration) -> Verdict:
 # Platform error
 
 
-def platform_blocks(calibration: Calibration) -> list[Any]:
+def platform_blocks(calibration: Calibration) -> list[Block]:
     """Return figures, a chart and maps of the error of the platform."""
     platform = calibration.result.platform
     if platform is None or calibration.platform is None:
@@ -182,16 +183,16 @@ def platform_blocks(calibration: Calibration) -> list[Any]:
         "readings; errors of the readings themselves are not in sigma."
     )
     charts = [Drawing(chart.markup()) for chart in platform_chart(calibration.result)]
-    blocks: list[Any] = [replace(platform_table(platform), note=note), *charts]
+    blocks: list[Block] = [replace(platform_table(platform), note=note), *charts]
     workspace = platform_map(calibration.dataset.machine, calibration.solution)
     if workspace is not None:
         blocks += _maps(workspace)
     return blocks
 
 
-def _maps(workspace: PlatformMap) -> list[Any]:
+def _maps(workspace: PlatformMap) -> list[Block]:
     """Return slices of constant z, whose colours mean the same before and after."""
-    blocks: list[Any] = []
+    blocks: list[Block] = []
     before, after = 1e3 * workspace.change, 1e3 * workspace.sigma
     most = float(max(np.nanmax(before), np.nanmax(after)))
     for name, values in (("Before", before), ("After, 1 sigma", after)):
@@ -209,7 +210,7 @@ def _maps(workspace: PlatformMap) -> list[Any]:
 # Against the truth
 
 
-def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Any]:
+def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Block]:
     """Return the errors of the nominal and the calibrated model.
 
     Raises
@@ -222,7 +223,7 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
     sigma = {row.name: row.sigma for row in calibration.result.parameters}
-    blocks: list[Any] = [Text([_at_the_platform(before, after), _ORIGIN])]
+    blocks: list[Block] = [Text([_at_the_platform(before, after), _ORIGIN])]
     for unit_of_chart in ("m", "rad"):
         # Coordinates that the frame makes zero are not parameters.
         indices = [
@@ -276,7 +277,7 @@ def _at_the_platform(before: Evaluation, after: Evaluation) -> str:
 # Parameters
 
 
-def parameter_blocks(calibration: Calibration) -> list[Any]:
+def parameter_blocks(calibration: Calibration) -> list[Block]:
     """Return joints in the links with all other parameters, as tables and as bars."""
     result, machine = calibration.result, calibration.dataset.machine
     motors = ""
@@ -295,7 +296,7 @@ def parameter_blocks(calibration: Calibration) -> list[Any]:
     others = [q for q in parameters if not (joints and q.parameter.is_joint_coordinate)]
     charts = parameter_charts([q for q in (*joints, *others) if q.parameter.kind != "radius"])
     return [
-        *(table.as_table(title) for title, table in tables(result)),
+        *(shown.as_table(title) for title, shown in tables(result)),
         Text([note], dim=True),
         Row([Drawing(chart.markup()) for chart in charts]),
     ]
@@ -344,7 +345,7 @@ def machine_scene(calibration: Calibration) -> Scene:
 # Outlines
 
 
-def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence[Any]]]:
+def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence[Block]]]:
     """Return the sections on residuals, and on the outlines with the largest and usual ones."""
     residuals, overlays = calibration.residuals, calibration.overlays
     if not len(residuals):
@@ -379,7 +380,7 @@ def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence
 # Evidence
 
 
-def identifiability_blocks(calibration: Calibration) -> list[Any]:
+def identifiability_blocks(calibration: Calibration) -> list[Block]:
     """Return counts, and the least certain directions."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
@@ -400,61 +401,44 @@ def identifiability_blocks(calibration: Calibration) -> list[Any]:
         "Kinematic parameters": f"{free - n_held} of {free} directions determined",
         "Degrees of freedom": f"{result.residuals.dof}, chi2 {result.residuals.chi2:.1f}",
     }
-    blocks: list[Any] = [Facts(counts)]
-    weak: list[list[Cell]] = [
-        [
+    blocks: list[Block] = [Facts(counts)]
+    weak = [
+        (
             row.in_words,
-            number(1e3 * row.sigma_m, 4),
-            _parts(components.parameters, components.components),
-        ]
+            f"{1e3 * row.sigma_m:.4f}",
+            ", ".join(
+                f"{c:+.2f} {name}"
+                for name, c in zip(row.links.parameters, row.links.components, strict=True)
+            ),
+        )
         for row in result.weakest
-        for components in (row.links,)
     ]
     if weak:
         columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
         note = "Select one under Show in the machine above to see it as a motion."
-        blocks.append(Table(columns, weak, note=note))
+        blocks.append(replace(table(*columns, rows=weak), note=note))
     return blocks
 
 
-def _parts(names: Any, components: Any) -> str:
-    return ", ".join(f"{c:+.2f} {name}" for name, c in zip(names, components, strict=True))
-
-
-def note_blocks(calibration: Calibration) -> list[Any]:
+def note_blocks(calibration: Calibration) -> list[Block]:
     """Return the diagnosis, and the notes."""
-    blocks: list[Any] = []
-    diagnosis: list[list[Cell]] = [
-        [d.what, "; ".join(d.same_as), number(d.images_before, 0), number(d.images_after, 0),
-         d.remedy]
+    blocks: list[Block] = []
+    diagnosis = [
+        (d.what, "; ".join(d.same_as), f"{d.images_before}", f"{d.images_after}", d.remedy)
         for d in calibration.result.diagnosis or ()
-    ]  # fmt: skip
+    ]
     if diagnosis:
         columns = ("likely mistake", "indistinguishable from", ">images that agree",
                    ">with correction", "remedy")  # fmt: skip
-        blocks.append(Table(columns, diagnosis, "Diagnosis"))
+        blocks.append(table(*columns, rows=diagnosis, title="Diagnosis"))
     in_table = {diagnosis.sentence for diagnosis in calibration.diagnosis}
     notes = [note for note in calibration.notes if note not in in_table]
     blocks += [Items(notes)] * bool(notes)
     steps = calibration.result.stages.staged
     remarks = [getattr(steps, "failure", ""), *getattr(steps, "diagnostics", ())]
-    if any(remarks):
-        remarks_of_steps = [remark for remark in remarks if remark]
-        blocks.append(Items(remarks_of_steps, title="The four steps alone"))
+    if shown := [remark for remark in remarks if remark]:
+        blocks.append(Items(shown, title="The four steps alone"))
     return blocks
-
-
-def reproducibility_blocks(calibration: Calibration, command: str, when: str) -> list[Any]:
-    """Return version, command, and where the fit started."""
-    facts = {
-        "Version": f"legcal {__version__}, Python {system.python_version()}, {system.machine()}",
-        "Command": command or "from Python",
-        "Time": when,
-        "Dataset": str(calibration.dataset.folder),
-        "Start of the fit": f"{calibration.result.start}, {calibration.solution.iterations} "
-        "iterations",
-    }
-    return [Facts(facts)]
 
 
 # Outlines: charts of residuals, and crops of the worst

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.configurations import poses_at
 from legcal.machine.picture import Mark, draw_machine
-from legcal.pages.document import Drawing, Items, Picture, Row, data_url, page_html
+from legcal.pages.document import Block, Drawing, Items, Picture, Row, data_url, page_html
 from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
 from legcal.planning.session import Plan, poses_to_take, views_in_words
@@ -245,7 +244,7 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
         rows=[[printable(row[i]) for i in settings] for row in rows],
         title="Poses to take, in this order",
     )
-    blocks: list[Any] = [
+    blocks: list[Block] = [
         poses,
         Drawing(in_page, "Camera places from above and from the side."),
         Row(images),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform as system
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from rich.text import Text
 
 from legcal.errors import escaped
 from legcal.pages.document import (
+    Block,
     Cell,
     Facts,
     Items,
@@ -136,7 +138,7 @@ def text_page(
     report: Report,
     *,
     verdict: Verdict | None = None,
-    blocks: Sequence[Any] = (),
+    blocks: Sequence[Block] = (),
     command: str = "",
 ) -> Page:
     """Return a page with the tables and sentences of a report, followed by further blocks.
@@ -144,13 +146,19 @@ def text_page(
     The sentence of the verdict is not repeated.
     """
     when = time_of_page()
-    record = {"Version": f"legcal {__version__}", "Command": command or "from Python", "Time": when}
     omitted = verdict.sentence if verdict is not None else ""
     sections = [Section("result", "Result", _blocks(report, omitted))]
     if blocks:
         sections.append(Section("figures", "Figures", blocks))
-    sections.append(Section("record", "Reproducibility", [Facts(record)]))
+    sections.append(record_section(command, when, {}))
     return Page(title, when, verdict, sections)
+
+
+def record_section(command: str, when: str, more: Mapping[str, str]) -> Section:
+    """Return the section of a page that says how it was made."""
+    version = f"legcal {__version__}, Python {system.python_version()}, {system.machine()}"
+    facts = {"Version": version, "Command": command or "from Python", "Time": when, **more}
+    return Section("record", "Reproducibility", [Facts(facts)])
 
 
 def _blocks(report: Report, omitted: str) -> list[Any]:
