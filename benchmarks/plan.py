@@ -39,7 +39,7 @@ from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.planning.exchange import workspace_of
 from legcal.planning.places import Place, all_points, default_setting, places_along
-from legcal.planning.planner import Candidates, Scene, Task, drawn_covariance
+from legcal.planning.planner import Candidates, Task, drawn_covariance
 from legcal.planning.poses import surely_reached
 from legcal.planning.session import Plan, write_session
 from legcal.simulation.dataset import simulate
@@ -53,10 +53,9 @@ _LIFTS = {True: (0.1, 0.7), False: (0.8, 1.3)}  # [rad] of random places; planar
 
 
 def random_session(
-    scene: Scene, n_images: int, n_views: int, rng: np.random.Generator
+    task: Task, n_images: int, n_views: int, rng: np.random.Generator
 ) -> list[Candidates]:
     """Return a session of random extreme poses and random sensible places."""
-    task = scene.task
     machine, camera = task.machine, task.predictor.camera
     configurations: list[Array] = []
     while len(configurations) < n_images:
@@ -97,12 +96,10 @@ def indices(covariance: Array, unit: Array) -> dict[str, float]:
     }
 
 
-def judged(scene: Scene, session: list[Candidates], draws: int) -> Array:
+def judged(task: Task, session: list[Candidates], draws: int) -> Array:
     """Return the mean covariance of the parameters over the same draws."""
     rng = np.random.default_rng(1)
-    return np.asarray(
-        np.mean([drawn_covariance(scene.task, session, rng) for _ in range(draws)], axis=0)
-    )
+    return np.asarray(np.mean([drawn_covariance(task, session, rng) for _ in range(draws)], axis=0))
 
 
 def main() -> None:
@@ -143,7 +140,7 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
         choices = Choices(priors={f"{rod[0].name}.length": known})
     sigma = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
     predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices, sigma)
-    scene = Scene.nominal(Task(predictor, args.images, args.cameras, default_setting(machine)))
+    task = Task(predictor, args.images, args.cameras, default_setting(machine))
     work = workspace_of(machine, predictor.legs)
     if work is None:
         raise NotIdentifiable(f"{name}: readings do not give the pose, needed another machine.")
@@ -153,13 +150,11 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
     )
     seconds = time.perf_counter() - start
     session = [Candidates(Place(v.T_base_camera), v.poses) for v in plan.views]
-    planned = work.error(judged(scene, session, args.draws)).mean_displacement
+    planned = work.error(judged(task, session, args.draws)).mean_displacement
     unit = np.array([1.0 if u == "m" else 1.0 / machine.q0.mean() for u in plan.units])
     rng, errors, ranked = np.random.default_rng(7), [], []
     for _ in range(args.random):
-        covariance = judged(
-            scene, random_session(scene, args.images, args.cameras, rng), args.draws
-        )
+        covariance = judged(task, random_session(task, args.images, args.cameras, rng), args.draws)
         errors.append(work.error(covariance).mean_displacement)
         free = np.diagonal(covariance) > 0.0
         ranked.append(indices(covariance[np.ix_(free, free)], unit[free]))

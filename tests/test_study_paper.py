@@ -11,18 +11,17 @@ from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 from toy_studies import Deadly, Draws, Mistaken
 
-from legcal.data.outlines import LegAxes
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.machine.configurations import JITTER
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
+from legcal.paper.criteria import Criteria
+from legcal.paper.unknowns import NominalMachine
 from legcal.report.session import study_table
 from legcal.simulation.observe import TableNoise, axes_in_images
 from legcal.simulation.paper import (
     DOCUMENT_NAME,
-    ESTIMATORS,
     PAPER_VIEWS,
     SCALARS,
     EstimatorRow,
@@ -33,7 +32,7 @@ from legcal.simulation.paper import (
     platform_errors,
     run_study,
 )
-from legcal.simulation.session import SimulatedSession, draw_poses, streams
+from legcal.simulation.session import draw_poses, streams
 
 
 def _poses(machine: Machine, n: int = 10) -> RigidTransform:
@@ -106,21 +105,15 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
 ) -> None:
     calls = []
 
-    def often_fails(
-        session: SimulatedSession, axes: LegAxes, initial: tuple[Leg, ...]
-    ) -> tuple[Leg, ...]:
-        calls.append(session)
+    def steps(machine: NominalMachine, *_: object, criteria: Criteria) -> NominalMachine:
+        if criteria == "default":
+            raise DidNotConverge("It never does.")
+        calls.append(machine)
         if len(calls) % 2:
             raise DidNotConverge("It did not.")
-        return initial
+        return machine
 
-    def always_fails(
-        session: SimulatedSession, axes: LegAxes, initial: tuple[Leg, ...]
-    ) -> tuple[Leg, ...]:
-        raise DidNotConverge("It never does.")
-
-    for name, estimate in (("literal", often_fails), ("default", always_fails)):
-        monkeypatch.setitem(ESTIMATORS, name, estimate)
+    monkeypatch.setattr("legcal.simulation.paper.run_steps", steps)
     found = run_study(PaperStudy(n_poses=4), 2)
     rows = {(row["estimator"], row["coplanar"]): row for row in found.document()["rows"]}
     assert rows["literal", True]["failures"] == {"DidNotConverge": 2}

@@ -88,7 +88,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The planning task: machine, numbers of images and views, conditions."""
+    """The planning task: machine, numbers of images and views, conditions, and what is seen."""
 
     predictor: Predictor
     n_images: int
@@ -102,6 +102,7 @@ class Task:
     hand_held: bool = False
     seed: int = 0
     laid: LaidBoard | None = None  # the board at its selected place
+    drawn: tuple[Leg, ...] | None = None  # of a machine within tolerance, in R_b and R_e
 
     @property
     def machine(self) -> Machine:
@@ -113,27 +114,14 @@ class Task:
         """Number of existing images."""
         return sum(len(view.poses.poses) for view in self.given)
 
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A machine, nominal or within tolerance, in front of cameras."""
-
-    task: Task
-    legs: tuple[Leg, ...]  # in R_b and R_e
-
-    @classmethod
-    def nominal(cls, task: Task) -> Scene:
-        """Return the nominal machine."""
-        return cls(task, task.predictor.legs.nominal)
-
-    @classmethod
-    def drawn(cls, task: Task, rng: np.random.Generator) -> Scene:
-        """Draw a machine within tolerance."""
-        return cls(task, drawn_legs(task.predictor.legs, task.setting, rng))
+    @property
+    def legs(self) -> tuple[Leg, ...]:
+        """The legs that are seen, in R_b and R_e: drawn, or nominal."""
+        return self.predictor.legs.nominal if self.drawn is None else self.drawn
 
     def bodies(self, poses: Sequence[RigidTransform]) -> Bodies:
         """Place legs and arms at poses T_Rb_Re."""
-        machine, (R, t) = self.task.machine, components(poses)
+        machine, (R, t) = self.machine, components(poses)
         return Bodies.at(
             self.legs,
             R,
@@ -148,7 +136,7 @@ class Scene:
         bodies = self.bodies(poses)
         points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
         margin = self._margin(T, points) if surely else 0.0
-        return visible_parts(self.task.predictor.camera, T, bodies, margin)
+        return visible_parts(self.predictor.camera, T, bodies, margin)
 
     def board_is_shown(
         self,
@@ -159,7 +147,7 @@ class Scene:
         is_read: bool = True,
     ) -> BoolArray:
         """Return a mask of images that show the board, (n_images,); all without a board."""
-        laid, camera = self.task.laid, self.task.predictor.camera
+        laid, camera = self.laid, self.predictor.camera
         if laid is None:
             return np.ones(len(poses), dtype=np.bool_)
         bodies = self.bodies(poses)
@@ -168,7 +156,7 @@ class Scene:
 
     def showing(self, candidates: Candidates) -> Candidates:
         """Select the candidates that show the board; the same object if all do."""
-        poses = platforms_in_base(self.task.machine, candidates.poses.poses)
+        poses = platforms_in_base(self.machine, candidates.poses.poses)
         shown = self.board_is_shown(candidates.place.T_base_camera, poses, surely=True)
         if shown.all():
             return candidates
@@ -177,7 +165,7 @@ class Scene:
     def _margin(self, T: RigidTransform, points: Array) -> float:
         """Largest image shift of points (n, 3) in the base link within tolerance [px]."""
         nearest = float(T.inv().apply(points)[:, 2].min())
-        return self.task.setting.margin(self.task.predictor.camera, max(nearest, 0.1))
+        return self.setting.margin(self.predictor.camera, max(nearest, 0.1))
 
     def contributions(
         self,
@@ -197,7 +185,7 @@ class Scene:
         with_board = is_shot or self.board_is_shown(T, poses, surely=surely)
         if not len(seen.leg) or not np.any(with_board):
             return None
-        predictor = self.task.predictor
+        predictor = self.predictor
         outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp), predictor.noise)
         if found is not None:
             outlines = outlines.choose(found[outlines.row, outlines.leg])
@@ -205,16 +193,16 @@ class Scene:
         added = predictor.contributions(
             {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit
         )
-        if self.task.board is not None:
+        if self.board is not None:
             added = added.tied_by_board({"here": T})
             added = replace(added, rows=added.rows * np.reshape(with_board, (-1, 1, 1)))
-        if self.task.hand_held:  # one series of images of one camera
+        if self.hand_held:  # one series of images of one camera
             added = replace(added, names=tuple(n.replace("here: ", "hand ") for n in added.names))
         return added
 
     def of(self, candidates: Candidates, *, is_shot: bool = False) -> Contributions | None:
         """Return the information of the images of candidates."""
-        poses = platforms_in_base(self.task.machine, candidates.poses.poses)
+        poses = platforms_in_base(self.machine, candidates.poses.poses)
         return self.contributions(candidates.place.T_base_camera, poses, is_shot=is_shot)
 
 
@@ -237,12 +225,11 @@ def plan_session(
     n_poses = min(MOST_POSES, MIN_POSES + POSES_EACH * task.n_images)
     poses = candidate_poses(machine, legs, task.setting, n_poses, rng, progress)
     task = _with_laid_board(task, poses)
-    scene = Scene.nominal(task)
-    shown = _visible_places(scene, _places(task, poses), poses, rng, progress, run)
-    before = [scene.of(candidates, is_shot=True) for candidates in task.given]
+    shown = _visible_places(task, _places(task, poses), poses, rng, progress, run)
+    before = [task.of(candidates, is_shot=True) for candidates in task.given]
     work, basis = workspace_of(machine, legs), shown[0][1].basis
     search = _Search(
-        scene,
+        task,
         [contributions for contributions in before if contributions is not None],
         work,
         basis,
@@ -310,9 +297,8 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
     best, most = task, 0.0
     for laid in lying(task.board, task.machine):
         trial = replace(task, laid=laid)
-        scene = Scene.nominal(trial)
         is_shown = [
-            scene.board_is_shown(T, in_Rb, surely=False, is_read=bool(task.places)) for T in places
+            trial.board_is_shown(T, in_Rb, surely=False, is_read=bool(task.places)) for T in places
         ]
         share = np.mean(is_shown)
         if share > most:
@@ -327,7 +313,7 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
 
 
 def _visible_places(
-    scene: Scene,
+    task: Task,
     places: Sequence[Place],
     poses: Configurations,
     rng: np.random.Generator,
@@ -335,21 +321,21 @@ def _visible_places(
     run: Run,
 ) -> list[tuple[Place, Contributions]]:
     """Return the camera places that see legs, with the information of a few poses."""
-    machine, visible = scene.task.machine, []
+    visible = []
     probes = np.sort(rng.permutation(len(poses.poses))[:N_PROBES]).tolist()
-    in_Rb = platforms_in_base(machine, [poses.poses[i] for i in probes])
+    in_Rb = platforms_in_base(task.machine, [poses.poses[i] for i in probes])
     contributions_of_places = run(
-        partial(scene.contributions, poses=in_Rb), [place.T_base_camera for place in places]
+        partial(task.contributions, poses=in_Rb), [place.T_base_camera for place in places]
     )
     for k, (place, contributions) in enumerate(zip(places, contributions_of_places, strict=True)):
         if contributions is not None:
             visible.append((place, contributions))
         progress("Camera places", k + 1, len(places))
-    n_needed = 1 if scene.task.hand_held else scene.task.n_views
-    if not visible or (scene.task.places and len(visible) < n_needed):
+    n_needed = 1 if task.hand_held else task.n_views
+    if not visible or (task.places and len(visible) < n_needed):
         used = {id(place) for place, _ in visible}
         blind = [place for place in places if id(place) not in used]
-        raise NotVisible(_no_visible_places(scene.task, blind, len(places), n_needed))
+        raise NotVisible(_no_visible_places(task, blind, len(places), n_needed))
     return visible
 
 
@@ -440,7 +426,7 @@ def _selected_candidates(current: Sequence[Candidates], images: Chosen) -> list[
 class _Search:
     """The search for a session."""
 
-    scene: Scene  # the nominal machine
+    task: Task  # with the nominal machine
     given: Sequence[Contributions]  # of existing images
     work: Workspace | None  # None if readings do not determine the pose
     basis: Array  # of the coordinates of the machine
@@ -450,14 +436,9 @@ class _Search:
     stop: Callable[[], bool]
     run: Run
 
-    @property
-    def task(self) -> Task:
-        """The planning task."""
-        return self.scene.task
-
     def added(self, candidates: Sequence[Candidates]) -> list[Contributions]:
         """Return the information of candidates, all of which see legs."""
-        return [one for one in self.run(self.scene.of, candidates) if one is not None]
+        return [one for one in self.run(self.task.of, candidates) if one is not None]
 
     def with_all(self, slots: Sequence[Contributions]) -> Session:
         """Return the session with all images of all slots."""
@@ -478,7 +459,7 @@ class _Search:
         n_places = min(N_HANDS, len(shown)) if task.hand_held else task.n_views
         contributions = [contributions for _, contributions in shown]
         chosen = choose_places(contributions, n_places, task.n_images, self.criterion, self.given)
-        current = [self.scene.showing(Candidates(shown[i][0], poses)) for i in chosen]
+        current = [self.task.showing(Candidates(shown[i][0], poses)) for i in chosen]
         count = [len(candidates.poses.poses) for candidates in current]
         if sum(count) < task.n_images:
             raise NotVisible(
@@ -551,8 +532,8 @@ class _Search:
                     break
                 place = near(current[v].place, target, PLACE_STEP * step, self.rng)
                 trial = replace(candidates, place=place)
-                added = self.scene.of(trial) if place.is_inside(self.task.bounds) else None
-                if added is None or self.scene.showing(trial) is not trial:
+                added = self.task.of(trial) if place.is_inside(self.task.bounds) else None
+                if added is None or self.task.showing(trial) is not trial:
                     continue
                 trial_value = self.value([*contributions[:v], added, *contributions[v + 1 :]])
                 if trial_value < value:
@@ -570,7 +551,7 @@ class _Search:
             if not self.stop():
                 legs = task.predictor.legs
                 poses = poses_near(task.machine, legs, task.setting, poses, spread, self.rng)
-            widened.append(self.scene.showing(replace(candidates, poses=poses)))
+            widened.append(self.task.showing(replace(candidates, poses=poses)))
         session = Session(self.added(widened), self.given)
         images = [
             (v, k)
@@ -615,7 +596,7 @@ class _Search:
             via_of_view = via[n_done : n_done + len(poses.poses)]
             n_done += len(poses.poses)
             T, in_Rb = candidates.place.T_base_camera, platforms_in_base(machine, poses.poses)
-            seen = self.scene.seen(T, in_Rb, surely=False)
+            seen = self.task.seen(T, in_Rb, surely=False)
             views.append(PlannedView(candidates.place.name, T, poses, via_of_view, seen))
         notes = []
         if blocked:
@@ -684,7 +665,8 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
 
 def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.Generator) -> Array:
     """Return the covariance (p, p) of the parameters in a random session within tolerance."""
-    scene, machine, parts = Scene.drawn(task, rng), task.machine, []
+    scene = replace(task, drawn=drawn_legs(task.predictor.legs, task.setting, rng))
+    machine, parts = task.machine, []
     for candidates, is_set in (*((c, False) for c in current), *((c, True) for c in task.given)):
         nearby = platforms_in_base(machine, candidates.poses.poses)
         poses: Sequence[RigidTransform] = nearby

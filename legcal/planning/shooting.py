@@ -51,7 +51,7 @@ from legcal.perception.image_quality import Exposure, image_defects, measure_exp
 from legcal.perception.photographs import measure_photographs, nominal_placement
 from legcal.planning.exchange import Session, Workspace, criterion_of, workspace_of
 from legcal.planning.places import default_setting
-from legcal.planning.planner import Scene, Task
+from legcal.planning.planner import Task
 from legcal.planning.poses import candidate_poses, ways
 from legcal.planning.request import measured_length
 from legcal.progress import no_progress
@@ -225,9 +225,7 @@ class GuidedSession:
         if known is None:
             return None
         session, slot, first = known
-        criterion = criterion_of(
-            self._work, self._scene.task.predictor.legs, session.slots[0].basis
-        )
+        criterion = criterion_of(self._work, self._task.predictor.legs, session.slots[0].basis)
         images = np.arange(first, first + len(pool.poses))
         k = int(np.argmin(criterion(session.with_one_more(slot, images))))
         q = np.where(np.isnan(m.q[0]), np.nan, pool.readings[k])
@@ -446,24 +444,24 @@ class GuidedSession:
         return self._work.error(basis @ session.machine @ basis.T)
 
     @cached_property
-    def _scene(self) -> Scene:
+    def _task(self) -> Task:
         m, board = self.dataset.measurements, self.dataset.board_on("base")
         lengths, _ = measured_length(self.machine, board=board is not None)
         predictor = Predictor(
             self.machine, m.views[0].camera, DEFAULT_NOISE, m.sigma_q, lengths, m.sigma_by_joint
         )
-        return Scene.nominal(Task(predictor, 1, 1, default_setting(self.machine)))
+        return Task(predictor, 1, 1, default_setting(self.machine))
 
     @cached_property
     def _work(self) -> Workspace | None:
         if any(view.hand_held for view in self.dataset.measurements.views):
             return None
-        return workspace_of(self.machine, self._scene.task.predictor.legs)
+        return workspace_of(self.machine, self._task.predictor.legs)
 
     @cached_property
     def _pool(self) -> Configurations:
         """Poses from which the next one is chosen."""
-        task = self._scene.task
+        task = self._task
         rng = np.random.default_rng(0)
         return candidate_poses(self.machine, task.predictor.legs, task.setting, N_CANDIDATES, rng)
 
@@ -499,7 +497,7 @@ class GuidedSession:
                 found = np.concatenate([found, np.ones((len(pool.poses), n_legs), dtype=np.bool_)])
                 at, first = len(slots), n
             poses = platforms_in_base(machine, poses_at(machine, configurations).poses)
-            added = self._scene.contributions(T, poses, surely=False, found=found)
+            added = self._task.contributions(T, poses, surely=False, found=found)
             if added is not None:
                 slots.append(added)
                 counts.append(n)

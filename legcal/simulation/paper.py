@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.outlines import LegAxes, axes_of_table
+from legcal.data.outlines import axes_of_table
 from legcal.errors import DidNotConverge, LegcalError, UsageError
 from legcal.files.folder import OutputKind, check_destination, result_folder
 from legcal.files.schema import Document, Number, SparseDocument
@@ -132,7 +132,7 @@ class PaperStudy:
     n_poses: int = 15  # extreme poses of each camera position
     n_images: int = 3  # of each pose
     n_checked: int = 10  # random poses of eq (20)
-    estimators: tuple[str, ...] = ("literal", "default")  # the estimators compared
+    estimators: tuple[Criteria, ...] = ("literal", "default")  # of the four steps, compared
 
     @property
     def name(self) -> str:
@@ -188,9 +188,10 @@ class PaperStudy:
         axes = axes_of_table(*axes_in_images(session.scene, self.noise, rngs["observations"]))
         checked = checked_poses(truth, initial, self.n_checked, rng)
         errors_by_estimator = {INITIAL: _errors(truth, initial, checked)}
+        machine = NominalMachine(truth.leg_names, tuple(initial), truth.frame_legs)
         for name in self.estimators:
             try:
-                legs = ESTIMATORS[name](session, axes, initial)
+                legs = run_steps(machine, axes, session.measurements, criteria=name).legs
             except LegcalError as failure:
                 errors_by_estimator[name] = {"failure": failure_of(failure)}
             else:
@@ -265,25 +266,6 @@ def poses_by_readings(
     solved = solve_poses(legs, truth.frame_legs, R, t, lengths - truth.q0)
     poses = RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
     return poses, np.asarray(solved.missed <= _MAX_ERROR * lengths.max(axis=1))
-
-
-# Estimators: their inputs are measurements and axes of a session, and the initial legs
-
-
-def four_steps(
-    session: SimulatedSession, axes: LegAxes, initial: Sequence[Leg], criteria: Criteria
-) -> tuple[Leg, ...]:
-    """Return the legs of the four steps."""
-    truth = session.truth
-    machine = NominalMachine(truth.leg_names, tuple(initial), truth.frame_legs)
-    return run_steps(machine, axes, session.measurements, criteria=criteria).legs
-
-
-Estimator = Callable[[SimulatedSession, LegAxes, Sequence[Leg]], Sequence[Leg]]
-ESTIMATORS: dict[str, Estimator] = {
-    "literal": partial(four_steps, criteria="literal"),
-    "default": partial(four_steps, criteria="default"),
-}
 
 
 # Means over runs, and figure 4
@@ -424,10 +406,7 @@ class PaperDocument(Document):
                 continue
             errors = [
                 Bars(label, by_key[is_coplanar, name].parameters_mm or [None] * len(labels))
-                for label, name in (
-                    ("initial model", INITIAL),
-                    (words, estimator),
-                )
+                for label, name in (("initial model", INITIAL), (words, estimator))
             ]
             n_runs = shown.runs + shown.failed
             failed = f", {shown.failed} of {n_runs} runs failed" * bool(shown.failed)
