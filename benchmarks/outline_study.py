@@ -100,11 +100,11 @@ class OutlineStudy(ABC):
                 record[machine] = {"failure": failure_of(error)}
         return record
 
-    def summary(self, records: Iterable[Record]) -> OutlineSummary:
+    def summary(self, records: Iterable[Record], heading: dict[str, Any]) -> OutlineSummary:
         """Return what all runs showed."""
         together = list(records)
         found = [self.judged(m, [record[m] for record in together]) for m in self.machines]
-        return OutlineSummary(self, found)
+        return OutlineSummary(self, found, heading)
 
     @property
     def readings(self) -> tuple[str, ...]:
@@ -155,6 +155,7 @@ class OutlineSummary:
 
     study: OutlineStudy
     machines: list[Found]
+    heading: dict[str, Any]
 
     def document(self) -> dict[str, Any]:
         """Return the document of ``--json``."""
@@ -162,6 +163,7 @@ class OutlineSummary:
             "machines": self.machines,
             "met": all(found["met"] for found in self.machines),
             "readings": list(self.study.readings),
+            **self.heading,
         }
 
     def files(self) -> dict[str, bytes]:

@@ -26,7 +26,7 @@ from legcal.machine.inspection import Inspection
 from legcal.planning.session import PlanDocument
 from legcal.recordings.importing import ImportDocument
 from legcal.simulation.dataset import SimulationDocument
-from legcal.simulation.paper import PaperDocument, StudyHeading
+from legcal.simulation.paper import PaperDocument
 from legcal.vision.board import AprilgridEntry, CharucoEntry, ChessboardEntry
 from legcal.vision.camera_file import RosEntry
 
@@ -106,7 +106,7 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {  # that legcal writes
     "example": create_model("Example", __base__=Document, path=(str, ...)),
     "export": ExportDocument,
     "simulate": SimulationDocument,
-    "study": create_model("Study", __base__=(PaperDocument, StudyHeading)),
+    "study": PaperDocument,
     "locate": create_model("Locate", __base__=LocationFile, written=(list[str], ...)),
     "location": LocationFile,
     "result": Result,

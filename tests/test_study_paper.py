@@ -26,7 +26,7 @@ from legcal.simulation.paper import (
     SCALARS,
     EstimatorRow,
     PaperStudy,
-    StudyResult,
+    Summary,
     paper_cameras,
     paper_machine,
     platform_errors,
@@ -40,7 +40,7 @@ def _poses(machine: Machine, n: int = 10) -> RigidTransform:
     return RigidTransform.concatenate(list(platforms_in_base(machine, drawn)))
 
 
-def _printed(result: StudyResult) -> str:
+def _printed(result: Summary) -> str:
     printed = io.StringIO()
     Console(file=printed, width=80).print(study_table(result.document()))
     return printed.getvalue()

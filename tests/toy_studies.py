@@ -19,9 +19,10 @@ class Total:
 
     total: float
     n: int
+    heading: dict[str, Any]
 
     def document(self) -> dict[str, Any]:
-        return {"total": self.total, "n": self.n}
+        return {"total": self.total, "n": self.n, **self.heading}
 
     def files(self) -> dict[str, bytes]:
         return {"total.txt": str(self.total).encode()}
@@ -49,11 +50,11 @@ class Draws:
             raise DidNotConverge(f"The draw is {x}.")
         return {"x": x}
 
-    def summary(self, records: Iterable[Record]) -> Total:
+    def summary(self, records: Iterable[Record], heading: dict[str, Any]) -> Total:
         total, n = 0.0, 0
         for record in records:
             total, n = total + record["x"], n + 1
-        return Total(total, n)
+        return Total(total, n, heading)
 
 
 @dataclass(frozen=True)

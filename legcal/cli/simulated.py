@@ -154,10 +154,10 @@ def paper(
     from legcal.pages.document import Drawing
     from legcal.report.session import study_table
     from legcal.simulation.observe import TableNoise
-    from legcal.simulation.paper import PaperStudy, StudyResult, run_study
+    from legcal.simulation.paper import PaperStudy, Summary, run_study
     from legcal.workers import processors
 
-    def make_page(study_result: StudyResult, folder: Path) -> None:
+    def make_page(study_result: Summary, folder: Path) -> None:
         figure = Markup((folder / "fig4.svg").read_text(encoding="utf-8"))
         title, text = "The paper's simulation", study_table(study_result.document())
         write_page(folder / REPORT, title, text, blocks=[Drawing(figure)])

@@ -26,7 +26,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data.outlines import axes_of_table
 from legcal.errors import DidNotConverge, LegcalError, UsageError
 from legcal.files.folder import OutputKind, check_destination, result_folder
-from legcal.files.schema import Document, Number, SparseDocument
+from legcal.files.schema import Document, Number
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import BoolArray
 from legcal.machine.closing import solve_poses
@@ -159,9 +159,10 @@ class PaperStudy:
             for name, child in zip(MACHINES, seeds, strict=True)
         }
 
-    def summary(self, records: Iterable[Record]) -> PaperDocument:
+    def summary(self, records: Iterable[Record], heading: Heading) -> PaperDocument:
         """Return the means over all runs."""
-        return PaperDocument.of(records, in_radians=self.noise == TableNoise.in_radians())
+        in_radians = self.noise == TableNoise.in_radians()
+        return PaperDocument.of(records, heading, in_radians=in_radians)
 
     def session(
         self, truth: Machine, views: Sequence[Viewpoint], rngs: Streams
@@ -367,9 +368,14 @@ class PaperDocument(Document):
     true_values_mm: dict[str, list[Number]]  # by machine
     as_printed: dict[str, dict[str, Any] | str]  # in the paper
     readings: list[str]  # interpretations of the paper where its text leaves a choice
+    study: str
+    settings: dict[str, Any]
+    seed: int
+    runs: int
+    failures: dict[str, int]  # runs that failed as a whole, by kind of error
 
     @classmethod
-    def of(cls, records: Iterable[Record], *, in_radians: bool) -> PaperDocument:
+    def of(cls, records: Iterable[Record], heading: Heading, *, in_radians: bool) -> PaperDocument:
         """Return the means over the records of runs."""
         by_key: dict[tuple[str, str], list[Record]] = {}
         for record in records:
@@ -389,6 +395,7 @@ class PaperDocument(Document):
             },
             as_printed={"initial": PRINTED_BEFORE, "calibrated": PRINTED_AFTER, "note": CONTEXT},
             readings=[IN_RADIANS if in_radians else IN_DEGREES, *READINGS],
+            **heading,
         )
 
     def files(self) -> dict[str, bytes]:
@@ -427,10 +434,12 @@ _PROCESSES = 4  # maximum number of processes for each core; more only wait for 
 
 Record = dict[str, Any]
 """The result of one run as a JSON document: numbers, texts, lists, null; never NaN."""
+Heading = dict[str, Any]
+"""What the documents of all studies begin with: study, settings, seed, runs, failures."""
 
 
 class Summary(Protocol):
-    """The combined result of all runs of a study."""
+    """The combined result of the runs of a study that did not fail, with its heading."""
 
     def document(self) -> dict[str, Any]:
         """Return it as a JSON document."""
@@ -457,30 +466,8 @@ class Study(Protocol):
     def one_run(self, seed: np.random.SeedSequence) -> Record:
         """Return the record of one run; a LegcalError is recorded as a failed run."""
 
-    def summary(self, records: Iterable[Record]) -> Summary:
+    def summary(self, records: Iterable[Record], heading: Heading) -> Summary:
         """Summarise the records of all runs that did not fail, read once and in order."""
-
-
-class StudyHeading(SparseDocument):
-    """The part of a study's document that is common to all studies."""
-
-    study: str
-    settings: dict[str, Any]
-    seed: int
-    runs: int
-    failures: dict[str, int]  # runs that failed as a whole, by kind of error
-
-
-@dataclass(frozen=True, eq=False)
-class StudyResult:
-    """A finished study."""
-
-    heading: StudyHeading
-    summary: Summary  # result of the runs that did not fail
-
-    def document(self) -> dict[str, Any]:
-        """Return the document that ``legcal study --json`` prints."""
-        return self.summary.document() | self.heading.document()
 
 
 def run_study(
@@ -491,8 +478,8 @@ def run_study(
     workers: Workers = 1,
     output: Path | None = None,
     progress: Progress = False,
-    beside: Callable[[StudyResult, Path], None] | None = None,
-) -> StudyResult:
+    beside: Callable[[Any, Path], None] | None = None,
+) -> Summary:
     """Run a study.
 
     Parameters
@@ -516,7 +503,7 @@ def run_study(
 
     Returns
     -------
-    StudyResult
+    Summary
 
     Raises
     ------
@@ -546,19 +533,19 @@ def run_study(
             f"The study {study.name} found nothing: all of its {n_runs} runs failed, needed "
             f"one that does not; the first one says: {failures[0]}"
         )
-    heading = StudyHeading(
-        study=study.name,
-        settings=study.settings,
-        seed=seed,
-        runs=n_runs,
-        failures=dict(Counter(type(failure).__name__ for failure in failures)),
-    )
+    heading = {
+        "study": study.name,
+        "settings": study.settings,
+        "seed": seed,
+        "runs": n_runs,
+        "failures": dict(Counter(type(failure).__name__ for failure in failures)),
+    }
     records = (outcome for outcome in in_order if not isinstance(outcome, LegcalError))
-    result = StudyResult(heading, study.summary(records))
+    result = study.summary(records, heading)
     if output is not None:
         document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
         with result_folder(output, _STUDY) as folder:
-            for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
+            for name, content in {**result.files(), DOCUMENT_NAME: document}.items():
                 (folder / name).write_bytes(content)
             if beside is not None:
                 beside(result, folder)
