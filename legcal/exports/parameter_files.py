@@ -9,14 +9,14 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from legcal.calibration.documents import JointInLink
-from legcal.calibration.summary import FRAMES, Quantity, parameters_of
+from legcal.calibration.summary import FRAMES, Quantity, joints_of, parameters_of
 from legcal.exports.subject import Rendered, Subject, one_file
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
@@ -98,49 +98,55 @@ def json_files(subject: Subject, path: Path) -> Rendered:
 
 def rows_of(subject: Subject) -> list[Quantity]:
     """Return the rows of a subject: joints and axes in their links, then all parameters."""
-    parameters = (
-        _parameters_of_model(subject.machine)
-        if subject.result is None
-        else parameters_of(subject.result.document)
+    machine = subject.machine
+    if subject.result is not None:
+        result = subject.result.document
+        return [*joints_of(result), *_directions(subject), *parameters_of(result)]
+    legs, links = machine.legs_of_frames, {"base": machine.base, "platform": machine.platform}
+    lengths = [
+        Quantity.of(f"{leg.name}.{kind}", "", unit, (value, None, None))
+        for leg in legs
+        for kind, unit, value in (
+            ("length" if leg.kind is LegKind.CONSTANT else "offset", "m", leg.q0),
+            ("twist", "rad", leg.twist),
+        )
+        if value is not None and not (unit == "m" and leg.kind is LegKind.PASSIVE)
+    ]
+    in_links, in_frames = (
+        [
+            row
+            for leg in several
+            for side, frame in frames.items()
+            for row in _vector(f"{leg.name}.{side}", frame, "m", _end(leg, side)[0])
+        ]
+        for several, frames in ((legs, links), (geometries(machine), FRAMES))
     )
-    return [*_joint_rows(subject), *_actuator_rows(subject), *parameters]
+    return [*in_links, *_directions(subject), *in_frames, *lengths]
 
 
-def _joint_rows(subject: Subject) -> Iterator[Quantity]:
-    """Yield joint centres and axes in their links."""
+def _directions(subject: Subject) -> Iterator[Quantity]:
+    """Yield axes of joints in their links, directions and axes of actuators in the base link."""
     machine, nominal = subject.machine, subject.nominal
-    joints = _joints(subject)
+    status = "model" if subject.result is None else "derived"
     for side, link in (("base", machine.base), ("platform", machine.platform)):
         for j, leg in enumerate(machine.legs_of_frames):
-            joint = joints.get((side, leg.name))
-            point, axis = _end(leg, side)
-            before, turned = None, None
-            if nominal is not None:
-                before, turned = _end(nominal.legs_of_frames[j], side)
-            status = ["model"] * 3 if joint is None else joint.status
-            sigma = [None] * 3 if joint is None else joint.sigma
-            yield from _vector(f"{leg.name}.{side}", link, "m", point, before, status, sigma)
+            axis = _end(leg, side)[1]
+            was = None if nominal is None else _end(nominal.legs_of_frames[j], side)[1]
             if axis is not None:
-                if turned is not None and axis @ turned < 0.0:
-                    turned = -turned  # axes are lines
-                status = ["model" if joint is None else "derived"] * 3
-                yield from _vector(f"{leg.name}.{side}_axis", link, "", axis, turned, status)
-
-
-def _actuator_rows(subject: Subject) -> Iterator[Quantity]:
-    """Yield directions and axes of actuators, in the base link."""
-    machine, nominal = subject.machine, subject.nominal
+                if was is not None and axis @ was < 0.0:
+                    was = -was  # axes are lines
+                yield from _vector(f"{leg.name}.{side}_axis", link, "", axis, was, status)
     before = {} if nominal is None else {other.joint: other for other in nominal.actuators}
-    status = ["model" if nominal is None else "derived"] * 3
     for actuator in machine.actuators:
         other, joint = before.get(actuator.joint), actuator.joint
-        kind = "axis" if actuator.turns else "direction"
+        name = f"{joint}.{'axis' if actuator.turns else 'direction'}"
         was = None if other is None else other.axis
-        yield from _vector(f"{joint}.{kind}", machine.base, "", actuator.axis, was, status)
+        yield from _vector(name, machine.base, "", actuator.axis, was, status)
         if actuator.turns:
             was = None if other is None else other.point
-            name = f"{joint}.axis_point"
-            yield from _vector(name, machine.base, "m", actuator.point, was, status)
+            yield from _vector(
+                f"{joint}.axis_point", machine.base, "m", actuator.point, was, status
+            )
 
 
 def _vector(
@@ -148,15 +154,13 @@ def _vector(
     frame: str,
     unit: str,
     vector: Array,
-    nominal: Array | None,
-    status: Sequence[str],
-    sigma: Sequence[float | None] = (None, None, None),
+    nominal: Array | None = None,
+    status: str = "model",
 ) -> Iterator[Quantity]:
     """Yield the components of a vector."""
     for k, axis in enumerate("xyz"):
         before = None if nominal is None else float(nominal[k])
-        numbers = float(vector[k]), before, sigma[k]
-        yield Quantity.of(f"{name}.{axis}", frame, unit, numbers, status[k])
+        yield Quantity.of(f"{name}.{axis}", frame, unit, (float(vector[k]), before, None), status)
 
 
 def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
@@ -168,18 +172,6 @@ def _joints(subject: Subject) -> dict[tuple[str, str], JointInLink]:
 def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:
     """Return the joint centre and the axis of a leg at base or platform."""
     return (leg.A, leg.base_axis) if side == "base" else (leg.B, leg.platform_axis)
-
-
-def _parameters_of_model(machine: Machine) -> Iterator[Quantity]:
-    """Yield the parameters of a model, joints in R_b and R_e."""
-    for name, leg in zip(machine.leg_names, geometries(machine), strict=True):
-        for side, point in (("base", leg.A), ("platform", leg.B)):
-            yield from _vector(f"{name}.{side}", FRAMES[side], "m", point, None, ["model"] * 3)
-        if leg.kind is not LegKind.PASSIVE:
-            kind = "length" if leg.kind is LegKind.CONSTANT else "offset"
-            yield Quantity.of(f"{name}.{kind}", "", "m", (leg.q0, None, None))
-        if leg.twist is not None:
-            yield Quantity.of(f"{name}.twist", "", "rad", (leg.twist, None, None))
 
 
 def _leg(

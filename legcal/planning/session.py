@@ -153,6 +153,14 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     return plan.sigma_q
 
 
+def settings_in_words(machine: Machine, q: Array) -> tuple[str, ...]:
+    """Return the readings of the motors at q (n_legs,): ``leg1_prismatic 28.663 mm``."""
+    legs = [(j, machine.legs[j]) for j in machine.motors]
+    shown = [(j, leg.prismatic, *SHOWN_IN[leg.reading_unit]) for j, leg in legs]
+    words = [f"{joint} {size * q[j]:z.3f} {unit}" for j, joint, size, unit in shown]
+    return tuple(dict.fromkeys(words))
+
+
 def poses_to_take(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Return header and rows of ``poses.csv``."""
     motors, labels = list(plan.machine.motors), plan.labels
@@ -265,6 +273,11 @@ class Plan:
     def labels(self) -> list[str]:
         """Labels of the poses, in the order to take them."""
         return pose_labels(self.n_images, self.n_given)
+
+    @property
+    def has_ways(self) -> bool:
+        """Whether some pose is reached by another one."""
+        return any(via for view in self.views for via in view.via)
 
     @property
     def sentence(self) -> str:

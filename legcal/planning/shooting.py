@@ -41,7 +41,6 @@ from legcal.data.reading_units import reading_units
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, UsageError
 from legcal.files.folder import write_atomically
-from legcal.files.quantity import SHOWN_IN
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations, poses_at
@@ -71,7 +70,6 @@ class Asked:
     view: str
     pose: str  # its label
     q: Array  # (n_legs,) readings to command [m or rad]; NaN of passive legs
-    settings: tuple[str, ...]  # the same in words, ``leg1_prismatic 28.663 mm``
     via: str  # label of the pose to pass first, ``home``, or ""
     is_planned: bool
     image: str  # path in the session, without its ending
@@ -164,7 +162,7 @@ class GuidedSession:
         if (self.folder / POSES_NAME).is_file():
             _, poses = _cells(self.folder / POSES_NAME)
             self._vias = {row.get("image", ""): row.get("on the way", "") for row in poses}
-        self.__dict__.pop("_known", None)
+        self.__dict__.pop("error", None)
 
     def _write_tables(self, rows: Sequence[dict[str, str]]) -> None:
         """Write the rows that are taken; the plan is kept beside them."""
@@ -187,7 +185,7 @@ class GuidedSession:
             image = cells["image"]
             pose, via = _label(cells)[1], self._vias.get(image, "")
             stem = str(PurePosixPath(image).with_suffix(""))
-            return Asked(cells["view"], pose, q, self._settings(q), via, True, stem, cells)
+            return Asked(cells["view"], pose, q, via, True, stem, cells)
         return self._best()
 
     @property
@@ -206,13 +204,6 @@ class GuidedSession:
     def n_planned(self) -> int:
         """Number of photographs of the session with all that is planned."""
         return len(self.taken) + len(self._to_take)
-
-    def _settings(self, q: Array) -> tuple[str, ...]:
-        legs, words = self.machine.legs, list[str]()
-        for j in self.machine.motors:
-            size, unit = SHOWN_IN[legs[j].reading_unit]
-            words.append(f"{legs[j].prismatic} {size * q[j]:.3f} {unit}")
-        return tuple(dict.fromkeys(words))
 
     def _best(self) -> Asked | None:
         """Return the pose that determines the platform best, from where the camera stands."""
@@ -238,9 +229,7 @@ class GuidedSession:
         if "pose" not in self._header:
             cells.pop("pose")
         image = f"images/{view}_{label}"
-        return Asked(
-            view, label, q, self._settings(q), "home" if via[1] else "", False, image, cells
-        )
+        return Asked(view, label, q, "home" if via[1] else "", False, image, cells)
 
     # The check of a photograph
 
@@ -429,13 +418,9 @@ class GuidedSession:
 
     # What is known
 
-    @property
+    @cached_property
     def error(self) -> PlatformError | None:
         """The predicted error of the platform with the photographs so far; None if unknown."""
-        return self._known
-
-    @cached_property
-    def _known(self) -> PlatformError | None:
         known = self._known_with("", None)
         if known is None or self._work is None:
             return None

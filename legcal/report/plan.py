@@ -11,12 +11,12 @@ import numpy as np
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
-from legcal.machine.configurations import poses_at
+from legcal.machine.model import readings_at
 from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Block, Drawing, Items, Picture, Row, data_url, page_html
 from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
-from legcal.planning.session import Plan, poses_to_take, views_in_words
+from legcal.planning.session import Plan, poses_to_take, settings_in_words, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
 from legcal.scene.motions import pyramid
@@ -71,7 +71,7 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
             rows=[tuple(map(printable, row)) for row in views],
         ),
         table(
-            "view", *(f">distance to A{j + 1} [mm]" for j in _measured(plan)),
+            "view", *(f">distance to A{j + 1} [mm]" for j in plan.machine.frame_legs),
             ">height above the base joints [mm]",
             rows=[tuple(map(printable, row)) for row in distances],
             title="Distances to measure, from the middle of the lens to joints of the base"
@@ -123,14 +123,9 @@ def _scaled_in_words(plan: Plan, value: float) -> str:
     return f"{1e3 * ratio * plan.error.mean_displacement:.3f} mm"
 
 
-def _measured(plan: Plan) -> tuple[int, ...]:
-    """Return the joints of the base to which distances are measured."""
-    return plan.machine.frame_legs
-
-
 def _measured_joints(plan: Plan) -> Array:
-    """Return the measured joints in the base, motors at zero, (3, 3) [m]."""
-    return np.asarray(plan.machine.A_base[list(_measured(plan))])
+    """Return the joints to which distances are measured, motors at zero, (3, 3) [m]."""
+    return np.asarray(plan.machine.A_base[list(plan.machine.frame_legs)])
 
 
 def camera_distances(plan: Plan) -> dict[str, list[float]]:
@@ -148,20 +143,21 @@ def camera_distances(plan: Plan) -> dict[str, list[float]]:
 
 def checklist(plan: Plan) -> list[str]:
     """Return the checklist for taking the photographs."""
-    hand_held = plan.hand_held
+    machine, hand_held = plan.machine, plan.hand_held
     first = (
         f"The plan is for the camera of camera_info.yaml, {plan.camera.width} x "
         f"{plan.camera.height} px with a focal length of {plan.camera.K[0, 0]:.0f} px: if yours is "
         "another, plan again with --camera."
     )
     cm, deg = 1e2 * plan.setting.shift, np.degrees(plan.setting.turn)
+    home = settings_in_words(machine, readings_at(machine, machine.home))
     place = (
         "Take each image from about the position in poses.csv; the whole board must be in it."
         if hand_held
         else f"Set the tripod to within {float(f'{cm:.2g}'):g} cm and {deg:.3g} deg: measure the "
         "distances from the lens, then turn the camera until the picture looks as its preview."
     )
-    by_way = ", via the pose in the column 'on the way'" if _has_ways(plan) else ""
+    by_way = ", via the pose in the column 'on the way'" if plan.has_ways else ""
     items = [
         first,
         place,
@@ -174,7 +170,7 @@ def checklist(plan: Plan) -> list[str]:
         "A background that differs from the legs in brightness along their whole length.",
         "A remote release or two seconds of delay; lossless files, or JPEG of quality 95.",
         f"Move the machine through the poses of poses.csv in order{by_way}. It starts at home, "
-        f"where motors read {_home_in_words(plan)}.",
+        f"where motors read {', '.join(home)}.",
         "Wait until it is at rest; record the encoder values, not the commands, in "
         "measurements.csv.",
         "Save each photograph under its name in measurements.csv.",
@@ -183,32 +179,15 @@ def checklist(plan: Plan) -> list[str]:
         items.append(f"Afterwards, {_to_be_added(plan)}.")
     if plan.board is not None:
         items.insert(1, _board_in_words(plan, plan.board))
-    measured = plan.machine.rod_for_scale(has_length=plan.board is not None)
+    measured = machine.rod_for_scale(has_length=plan.board is not None)
     if measured is not None and plan.only is None:
         items.insert(
             1,
             f"Measure the rod of {measured[0].name} from joint centre to joint centre: readings of "
             "motors that turn carry no length. Calibrate with "
-            f"{plan.machine.length_option}.",
+            f"{machine.length_option}.",
         )
     return items
-
-
-def _has_ways(plan: Plan) -> bool:
-    """Whether some pose is reached by another one."""
-    return any(via for view in plan.views for via in view.via)
-
-
-def _home_in_words(plan: Plan) -> str:
-    """Return the readings of the motors at home."""
-    machine = plan.machine
-    readings = poses_at(machine, [machine.home_configuration]).readings[0]
-    readings_in_words = []
-    for j in machine.motors:
-        leg = machine.legs[j]
-        size, unit = SHOWN_IN[leg.reading_unit]
-        readings_in_words.append(f"{leg.prismatic} {size * readings[j]:z.2f} {unit}")
-    return ", ".join(readings_in_words)
 
 
 def _board_in_words(plan: Plan, board: LaidBoard) -> str:
@@ -218,7 +197,7 @@ def _board_in_words(plan: Plan, board: LaidBoard) -> str:
     x, y, z = 1e3 * board.middle
     facing = "up" if board.normal[2] > 0.0 else "down"  # down for a hanging machine
     joints = ", ".join(
-        f"{d:.0f} mm from A{j + 1}" for d, j in zip(distance, _measured(plan), strict=True)
+        f"{d:.0f} mm from A{j + 1}" for d, j in zip(distance, plan.machine.frame_legs, strict=True)
     )
     return (
         f"Fix the board to the base, flat at the level of its joints, print {facing}, as "
@@ -237,7 +216,7 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     header, rows = poses_to_take(plan)
     first_motor = 4
     settings = [0, 1, *range(first_motor, first_motor + len(plan.machine.motors))]  # view, pose
-    if _has_ways(plan):
+    if plan.has_ways:
         settings.insert(2, 3)
     poses = table(
         *(f"{'>' * (i >= first_motor)}{printable(header[i])}" for i in settings),

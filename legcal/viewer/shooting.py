@@ -11,6 +11,7 @@ from legcal.calibration.summary import mm_deg
 from legcal.errors import LegcalError, printable
 from legcal.pages.document import Dialogue as DialogueBlock
 from legcal.pages.document import Page, Section, page_html
+from legcal.planning.session import settings_in_words
 from legcal.planning.shooting import Asked, Checked, GuidedSession
 from legcal.recordings.frames import LiveCamera, WatchedFolder
 from legcal.viewer.server import HTML, LOCAL, Address, PageServer
@@ -91,10 +92,11 @@ class Dialogue:
         """Return what is asked now."""
         n, of = len(self.session.taken), self.session.n_planned
         number = f"{n + 1} of {of}" if asked.is_planned else f"{n + 1}, beyond the plan"
+        settings = ", ".join(settings_in_words(self.session.machine, asked.q))
         how = {"": "", "home": "by home: "}.get(asked.via, f"by {asked.via}: ")
         return [
             f"Photograph {number}: camera at {asked.view}, pose {asked.pose}.",
-            f"  set {how}{', '.join(asked.settings)}; then {self.source.asks}.",
+            f"  set {how}{settings}; then {self.source.asks}.",
         ]
 
     def _hear(self, word: str, asked: Asked) -> None:
