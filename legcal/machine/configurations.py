@@ -14,7 +14,7 @@ from contextlib import suppress
 from enum import StrEnum
 from functools import lru_cache
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -76,6 +76,12 @@ class Configurations(NamedTuple):
     configurations: Array
     readings: Array
     poses: list[RigidTransform]
+
+    def chosen(self, which: Sequence[int]) -> Self:
+        """Return some of them, in the order of their indices."""
+        index = np.array(which, dtype=np.intp)
+        poses = [self.poses[i] for i in which]
+        return type(self)(self.configurations[index], self.readings[index], poses)
 
 
 def random_configurations(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 from markupsafe import Markup
 
@@ -72,12 +72,11 @@ class Text(Block):
     dim: bool = False
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(Protocol):
     """A thing to do, with a command to copy."""
 
     what: str
-    command: str = ""
+    command: str
 
 
 @dataclass(frozen=True)

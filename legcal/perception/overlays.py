@@ -114,7 +114,7 @@ def marks_of_image(
     edges = tuple(
         Mark(
             "body" if of_bodies.used[i] else "rejected",
-            _curve(camera, of_bodies.h[i], camera.undistort(of_bodies.ends[i])),
+            curve(camera, of_bodies.h[i], camera.undistort(of_bodies.ends[i])),
         )
         for i in range(len(of_bodies))
     )
@@ -153,11 +153,11 @@ def _part_marks(
         if pair.used[i]:
             kind = "edge 1" if pair.edge[i] == 1 else "edge 2"
         ends = camera.undistort(pair.ends[i])
-        marks.append(Mark(kind, _curve(camera, pair.h[i], ends)))
+        marks.append(Mark(kind, curve(camera, pair.h[i], ends)))
     if np.count_nonzero(used) == 2:
         # h1 . M = R and h2 . M = -R of all points M of the axis, eq (5): it is seen at h1 + h2.
         ends = np.mean([camera.undistort(pair.ends[i]) for i in np.flatnonzero(used)], axis=0)
-        marks.append(Mark("axis", _curve(camera, pair.h[used].sum(axis=0), ends)))
+        marks.append(Mark("axis", curve(camera, pair.h[used].sum(axis=0), ends)))
     if leg is not None and not np.all(are_measured) and not pair.rejected_for(Reason.OUTSIDE).any():
         for i, segment in enumerate(leg.segments):
             if segment.link == part:
@@ -166,11 +166,11 @@ def _part_marks(
     return tuple(marks)
 
 
-def _curve(camera: Camera, h: Array, ends: Array) -> Array:
+def curve(camera: Camera, h: Array, ends: Array, n: int = N_POINTS) -> Array:
     """Return a line (3,) of the sensor plane between the feet of two of its points, (n, 2) [px]."""
     normal = h[:2] / (h[:2] @ h[:2])
     feet = ends - (ends @ h[:2] + h[2])[:, None] * normal
-    share = np.linspace(0.0, 1.0, N_POINTS)[:, None]
+    share = np.linspace(0.0, 1.0, n)[:, None]
     return camera.distort(feet[0] + share * (feet[1] - feet[0]))
 
 

@@ -53,7 +53,6 @@ from legcal.planning.poses import (
     drawn_legs,
     poses_near,
     shortest_order,
-    some_of,
     ways,
 )
 from legcal.planning.session import Plan, PlannedView, pose_labels
@@ -160,7 +159,7 @@ class Task:
         shown = self.board_is_shown(candidates.place.T_base_camera, poses, surely=True)
         if shown.all():
             return candidates
-        return replace(candidates, poses=some_of(candidates.poses, np.flatnonzero(shown).tolist()))
+        return replace(candidates, poses=candidates.poses.chosen(np.flatnonzero(shown).tolist()))
 
     def _margin(self, T: RigidTransform, points: Array) -> float:
         """Largest image shift of points (n, 3) in the base link within tolerance [px]."""
@@ -416,7 +415,7 @@ def _selected_candidates(current: Sequence[Candidates], images: Chosen) -> list[
     """Return the selected poses by place; places without any are dropped."""
     images_of_slot = [[k for s, k in images.images if s == v] for v in range(len(current))]
     return [
-        replace(candidates, poses=some_of(candidates.poses, which))
+        replace(candidates, poses=candidates.poses.chosen(which))
         for candidates, which in zip(current, images_of_slot, strict=True)
         if which
     ]
@@ -587,7 +586,7 @@ class _Search:
         ordered, begin = list[Configurations](), machine.home_configuration
         for candidates in current:
             ordered.append(
-                some_of(candidates.poses, shortest_order(machine, candidates.poses, begin))
+                candidates.poses.chosen(shortest_order(machine, candidates.poses, begin))
             )
             begin = ordered[-1].configurations[-1]
         via, blocked = ways(machine, np.concatenate([poses.configurations for poses in ordered]))
@@ -650,9 +649,7 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
     """Name views after their places or by number; hand-held images after their pose."""
     if task.hand_held:
         views = [
-            replace(
-                view, poses=some_of(view.poses, [k]), via=(view.via[k],), seen=view.seen.only(k)
-            )
+            replace(view, poses=view.poses.chosen([k]), via=(view.via[k],), seen=view.seen.only(k))
             for view in views
             for k in range(len(view.poses.poses))
         ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -140,13 +139,6 @@ def poses_near(
     kept = surely_reached(machine, legs, setting, poses_at(machine, nearby))
     more = [nearby[k] for k in np.flatnonzero(kept)]
     return poses_at(machine, [*poses.configurations, *more])
-
-
-def some_of(poses: Configurations, which: Sequence[int]) -> Configurations:
-    """Select poses by index, in that order."""
-    index = np.array(which, dtype=np.intp)
-    chosen = [poses.poses[i] for i in which]
-    return Configurations(poses.configurations[index], poses.readings[index], chosen)
 
 
 # Order of poses, and intermediate poses on the path between them

@@ -33,7 +33,7 @@ from legcal.data.measurements import few
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.leg import ParameterId
-from legcal.pages.document import Step, Table, Verdict
+from legcal.pages.document import Table, Verdict
 from legcal.report.render import Report, report, table
 
 if TYPE_CHECKING:
@@ -101,8 +101,7 @@ def _height(line: str) -> int:
 def document(calibration: Calibration, output: Path, command: str) -> dict[str, Any]:
     """Return the document of ``calibrate --json``: the result, and what to do next."""
     steps = next_steps(calibration, str(output), command)
-    blocks = [NextStep(what=one.what, command=one.command) for one in steps]
-    return calibration.result.model_copy(update={"next": blocks}).document()
+    return calibration.result.model_copy(update={"next": steps}).document()
 
 
 def _written_beside(command: str) -> str:
@@ -114,66 +113,56 @@ def _written_beside(command: str) -> str:
     return shlex.join(words)
 
 
-def next_steps(calibration: Calibration, folder: str, command: str) -> list[Step]:
+def next_steps(calibration: Calibration, folder: str, command: str) -> list[NextStep]:
     """Return what to do next, the first thing first; *command* has made the result, if any has."""
-    result, steps = calibration.result, list[Step]()
+    result, steps = calibration.result, list[NextStep]()
     dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
+
+    def add(what: str, command: str = "") -> None:
+        steps.append(NextStep(what=what, command=command))
+
     for doubt in calibration.doubts:
         what, remedy = (f"{text[0].upper()}{text[1:]}" for text in (doubt.what, doubt.remedy))
-        steps.append(Step(f"{what}. {remedy}, and calibrate again."))
+        add(f"{what}. {remedy}, and calibrate again.")
     remedy = calibration.verdict.remedy
     if remedy and all(remedy != doubt.remedy for doubt in calibration.doubts):
-        steps.append(Step(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again."))
+        add(f"{remedy[0].upper()}{remedy[1:]}, and calibrate again.")
     if calibration.verdict.trustworthy:
-        steps.append(
-            Step(
-                "Load calibrated.urdf, or the numbers of its parameters, into the controller, and "
-                "move to a few poses whose place you can measure."
-            )
+        add(
+            "Load calibrated.urdf, or the numbers of its parameters, into the controller, and "
+            "move to a few poses whose place you can measure."
         )
         if result.holdout is None and calibration.dataset.machine.is_determined:
             again = _written_beside(command or f"legcal calibrate {dataset} -o {out}")
-            steps.append(
-                Step(
-                    "See how well it predicts images that it has not seen:",
-                    f"{again} --holdout 0.2",
-                )
+            add(
+                "See how well it predicts images that it has not seen:",
+                f"{again} --holdout 0.2",
             )
-        steps.append(
-            Step(
-                "Where the base stands in the cell and the tool on the platform is not seen in "
-                "photographs of legs; with measured POSES of the tool:",
-                f"legcal locate {out}/calibrated.yaml POSES -o located.yaml",
-            )
+        add(
+            "Where the base stands in the cell and the tool on the platform is not seen in "
+            "photographs of legs; with measured POSES of the tool:",
+            f"legcal locate {out}/calibrated.yaml POSES -o located.yaml",
         )
-        steps.append(
-            Step(
-                "In some months, or after a collision, photograph a few poses (NEW) and ask "
-                "whether anything moved:",
-                f"legcal calibrate NEW --check {out}",
-            )
+        add(
+            "In some months, or after a collision, photograph a few poses (NEW) and ask "
+            "whether anything moved:",
+            f"legcal calibrate NEW --check {out}",
         )
     elif not result.diagnosis:
         if result.weakest:
-            steps.append(
-                Step(f"More images help where least is known: {result.weakest[0].in_words}.")
-            )
-        steps.append(
-            Step(
-                "Look at the worst outlines in report.html: blur, reflections and wrong edges "
-                "show there."
-            )
+            add(f"More images help where least is known: {result.weakest[0].in_words}.")
+        add(
+            "Look at the worst outlines in report.html: blur, reflections and wrong edges "
+            "show there."
         )
     if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
-        steps.append(
-            Step(
-                "Calibrate the camera, with the board that you have: its file then states how well "
-                "it is known, which belongs into the uncertainty of the result.",
-                "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
-            )
+        add(
+            "Calibrate the camera, with the board that you have: its file then states how well "
+            "it is known, which belongs into the uncertainty of the result.",
+            "legcal camera BOARDS --board chessboard:9x6:25mm -o camera_info.yaml",
         )
     elif gain := _gain_of_a_board(calibration.platform):
-        steps.append(Step(gain, "legcal camera BOARDS --board chessboard:9x6:25mm -o FILE"))
+        add(gain, "legcal camera BOARDS --board chessboard:9x6:25mm -o FILE")
     return steps
 
 

@@ -54,10 +54,10 @@ from legcal.pages.document import (
     time_of_page,
 )
 from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
+from legcal.perception.overlays import curve
 from legcal.report.calibration import next_steps, platform_table
 from legcal.report.render import record_section, table
 from legcal.scene.motions import MachineScene
-from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.vision.image_file import small_jpeg
 
@@ -516,16 +516,16 @@ def _crop(calibration: Calibration, k: int, grey: Image, corner: Array, picture:
     fit = outlines_of_axis(u, A, solution.radii[j, part])[int(outlines.edge[i]) - 1]
     given = measurements.views[v].camera
     origin = corner - 0.5  # pixel (0, 0) is the centre of the first one
+    used, ends_px = bool(outlines.used[i]), outlines.ends[i]
+    measured = curve(given, outlines.h[i], given.undistort(ends_px), _N_POINTS)
+    predicted = curve(solution.cameras[v], fit, solution.cameras[v].undistort(ends_px), _N_POINTS)
     lines = [
-        (
-            "measured" if outlines.used[i] else "rejected",
-            _points(_curve(given, outlines.h[i], outlines.ends[i]) - origin),
-        ),
-        ("predicted", _points(_curve(solution.cameras[v], fit, outlines.ends[i]) - origin)),
+        ("measured" if used else "rejected", _points(measured - origin)),
+        ("predicted", _points(predicted - origin)),
     ]
     offset, sigmas = residuals.offset[k], float(np.linalg.norm(residuals.whitened[k]))
     name = dataset.machine.leg_names[j]
-    rejected = "" if outlines.used[i] else f"; rejected: {outlines.reason[i]}"
+    rejected = "" if used else f"; rejected: {outlines.reason[i]}"
     return Crop(
         name=f"outline-{i}",
         picture=picture,
@@ -536,15 +536,6 @@ def _crop(calibration: Calibration, k: int, grey: Image, corner: Array, picture:
         detail=f"{sigmas:.1f} sigma, {row_names(measurements)[row]}{rejected}",
         link=calibration.overlays.get(row, ""),
     )
-
-
-def _curve(camera: Camera, h: Array, ends: Array) -> Array:
-    """Return points of the image of a line (3,) of the sensor plane between two ends [px]."""
-    xy = camera.undistort(ends)
-    normal = h[:2] / (h[:2] @ h[:2])
-    feet = xy - (xy @ h[:2] + h[2])[:, None] * normal
-    share = np.linspace(0.0, 1.0, _N_POINTS)[:, None]
-    return camera.distort(feet[0] + share * (feet[1] - feet[0]))
 
 
 def _points(pixels: Array) -> str:

@@ -699,8 +699,7 @@ def preview(
     small = replace(
         camera, K=K, width=round(camera.width * scale), height=round(camera.height * scale)
     )
-    first = Configurations(poses.configurations[:1], poses.readings[:1], poses.poses[:1])
-    (posed,) = pose_machine(machine, dressed(machine, meshes_needed=False), first)
+    (posed,) = pose_machine(machine, dressed(machine, meshes_needed=False), poses.chosen([0]))
     if board is not None:
         posed = PlacedBoard(board.board, board.T_base_board).beside(posed)
     rng = np.random.default_rng(0)
