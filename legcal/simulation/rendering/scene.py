@@ -197,18 +197,9 @@ def _half_shadow(gap: Single, t: Single, lamp: Lamp) -> Single:
 class Lighting:
     """The light of a view, in the camera frame."""
 
-    lamps: tuple[Lamp, ...]  # the lamps
-    ambient: float  # radiance of a white surface by light from everywhere
+    lamps: tuple[Lamp, ...]
     up: Array  # (3,) away from the floor
-    limb: float  # limb, specular, texture: factors on the properties of materials
-    specular: float
-    texture: float
-    colour: bool  # whether there are three channels
-
-    @property
-    def n_channels(self) -> int:
-        """Number of channels: grey, or blue, green, red."""
-        return 3 if self.colour else 1
+    look: Appearance  # ambient light, factors on the properties of materials, colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,24 +231,22 @@ def shade(
     albedo = np.full(len(x), material.albedo, dtype=np.float32)
     if ink is not None:
         albedo *= ink
-    limb = material.limb * light.limb
+    limb = material.limb * light.look.limb
     if limb:
         albedo *= 1.0 - limb + limb * facing
-    if material.texture * light.texture:
+    if texture := material.texture * light.look.texture:
         local = solid.R.T.astype(np.float32) @ (P - solid.w.astype(np.float32)[:, None])
-        albedo *= np.maximum(
-            1.0 + material.texture * light.texture * mottled(np.asarray(local, dtype=np.float32)),
-            0.05,
-        )
-    gloss = material.specular * light.specular
+        pattern = mottled(np.asarray(local, dtype=np.float32))
+        albedo *= np.maximum(1.0 + texture * pattern, 0.05)
+    gloss = material.specular * light.look.specular
     upx, upy, upz = light.up.tolist()
     up = n[0] * upx + n[1] * upy + n[2] * upz
-    even = light.ambient * (0.8 + 0.2 * up) if light.lamps else np.float32(light.ambient)
+    even = light.look.ambient * (0.8 + 0.2 * up) if light.lamps else np.float32(light.look.ambient)
     mirror = None
     if gloss > _SHARP:
         of_eye = vx * upx + vy * upy + vz * upz
         sky = np.clip(0.5 + 0.5 * (2.0 * facing * up - of_eye), 0.0, 1.0)
-        mirror = (gloss * light.ambient) * (0.2 + 3.0 * sky**4)
+        mirror = (gloss * light.look.ambient) * (0.2 + 3.0 * sky**4)
     fixed = _channels(albedo * even, mirror, material.tint, light)
     of_lamp, faces_lamp = [], []
     for lamp in light.lamps:
@@ -281,7 +270,7 @@ def _channels(
     scattered: Single, mirrored: Single | None, tint: Sequence[float], light: Lighting
 ) -> Single:
     """Return the channels: scattered light takes the colour of the surface, mirrored does not."""
-    if not light.colour:
+    if not light.look.colour:
         return (scattered if mirrored is None else scattered + mirrored)[None]
     bgr = np.array(tint[::-1], dtype=np.float32)[:, None] * scattered
     return bgr if mirrored is None else bgr + mirrored
@@ -731,7 +720,6 @@ class RenderedView:
     """A camera in front of its surroundings, painted once for all images of a view."""
 
     T_camera_base: RigidTransform  # pose of the base frame in the camera
-    appearance: Appearance
     painter: Painter  # paints with the camera and the light
     canvas: FrameBuffer  # the surroundings, their light apart by lamp
     bystanders: tuple[SolidInView, ...]  # objects around that cast shadows on the machine
@@ -750,7 +738,7 @@ class RenderedView:
             if len(radiance) == 1
             else np.ascontiguousarray(np.moveaxis(radiance, 0, -1))
         )
-        return develop(grey, self.appearance, rng, self.fineness)
+        return develop(grey, self.painter.light.look, rng, self.fineness)
 
     def _backdrop(self, solids: Sequence[SolidInView]) -> Single:
         """Return the surroundings with the shadows of solids, (1, n_channels, n)."""
@@ -790,12 +778,12 @@ def prepare_view(
     cables = [_cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)]
     light = _lighting(centre, radius, T_camera_base, appearance)
     painter = Painter(rays, light, samples)
-    canvas = _empty(rays, light, appearance, rng)
+    canvas = _empty(rays, light, rng)
     bystanders = in_view(clutter, T_camera_base)
     painter.paint(canvas, [*in_view(floor, T_camera_base), *bystanders])
     foreground = in_view(cables, T_camera_base)
     return RenderedView(
-        T_camera_base, appearance, painter, canvas, tuple(bystanders), tuple(foreground), fineness
+        T_camera_base, painter, canvas, tuple(bystanders), tuple(foreground), fineness
     )
 
 
@@ -818,23 +806,14 @@ def _lighting(
                 shadows=light.shadows and appearance.shadows,
             )
         )
-    return Lighting(
-        lamps=tuple(lamps),
-        ambient=appearance.ambient,
-        up=np.asarray(T_camera_base.rotation.apply(_UP)),
-        limb=appearance.limb,
-        specular=appearance.specular,
-        texture=appearance.texture,
-        colour=appearance.colour,
-    )
+    return Lighting(tuple(lamps), np.asarray(T_camera_base.rotation.apply(_UP)), appearance)
 
 
-def _empty(
-    rays: PixelRays, light: Lighting, appearance: Appearance, rng: np.random.Generator
-) -> FrameBuffer:
+def _empty(rays: PixelRays, light: Lighting, rng: np.random.Generator) -> FrameBuffer:
     """Return a frame buffer with the background only."""
-    n = rays.width * rays.height
-    terms = np.zeros((1 + len(light.lamps), light.n_channels, n), dtype=np.float32)
+    n, appearance = rays.width * rays.height, light.look
+    n_channels = 3 if appearance.colour else 1  # blue, green, red
+    terms = np.zeros((1 + len(light.lamps), n_channels, n), dtype=np.float32)
     terms[0] = appearance.background
     if appearance.background_contrast > 0.0:
         picture = background(rays.width, rays.height, appearance.background_contrast, rng)
