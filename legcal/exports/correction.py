@@ -126,7 +126,6 @@ def correction_files(subject: Subject, path: Path, nodes: int | None = None) -> 
 
 
 def _number_of_nodes(given: int | None, m: int) -> int:
-    """Return the number of nodes along each coordinate."""
     n = DEFAULT_NODES[m] if given is None else given
     if n < 2 or n**m > MAX_ROWS:
         most = int(MAX_ROWS ** (1.0 / m) + 1e-9)

@@ -324,7 +324,6 @@ def _in_best_frame(errors: Errors[Ideal], ideal: Ideal) -> tuple[Array, Array]:
 
 
 def _nearest_delta(firmware: Firmware, mount: _Mounted, errors: Errors[IdealDelta]) -> IdealDelta:
-    """Return the Delta of a firmware that is nearest to a machine."""
     return _nearest(errors, partial(firmware.moved, mount.start), len(firmware.free()))
 
 

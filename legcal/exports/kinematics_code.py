@@ -82,7 +82,6 @@ def matlab_files(subject: Subject, path: Path) -> Rendered:
 
 
 def _rendered(template: str, machine: Machine, name: str, quoted: Any, **more: Any) -> str:
-    """Return a template rendered with the numbers of a machine."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(

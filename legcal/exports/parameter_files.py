@@ -157,7 +157,6 @@ def _vector(
     nominal: Array | None = None,
     status: str = "model",
 ) -> Iterator[Quantity]:
-    """Yield the components of a vector."""
     for k, axis in enumerate("xyz"):
         before = None if nominal is None else float(nominal[k])
         yield Quantity.of(f"{name}.{axis}", frame, unit, (float(vector[k]), before, None), status)
@@ -177,7 +176,6 @@ def _end(leg: Leg, side: str) -> tuple[Array, Array | None]:
 def _leg(
     name: str, in_links: Leg, in_frames: Leg, joints: Mapping[tuple[str, str], JointInLink]
 ) -> dict[str, Any]:
-    """Return the entry of a leg in the document."""
     actuator = in_links.actuator
     has_travel = in_links.has_value and bool(np.isfinite(in_links.travel).all())
     scale = SHOWN_IN["m" if actuator is None else actuator.unit][0]
@@ -238,7 +236,6 @@ def _uncertainty(joint: JointInLink | None) -> dict[str, Any]:
 
 
 def _axes(in_link: Array | None, in_frame: Array | None, frame: str) -> dict[str, Any] | None:
-    """Return a direction in its link and in its frame."""
     if in_link is None or in_frame is None:
         return None
     return {"link": in_link.tolist(), frame: in_frame.tolist()}
@@ -253,5 +250,4 @@ def _millimetres(matrix: Array) -> list[list[float]]:
 
 
 def _shown(value: str | float) -> str:
-    """Return the text of a cell of the table."""
     return value if isinstance(value, str) else f"{round(value, _DIGITS) + 0.0:.{_DIGITS}f}"

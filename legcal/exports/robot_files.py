@@ -183,8 +183,6 @@ def mjcf_files(subject: Subject, path: Path) -> Rendered:
 
 
 class _Writer:
-    """The writer of the bodies of one machine."""
-
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
         urdf = machine.urdf
@@ -230,7 +228,6 @@ class _Writer:
         return mujoco
 
     def _add(self, joint: UrdfJoint) -> None:
-        """Add the child body of a joint."""
         machine, link = self._machine, joint.child
         chain, home = machine.chain, machine.home_configuration
         is_free = joint.type == "floating"
@@ -291,7 +288,6 @@ class _Writer:
         )
 
     def _shapes(self, link: str, body: etree._Element) -> None:
-        """Add the visual cylinders of a link."""
         for visual in self._links[link].iterfind("visual"):
             cylinder = visual.find("geometry/cylinder")
             if cylinder is not None:
@@ -312,7 +308,6 @@ def _joint(body: etree._Element, name: str, kind: str, axis: Array, value: float
 
 
 def _pose(T: RigidTransform) -> dict[str, str]:
-    """Return a pose as XML attributes."""
     x, y, z, w = T.rotation.as_quat()
     return {"pos": _text(*T.translation), "quat": _text(w, x, y, z)}
 
@@ -323,7 +318,6 @@ def _text(*numbers: float) -> str:
 
 
 def _unused(name: str, taken: set[str]) -> str:
-    """Return an unused name."""
     unused = name
     while unused in taken:
         unused += "_"

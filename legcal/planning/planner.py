@@ -261,7 +261,6 @@ def plan_session(
 
 
 def _places(task: Task, poses: Configurations) -> list[Place]:
-    """Candidate camera places."""
     if task.places:
         return list(task.places)
     points = _framed(task, poses)
@@ -423,8 +422,6 @@ def _selected_candidates(current: Sequence[Candidates], images: Chosen) -> list[
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The search for a session."""
-
     task: Task  # with the nominal machine
     given: Sequence[Contributions]  # of existing images
     work: Workspace | None  # None if readings do not determine the pose

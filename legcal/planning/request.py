@@ -336,7 +336,6 @@ def _check(
     seed: int,
     size: float,  # of the machine [m]
 ) -> None:
-    """Refuse contradictory options."""
     start, problems = "The plan could not be made: found", []
     if seed < 0:
         problems.append(f"{start} {seed} as the seed, needed 0 or more; correct --seed.")
@@ -381,7 +380,6 @@ def _load_board(board: str | Path | Board) -> Board:
 
 
 def _notes_on_missing_images(shot: Dataset | None) -> tuple[str, ...]:
-    """Note on missing photographs of a given dataset."""
     if shot is None or shot.observations is not None:
         return ()
     n = shot.measurements.n_rows

@@ -367,7 +367,6 @@ class GuidedSession:
         return {name: repr(self._units[name].reading(value)) for name, value in names.items()}
 
     def _look_at_taken(self) -> None:
-        """Look at the photographs that are there."""
         m = self.dataset.measurements
         rows = [row for row in self.taken if m.image[row]]
         self._digests = {m.image[row]: _digest(self.folder / m.image[row]) for row in rows}

@@ -245,7 +245,6 @@ def check_summary(check: Check) -> Report:
 
 
 def _amount(change: ExplanationBlock) -> str:
-    """Return the amount of a change in words."""
     parts = []
     components = zip(change.components, change.units, change.links, strict=True)
     numbers = zip(change.values, change.sigma, strict=True)

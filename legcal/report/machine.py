@@ -194,7 +194,6 @@ def _span(values: Sequence[float] | None) -> str:
 
 
 def _home(home: dict[str, Sequence[float]]) -> str:
-    """Return home in millimetres and degrees."""
     xyz = ", ".join(f"{1e3 * x:z.2f}" for x in home["xyz"])
     turn = Rotation.from_quat(home["quat_xyzw"])
     angles = ", ".join(f"{degrees(x):z.3f}" for x in roll_pitch_yaw(turn.as_matrix()))
@@ -277,7 +276,6 @@ def location_table(location: Location, written: Sequence[str]) -> Report:
 
 
 def _noise_line(location: Location) -> str:
-    """Return the noise of the measurement and its source."""
     noise = location.noise
     stated = {True: "stated", False: "from the residuals"}
     words = f"position {1e3 * noise.position:.3g} mm ({stated[noise.position_stated]})"
@@ -501,7 +499,6 @@ def _two_digits(value: float) -> str:
 
 
 def _remedies(found: Identifiability) -> Table:
-    """Return the remedies."""
     n_parameters = found.full.of
     rows = [
         (
@@ -515,7 +512,6 @@ def _remedies(found: Identifiability) -> Table:
 
 
 def _verdict(found: Identifiability) -> list[Part]:
-    """Return the verdict and the remedies."""
     harmless = sum(weak.harmless for weak in found.full.weak)
     determined = f"the joint fit determines {found.full.rank} of {found.full.of} parameters"
     lines: list[Part] = []

@@ -223,7 +223,6 @@ def _hidden(views: Iterable[dict[str, Any]], n_images: int) -> str:
 
 
 def _left_out(n: int) -> str:
-    """Return the number of images left out, in words."""
     return (
         "1 image shows no leg and is left out."
         if n == 1
@@ -256,7 +255,6 @@ def study_table(document: Mapping[str, Any]) -> Report:
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the figures of an estimator."""
     if not row["runs"]:
         return ("all failed", "", "", "0")
     dX = row["dX_mm"]

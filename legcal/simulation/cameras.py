@@ -207,12 +207,10 @@ def board_on_platform(
 
 
 def _few(posed_machines: Sequence[PosedMachine]) -> list[int]:
-    """Return the indices of a few poses."""
     return list(map(int, np.unique(np.linspace(0, len(posed_machines) - 1, _N_POSES).astype(int))))
 
 
 def _some(posed_machines: Sequence[PosedMachine]) -> list[PosedMachine]:
-    """Return a machine in a few of its poses."""
     return [posed_machines[i] for i in _few(posed_machines)]
 
 

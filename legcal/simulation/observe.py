@@ -174,7 +174,6 @@ def _refuse_inside(viewpoint: Viewpoint, posed_machines: Sequence[PosedMachine])
 
 
 def _sees_nothing(name: str, legs: Sequence[Leg]) -> str:
-    """Return the problem of a view without a leg."""
     start = f"view {name}: its images could not be simulated: found"
     if not any(leg.cylinders for leg in legs):
         return (

@@ -561,7 +561,6 @@ def _outcome(study: Study, seed: int, number: int) -> tuple[int, Record | Legcal
 
 
 def _check_numbers(n_runs: int, seed: int, workers: Workers) -> None:
-    """Refuse numbers out of range."""
     processes = workers if is_number(workers) else 1
     for name, number, least, most in (
         ("runs", n_runs, 1, _MOST_RUNS),

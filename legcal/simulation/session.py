@@ -172,7 +172,6 @@ class _Simulator:
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
-        """The camera of each view."""
         settings = self.settings
         if self.plan is not None:
             return {view.name: view.camera for view in self.plan.measurements.views}

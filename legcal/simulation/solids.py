@@ -448,7 +448,6 @@ def pose_machine(
 
 @lru_cache(maxsize=8)  # several cameras see one machine, and there may be thousands of machines
 def _caster(posed: PosedMachine) -> Any:
-    """Return the ray caster of a machine."""
     return ray_caster(posed.vertices, posed.faces)
 
 

@@ -174,7 +174,6 @@ def write_model_with(
 
 
 def _places(nominal: Machine, folder: Path) -> tuple[Path, Path]:
-    """Return the paths of the files of the true model."""
     name = model_name(nominal)
     return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
 

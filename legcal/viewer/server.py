@@ -128,14 +128,11 @@ class _Server(http.server.ThreadingHTTPServer):
         super().__init__(address, handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report an error in a request."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
-    """The handler of the requests of a page."""
-
     server_version, sys_version = "legcal", ""
 
     def __init__(self, page: PageServer, *args: Any) -> None:
@@ -143,7 +140,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         super().__init__(*args)
 
     def do_GET(self) -> None:
-        """Send the page or something that belongs to it."""
         path = urlsplit(self.path).path
         content = self.page.content(path) if self._is_for_here() else None
         if content is None and path == "/favicon.ico":  # browsers ask for it
@@ -154,7 +150,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self._send(*content)
 
     def do_POST(self) -> None:
-        """Handle posted content."""
         token = self.headers.get(TOKEN_HEADER, "")
         if not self._is_for_here() or not secrets.compare_digest(
             token.encode(), self.page.token.encode()

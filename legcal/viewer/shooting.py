@@ -89,7 +89,6 @@ class Dialogue:
             self.say(line)
 
     def _prompt(self, asked: Asked) -> list[str]:
-        """Return what is asked now."""
         n, of = len(self.session.taken), self.session.n_planned
         number = f"{n + 1} of {of}" if asked.is_planned else f"{n + 1}, beyond the plan"
         settings = ", ".join(settings_in_words(self.session.machine, asked.q))

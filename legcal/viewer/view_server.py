@@ -193,7 +193,6 @@ class Motion:
         return self._stand(T, self._values(T))
 
     def _values(self, T: RigidTransform) -> Array:
-        """Return the joint values at a pose."""
         return np.where(self._slides, readings_at(self.machine, T), 0.0)
 
     def _stand(self, T: RigidTransform, q: Array) -> Posture:
@@ -224,7 +223,6 @@ class _Slider(NamedTuple):
         return SHOWN_IN[self.unit][0]
 
     def document(self, name: str) -> dict[str, Any]:
-        """Return the slider as the page has it."""
         label, unit = printable(self.label), SHOWN_IN[self.unit][1]
         low, high = np.round(self.size * self.ends, 2).tolist()
         step = 0.01 if unit else 1
@@ -331,7 +329,6 @@ class ViewServer(PageServer):
         return float(self.motion.coordinates[k])
 
     def _show_pose(self, value: float) -> None:
-        """Move to a pose of the session."""
         self._pose = int(np.clip(round(value) - 1, 0, len(self._photographs.poses) - 1))
         self.motion.show(self._photographs.q[self._pose])
 

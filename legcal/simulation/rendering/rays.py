@@ -185,7 +185,6 @@ def is_hidden(solid: SolidInView, mesh: Mesh, P: Single, lamp: Array) -> Single:
 
 @lru_cache(maxsize=256)
 def _caster(mesh: Mesh) -> Any:
-    """Return the ray caster of a mesh."""
     return ray_caster(mesh.vertices, mesh.faces)
 
 
@@ -259,7 +258,6 @@ def _cylinder(
 
 
 def _sphere(solid: SolidInView, shape: Sphere, x: Single, y: Single) -> tuple[Single, Faces]:
-    """Return depths of a sphere."""
     wx, wy, wz = solid.w.tolist()
     cx, cy, cz = y * wz - wy, wx - x * wz, x * wy - y * wx  # d x w
     d2 = x * x + y * y + 1.0

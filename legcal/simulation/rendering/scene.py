@@ -142,7 +142,6 @@ def _past(solid: SolidInView, lamp: Lamp, P: Single, to_lamp: Single) -> Single:
 def _past_cylinder(
     solid: SolidInView, shape: SolidCylinder, lamp: Lamp, P: Single, to_lamp: Single
 ) -> Single:
-    """Return the share of the lamp seen past a cylinder."""
     R = solid.R.T.astype(np.float32)
     qx, qy, qz = R @ (P - solid.w.astype(np.float32)[:, None])
     lx, ly, lz = R @ to_lamp
@@ -162,7 +161,6 @@ def _past_cylinder(
 def _past_sphere(
     solid: SolidInView, shape: Sphere, lamp: Lamp, P: Single, to_lamp: Single
 ) -> Single:
-    """Return the share of the lamp seen past a sphere."""
     q = P - solid.w.astype(np.float32)[:, None]
     l2 = np.maximum(np.einsum("in,in->n", to_lamp, to_lamp), _TINY)
     t = np.clip(-np.einsum("in,in->n", q, to_lamp) / l2, 0.0, 1.0)
