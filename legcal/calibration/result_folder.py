@@ -256,7 +256,7 @@ def load_result(given: str | Path) -> EarlierResult:
     legs, parametrization = geometries(machine), parametrization_of(machine, twists=True)
     values = {row.name: row.value for row in document.parameters}
     _check_actuators(path, document, machine)
-    nominal_legs = _with_nominal_axes(machine.leg_names, legs, document, values)
+    nominal_legs = with_nominal_axes(machine.leg_names, legs, document, values)
     estimated = [row for row in document.parameters if row.status == "estimated"]
     _check_covariance(path, estimated, np.array([row.sigma for row in estimated]), document)
     _check_same_model(path, document, values, machine, nominal_legs)
@@ -279,7 +279,7 @@ def load_result(given: str | Path) -> EarlierResult:
     )
 
 
-def _with_nominal_axes(
+def with_nominal_axes(
     names: Sequence[str],
     legs: Sequence[Leg],
     document: Result,

@@ -85,33 +85,21 @@ def load_subject(given: str | Path | Machine | EarlierResult) -> Subject:
 
 def _nominal(result: EarlierResult) -> Machine:
     """Return the nominal machine of a result, in the same links; only its legs are nominal."""
-    machine, document = result.machine, result.document
+    from legcal.calibration.result_folder import with_nominal_axes
+
+    machine = result.machine
     parametrization = parametrization_of(machine, twists=True)
-    rows = {row.name: row for row in document.parameters}
-    axes: Mapping[str, Mapping[str, list[float]]] = document.nominal_axes
-    legs = []
-    for name, place, leg in zip(
-        machine.leg_names, parametrization.place, geometries(machine), strict=True
-    ):
+    nominal = {row.name: row.nominal for row in result.document.parameters}
+    legs = with_nominal_axes(machine.leg_names, geometries(machine), result.document, nominal)
+    moved = []
+    for leg, place in zip(legs, parametrization.place, strict=True):
         numbers = np.concatenate([leg.A, leg.B, [leg.q0]])
         for column, at in enumerate(place[: LegColumns.LENGTH + 1].tolist()):
-            if at >= 0 and parametrization.names[at] in rows:
-                numbers[column] = rows[parametrization.names[at]].nominal
-        base, platform = (axes.get(side, {}).get(name) for side in ("base", "platform"))
-        twist = rows.get(f"{name}.twist")
-        legs.append(
-            replace(
-                leg,
-                A=numbers[LegColumns.A],
-                B=numbers[LegColumns.B],
-                q0=float(numbers[LegColumns.LENGTH]),
-                base_axis=leg.base_axis if base is None else np.array(base),
-                platform_axis=leg.platform_axis if platform is None else np.array(platform),
-                twist=leg.twist if twist is None else twist.nominal,
-                actuator=document.nominal_actuator(leg.actuator),
-            )
-        )
-    return replace(machine, legs=legs_in_links(machine, legs))
+            if at >= 0:
+                numbers[column] = nominal.get(parametrization.names[at], numbers[column])
+        A, B = numbers[LegColumns.A], numbers[LegColumns.B]
+        moved.append(replace(leg, A=A, B=B, q0=float(numbers[LegColumns.LENGTH])))
+    return replace(machine, legs=legs_in_links(machine, moved))
 
 
 # Names of a machine as identifiers and literals of other languages
