@@ -366,28 +366,20 @@ def choose_places(
     given: Sequence[Contributions] = (),
 ) -> list[int]:
     """Select the places whose images, on average, determine the machine best jointly."""
+    shares = [*(n_images / n_views / len(place.rows) for place in shown), *(1.0 for _ in given)]
+    parts = [
+        replace(part, rows=np.sqrt(share) * part.rows).of_shared()
+        for part, share in zip((*shown, *given), shares, strict=True)
+    ]
     names: dict[str, int] = {}
-    for contributions in (*shown, *given):
-        for name in contributions.names:
-            if ": " not in name:
-                names.setdefault(name, len(names))
-    shared = np.zeros((len(shown) + len(given), len(names), len(names)))
+    columns = [[names.setdefault(name, len(names)) for name in part.names] for part in parts]
+    information = np.zeros((len(parts), len(names), len(names)))
     prior = np.zeros((len(names), len(names)))
-    for k, contributions in enumerate((*shown, *given)):
-        is_of_view = np.array([": " in name for name in contributions.names])
-        columns = np.array([names[name] for name in contributions.names if ": " not in name])
-        stacked = contributions.all_gains().reshape(-1, len(contributions.names))
-        share = n_images / n_views / len(contributions.rows) if k < len(shown) else 1.0
-        G = stacked.T @ stacked * share
-        own_information = (
-            G[np.ix_(is_of_view, is_of_view)] + contributions.prior[np.ix_(is_of_view, is_of_view)]
-        )
-        mixed = G[np.ix_(is_of_view, ~is_of_view)]
-        G = G[np.ix_(~is_of_view, ~is_of_view)] - mixed.T @ np.linalg.solve(own_information, mixed)
-        shared[k][np.ix_(columns, columns)] = G
-        prior[np.ix_(columns, columns)] = contributions.prior[np.ix_(~is_of_view, ~is_of_view)]
-    p, free_places = shown[0].basis.shape[1], shared[: len(shown)]
-    base = prior + shared[len(shown) :].sum(axis=0)
+    for of_part, part, at in zip(information, parts, columns, strict=True):
+        of_part[np.ix_(at, at)] = part.rows[0].T @ part.rows[0]
+        prior[np.ix_(at, at)] = part.prior
+    p, free_places = shown[0].basis.shape[1], information[: len(shown)]
+    base = prior + information[len(shown) :].sum(axis=0)
 
     def values(others: Sequence[int]) -> Array:
         inverse = np.linalg.inv(base + free_places[list(others)].sum(axis=0) + free_places)

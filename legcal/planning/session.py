@@ -153,11 +153,11 @@ def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
     return plan.sigma_q
 
 
-def settings_in_words(machine: Machine, q: Array) -> tuple[str, ...]:
+def settings_in_words(machine: Machine, q: Array, digits: int = 3) -> tuple[str, ...]:
     """Return the readings of the motors at q (n_legs,): ``leg1_prismatic 28.663 mm``."""
     legs = [(j, machine.legs[j]) for j in machine.motors]
     shown = [(j, leg.prismatic, *SHOWN_IN[leg.reading_unit]) for j, leg in legs]
-    words = [f"{joint} {size * q[j]:z.3f} {unit}" for j, joint, size, unit in shown]
+    words = [f"{joint} {size * q[j]:z.{digits}f} {unit}" for j, joint, size, unit in shown]
     return tuple(dict.fromkeys(words))
 
 

@@ -150,7 +150,7 @@ def checklist(plan: Plan) -> list[str]:
         "another, plan again with --camera."
     )
     cm, deg = 1e2 * plan.setting.shift, np.degrees(plan.setting.turn)
-    home = settings_in_words(machine, readings_at(machine, machine.home))
+    home = settings_in_words(machine, readings_at(machine, machine.home), digits=2)
     place = (
         "Take each image from about the position in poses.csv; the whole board must be in it."
         if hand_held
