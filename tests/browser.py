@@ -1,7 +1,8 @@
 """Chromium without a window, driven by Selenium."""
 
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -36,3 +37,12 @@ def chromium() -> Iterator[Any]:
 def errors(browser: Any) -> list[str]:
     """Return what the console calls an error."""
     return [one["message"] for one in browser.get_log("browser") if one["level"] == "SEVERE"]
+
+
+def until(condition: Callable[[], Any]) -> Any:
+    """Wait for something that is true, and return it."""
+    end = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return found

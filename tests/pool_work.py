@@ -1,7 +1,10 @@
 """Work for the processes of a pool, in a module that they import at once."""
 
+import pickle
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from legcal.errors import DatasetError
 
@@ -20,3 +23,18 @@ def negative(row: int, refused: int = -1) -> int:
     if row == refused:
         raise DatasetError(f"row {row} could not be used.")
     return -row
+
+
+def _pickled(content: Any) -> Any:
+    return pickle.loads(pickle.dumps(content))
+
+
+def _called(work: Any, *arguments: Any) -> Any:
+    return _pickled(work(*arguments))
+
+
+class OtherProcess(ThreadPoolExecutor):
+    """Work that comes and goes as to another process, which would take seconds to start."""
+
+    def submit(self, work: Any, /, *arguments: Any, **_: Any) -> Future[Any]:
+        return super().submit(_called, *_pickled((work, *arguments)))

@@ -1,7 +1,6 @@
 """One way to run work: in processes, by an executor that is handed in, on a Dask cluster."""
 
 import os
-import pickle
 import socket
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from typing import Any
 import pytest
 from command_line import run as run_command
 from hexapod_example import ROOT
-from pool_work import negative, row_zero_after_row_five
+from pool_work import OtherProcess, negative, row_zero_after_row_five
 from simulated import files_of
 from toy_studies import Draws
 
@@ -53,14 +52,6 @@ def test_every_back_end_keeps_the_contract(several: Workers) -> None:
         assert list(run(negative, range(99))) == [-row for row in range(99)]
         with pytest.raises(DatasetError, match="row 7"):
             list(run(partial(negative, refused=7), range(9)))
-
-
-class OtherProcess(ThreadPoolExecutor):
-    """Calls that are pickled as for another process, which would take seconds to start."""
-
-    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        there, *given = pickle.loads(pickle.dumps((function, *arguments)))
-        return super().submit(there, *given, **named)
 
 
 def test_an_executor_that_is_handed_in_gives_the_same_bits(tmp_path: Path) -> None:

@@ -2,11 +2,9 @@
 
 import json
 import os
-import pickle
 import re
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 from command_line import run
 from csv_rows import read_rows
+from pool_work import OtherProcess
 from scipy.spatial.transform import RigidTransform
 
 import legcal
@@ -49,16 +48,6 @@ BOUNDS = "0m:2m,-2m:2m,0.5m:2m"  # of cameras
 
 
 WORDS = ["plan", "3-rpr", "--images", "6", "--cameras", "2", "--seed", "3", "--bounds", BOUNDS]
-
-
-class Elsewhere:
-    """An executor whose work comes and goes as to and from another process."""
-
-    def submit(self, work: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
-        work, arguments = pickle.loads(pickle.dumps((work, arguments)))
-        done = Future[Any]()
-        done.set_result(pickle.loads(pickle.dumps(work(*arguments))))
-        return done
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -97,7 +86,7 @@ def planned(small_search: None) -> Plan:
     """A plan for outlines with white noise, its work done elsewhere."""
     return legcal.plan(
         "3-rpr", images=6, cameras=2, seed=3, noise=WHITE, setting=FEW,
-        bounds=parse_bounds(BOUNDS), workers=Elsewhere(),
+        bounds=parse_bounds(BOUNDS), workers=OtherProcess(1),
     )  # fmt: skip
 
 

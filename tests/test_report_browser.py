@@ -4,7 +4,6 @@ import csv
 import io
 import shutil
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import PATIENCE, chromium
+from browser import chromium, until
 from browser import errors as _errors
 from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.wait import WebDriverWait
 
 import legcal
 from legcal.calibration.detection import Detection, Examination
@@ -122,37 +120,51 @@ def detection(examined: tuple[Path, Examination]) -> tuple[Path, Detection]:
     return folder, found.detection
 
 
-def _downloaded(path: Path) -> str:
-    """Wait for a file and return its text."""
-    end = time.monotonic() + PATIENCE
-    while not path.exists():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return path.read_text("utf-8")
+class Dialog:
+    """A dialog of a page."""
+
+    def __init__(self, browser: Any, name: str) -> None:
+        self.browser, self.name = browser, name
+
+    def find(self, selector: str) -> Any:
+        return self.browser.find_element("css selector", f"#{self.name} {selector}")
+
+    def row(self, condition: str) -> Any:
+        """Return the row of the list that meets a condition of XPath."""
+        return self.browser.find_element("xpath", f"//*[@id='{self.name}']//li/button[{condition}]")
+
+    def until(self, script: str) -> Any:
+        """Wait for what a script returns."""
+        return until(lambda: self.browser.execute_script(script))
+
+    def download(self, button: str, path: Path) -> str:
+        """Return the text of the file behind a button."""
+        path.unlink(missing_ok=True)
+        self.find(button).click()
+        until(path.exists)
+        return path.read_text("utf-8")
 
 
-class Editor:
+def _download_to(browser: Any, folder: Path) -> None:
+    browser.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)}
+    )
+
+
+class Editor(Dialog):
     """The editor of a page, used as people do."""
 
-    def __init__(self, browser: Any, page: Path, downloads: Path) -> None:
-        self.browser, self.downloads = browser, downloads
-        browser.execute_cdp_cmd(
-            "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(downloads)}
-        )
+    def __init__(self, browser: Any, page: Path) -> None:
+        super().__init__(browser, "editor")
         browser.get(page.as_uri())
 
     def open(self, image: int) -> None:
         """Open the editor at an image."""
         button = self.browser.find_element("css selector", f"figcaption [data-edit='{image}']")
         self.browser.execute_script("arguments[0].click()", button)
-        shown = (
+        self.until("return document.querySelector('#editor .rows button') !== null")
+        self.until(
             "return [...document.querySelectorAll('#editor image')].every((i) => i.getBBox().width)"
-        )
-        WebDriverWait(self.browser, PATIENCE).until(
-            lambda _: (
-                self.browser.find_elements("css selector", "#editor .rows button")
-                and self.browser.execute_script(shown)
-            )
         )
         self.find("[name=sigma]").clear()
         self.find("[name=sigma]").send_keys(str(SIGMA))
@@ -160,13 +172,8 @@ class Editor:
     def close(self) -> None:
         self.find("[name=close]").click()
 
-    def find(self, selector: str) -> Any:
-        return self.browser.find_element("css selector", f"#editor {selector}")
-
     def choose(self, name: str) -> None:
-        self.browser.find_element(
-            "xpath", f"//*[@id='editor']//li/button[b[text()='{name}']]"
-        ).click()
+        self.row(f"b[text()='{name}']").click()
 
     def press(self, *keys: str) -> None:
         """Press keys; one of several words, as "Shift ArrowDown", holds the first."""
@@ -194,17 +201,7 @@ class Editor:
         ActionChains(self.browser).release().perform()
 
     def state(self, name: str) -> str:
-        row = self.browser.find_element(
-            "xpath", f"//*[@id='editor']//li/button[b[text()='{name}']]/span"
-        )
-        return str(row.text)
-
-    def download(self) -> str:
-        """Return the text of the table."""
-        path = self.downloads / "observations.csv"
-        path.unlink(missing_ok=True)
-        self.find("[data-download]").click()
-        return _downloaded(path)
+        return str(self.row(f"b[text()='{name}']").find_element("css selector", "span").text)
 
 
 def _rows(text: str) -> list[dict[str, str]]:
@@ -220,7 +217,8 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
 ) -> None:
     folder, found = detection
     out = folder.parent / "found"
-    editor = Editor(browser, out / "index.html", tmp_path)
+    _download_to(browser, tmp_path)
+    editor = Editor(browser, out / "index.html")
     before = _rows((out / "observations.csv").read_text())
     moved, dropped = 4, 1  # rows of the first image
     editor.open(0)
@@ -244,7 +242,7 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
     assert editor.state(names[0]).startswith("rejected")
     editor.find("[name=undo]").click()
     assert editor.state(names[0]) == "used"
-    text = editor.download()
+    text = editor.download("[data-download]", tmp_path / "observations.csv")
     editor.close()
     assert "2 outlines are edited" in browser.find_element("id", "edit-state").text
     after = _rows(text)
@@ -282,25 +280,21 @@ def test_outlines_are_corrected_on_the_page_and_calibrate_takes_them(
 # Clicking joints on the page of ``legcal detect``.
 
 
-class Placer:
+class Placer(Dialog):
     """The editor of clicks on joints, used as people do."""
 
     def __init__(self, browser: Any) -> None:
-        self.browser = browser
+        super().__init__(browser, "placer")
 
     def open(self, image: int) -> None:
         button = self.browser.find_element("css selector", "[data-place]")
         self.browser.execute_script("arguments[0].click()", button)
         while self.shown() != image:
             self.find("[name=next]").click()
-        shown = "return document.querySelector('#placer image').getBBox().width > 0"
-        WebDriverWait(self.browser, PATIENCE).until(lambda _: self.browser.execute_script(shown))
+        self.until("return document.querySelector('#placer image').getBBox().width > 0")
 
     def shown(self) -> int:
         return int(self.find("[name=image]").get_property("value"))
-
-    def find(self, selector: str) -> Any:
-        return self.browser.find_element("css selector", f"#placer {selector}")
 
     def on_screen(self, px: Any) -> tuple[int, int]:
         x, y = self.browser.execute_script(
@@ -325,19 +319,11 @@ class Placer:
         actions.perform()
 
     def choose(self, joint: str) -> None:
-        self.browser.find_element(
-            "xpath", f"//*[@id='placer']//li/button[starts-with(b, '{joint} ')]"
-        ).click()
+        self.row(f"starts-with(b, '{joint} ')").click()
 
     def press_delete(self, joint: str) -> None:
         self.choose(joint)
         self.find("[name=remove]").click()
-
-    def until(self, script: str) -> Any:
-        """Wait for what a script returns."""
-        return WebDriverWait(self.browser, PATIENCE).until(
-            lambda _: self.browser.execute_script(script)
-        )
 
     @property
     def scale(self) -> float:
@@ -352,7 +338,7 @@ def test_a_photograph_fills_the_editor_on_a_telephone(
     narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
     try:
-        editor = Editor(browser, detection[0].parent / "found" / "index.html", tmp_path)
+        editor = Editor(browser, detection[0].parent / "found" / "index.html")
         editor.open(0)
         stage = editor.find(".stage").size
         editor.close()
@@ -366,9 +352,7 @@ def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:
     folder, found = detection
-    browser.execute_cdp_cmd(
-        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
-    )
+    _download_to(browser, tmp_path)
     browser.get((folder.parent / "found" / "index.html").as_uri())
     placer, row = Placer(browser), int(found.rows[0])
     placer.open(0)
@@ -384,8 +368,7 @@ def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
         placer.choose(joint)
         placer.click(seen[joint])
     placer.press_delete("leg6.platform")
-    placer.find("[data-landmarks]").click()
-    table = _rows(_downloaded(tmp_path / "landmarks.csv"))
+    table = _rows(placer.download("[data-landmarks]", tmp_path / "landmarks.csv"))
     clicked = {line["joint"]: np.array([float(line["u"]), float(line["v"])]) for line in table}
     assert list(clicked) == ["leg1.base", "leg2.base", "leg4.base", "leg1.platform",
                              "leg3.platform", "leg5.platform"]  # fmt: skip

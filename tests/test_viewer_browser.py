@@ -5,14 +5,13 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import PATIENCE, chromium, errors
+from browser import PATIENCE, chromium, errors, until
 from hexapod_example import Run
 from selenium.webdriver.common.keys import Keys
 
@@ -47,14 +46,6 @@ def _shown(source: Subject, browser: Any) -> Iterator[ViewServer]:
         assert not loop.is_alive()
 
 
-def _wait(condition: Callable[[], Any]) -> Any:
-    end = time.monotonic() + PATIENCE
-    while not (found := condition()):
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    return found
-
-
 def _press(browser: Any, name: str, key: str) -> None:
     browser.find_element("css selector", f"form[data-moves] [name={name}]").send_keys(key)
 
@@ -68,22 +59,22 @@ def test_sliders_move_the_machine(browser: Any) -> None:
     with _shown(open_source("3-upu"), browser) as server:
         before, lines = server.motion.posture, _drawn(browser)
         _press(browser, "q1", Keys.END)
-        _wait(lambda: server.motion.posture.q[1] == 0.15)
+        until(lambda: server.motion.posture.q[1] == 0.15)
         after = server.motion.posture
         np.testing.assert_allclose(after.q[[0, 2]], before.q[[0, 2]], atol=1e-9)
         assert np.abs(after.T.translation - before.T.translation).max() > 0.05
-        _wait(lambda: _drawn(browser) != lines)
+        until(lambda: _drawn(browser) != lines)
         B = [line[1] for line in _drawn(browser)]
         there = after.T.apply(server.source.machine.B_platform)
-        _wait(lambda: np.allclose([line[1] for line in _drawn(browser)], there, atol=1e-6) or B)
+        until(lambda: np.allclose([line[1] for line in _drawn(browser)], there, atol=1e-6) or B)
         assert "At the end of the travel: leg2" in browser.find_element("css selector", "body").text
         _press(browser, "x2", Keys.ARROW_LEFT)
-        _wait(lambda: server.motion.posture.T.translation[2] < after.T.translation[2] - 1e-6)
+        until(lambda: server.motion.posture.T.translation[2] < after.T.translation[2] - 1e-6)
         np.testing.assert_allclose(
             server.motion.posture.T.translation[:2], after.T.translation[:2], atol=1e-9
         )
         browser.find_element("css selector", "form[data-moves] button").click()
-        _wait(lambda: np.allclose(server.motion.posture.q, before.q))
+        until(lambda: np.allclose(server.motion.posture.q, before.q))
         assert errors(browser) == []
 
 
@@ -91,9 +82,9 @@ def test_a_result_is_shown_with_its_photographs(example_run: Run, browser: Any) 
     with _shown(open_source(example_run.output, example_run.folder), browser) as server:
         first = server.motion.posture.T.as_matrix()
         _press(browser, "pose", Keys.ARROW_RIGHT)
-        _wait(lambda: np.abs(server.motion.posture.T.as_matrix() - first).max() > 1e-3)
+        until(lambda: np.abs(server.motion.posture.T.as_matrix() - first).max() > 1e-3)
         (shown,) = server._photographs.at(1)
-        _wait(lambda: shown["caption"] in browser.find_element("css selector", "body").text)
+        until(lambda: shown["caption"] in browser.find_element("css selector", "body").text)
         lines = browser.find_elements("css selector", ".gallery polyline")
         assert len(lines) == len(shown["lines"]) > 0
         width = (

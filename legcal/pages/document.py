@@ -302,11 +302,11 @@ class Page:
     sections: Sequence[Section]
 
 
-def number(value: float | None, digits: int, *, signed: bool = False) -> Number:
+def number(value: float | None, digits: int) -> Number:
     """Return a number with some digits behind the point."""
     if value is None:
         return Number(None, "")
-    return Number(float(value), f"{value:{'+' if signed else ''}z.{digits}f}")
+    return Number(float(value), f"{value:z.{digits}f}")
 
 
 def time_of_page() -> str:

@@ -57,7 +57,7 @@ from legcal.simulation.settings import (
     Spread,
 )
 from legcal.simulation.truth import draw_errors, write_model_with
-from legcal.vision.camera import Camera, sample_camera
+from legcal.vision.camera import sample_camera
 from legcal.workers import Workers, is_number, processors, worker_pool
 
 MACHINES = ("coplanar", "noncoplanar")
@@ -93,22 +93,15 @@ def paper_machine(name: str) -> Machine:
     return replace(machine, legs=tuple(replace(leg, travel=TRAVEL) for leg in machine.legs))
 
 
-def paper_cameras(
-    machine: Machine,
-    rng: np.random.Generator,
-    legs: Sequence[Sequence[int]] = PAPER_VIEWS,
-    camera: Camera | None = None,
-) -> tuple[Viewpoint, ...]:
+def paper_cameras(machine: Machine, rng: np.random.Generator) -> tuple[Viewpoint, ...]:
     """Return cameras around a machine, each on the side of its legs."""
-    camera = camera or sample_camera()
+    camera = sample_camera()
     middle = 0.5 * (machine.A_base + machine.home.apply(machine.B_platform))
     centre = middle.mean(axis=0)
     views = []
-    for v, view_legs in enumerate(legs):
+    for v, view_legs in enumerate(PAPER_VIEWS):
         outward = (middle[list(view_legs)] - centre).mean(axis=0)
         outward[2] = 0.0
-        if np.linalg.norm(outward) < 1e-3 * _DISTANCE:  # every leg is seen: any side will do
-            outward = np.array([*rng.normal(size=2), 0.0])
         outward /= np.linalg.norm(outward)
         lift = rng.uniform(0.0, 0.25)
         toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
