@@ -37,8 +37,7 @@ calibration: camera_calibration.calibration camera_calibration.document
     result_folder summary verification
 planning: places request session shooting
 exports: formats subject
-scene: motions
-report: calibration calibration_page machine plan render session
+report: calibration calibration_page machine plan render scene session
 viewer: click_server server shooting source view_server
 cli:
 simulation: dataset observe paper session settings

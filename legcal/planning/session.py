@@ -306,14 +306,13 @@ class Plan:
                 dE_max_rad=error.max_rotation,
             )
         rows = zip(self.names, self.sigma.tolist(), self.units, strict=True)
-        return PlanDocument(
+        return PlanDocument.describing(
+            self,
             legcal_plan=1,
             legcal=__version__,
             mechanism=self.machine.name,
             images=self.n_images,
-            seed=self.seed,
             criterion="d" if error is None else "mean",
-            value=self.value,
             expected=expected,
             tolerance=Tolerance(
                 camera_m=setting.shift,
@@ -322,17 +321,13 @@ class Plan:
                 machine_rad=setting.angle,
                 draws=setting.draws,
             ),
-            noise=NoiseOfPlan(
-                sigma_px=noise.sigma_px,
-                correlation=noise.correlation,
+            noise=NoiseOfPlan.describing(
+                noise,
                 common_px=dict(zip(KINDS, noise.common_px, strict=True)),
                 places_px=dict(zip(PLACES, noise.places_px, strict=True)),
-                gamma_px=noise.gamma_px,
-                source=noise.source,
             ),
             board=self.board is not None,
             T_base_board=None if self.board is None else Pose.of(self.board.T_base_board),
-            hand_held=self.hand_held,
             given=self.given or None,
             views={
                 view.name: ViewOfPlan(

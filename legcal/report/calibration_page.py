@@ -57,7 +57,7 @@ from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
 from legcal.perception.overlays import curve
 from legcal.report.calibration import next_steps, platform_table
 from legcal.report.render import record_section, table
-from legcal.scene.motions import MachineScene
+from legcal.report.scene import MachineScene
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.vision.image_file import small_jpeg
 

@@ -19,7 +19,7 @@ from legcal.planning.places import LaidBoard
 from legcal.planning.session import Plan, poses_to_take, settings_in_words, views_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
-from legcal.scene.motions import pyramid
+from legcal.report.scene import pyramid
 
 PLACES, CHECKLIST, PAGE_NAME = "places.svg", "checklist.txt", "plan.html"
 _CAMERA_COLOUR, _BOARD_COLOUR = "#b45309", "#15803d"

@@ -32,7 +32,7 @@ from legcal.machine.model import Machine, joint_values, readings_at, readings_at
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import consistent_readings
 from legcal.pages.document import Page, Scene, Section, Sliders, page_html, time_of_page
-from legcal.scene.motions import MachineScene
+from legcal.report.scene import MachineScene
 from legcal.viewer.server import HTML, Address, PageServer
 from legcal.viewer.source import Photographs
 

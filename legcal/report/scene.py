@@ -1,4 +1,8 @@
-"""A machine beside another model of it, ellipsoids at its joints, pyramids of cameras."""
+"""A machine beside another model of it, ellipsoids at its joints, pyramids of cameras.
+
+Points and lengths are in the base link [m]; ``scene.js`` of :mod:`legcal.pages` draws them on the
+canvas of a page: a report, or that of :mod:`legcal.viewer`.
+"""
 
 from __future__ import annotations
 
