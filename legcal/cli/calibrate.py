@@ -163,8 +163,16 @@ def calibrate(
                 "the earlier result; leave one of them out."
             )
         page = None if output is None or not with_report else _page_of_check(output)
-        on = image_workers(cluster, workers)
-        _check(dataset, check, page, on, quiet=quiet, as_json=as_json)
+        from legcal.calibration import verification
+        from legcal.report.calibration import check_summary, check_verdict
+
+        used = image_workers(cluster, workers)
+        checked = verification.check(dataset, check, progress=not quiet, workers=used)
+        summary = check_summary(checked)
+        write_page(page, f"Check of {check.resolve().name}", summary, check_verdict(checked))
+        show(as_json, checked.document, lambda: summary)
+        if checked.movement.moved:
+            raise typer.Exit(1)
         return
     if output is None:
         raise UsageError(
@@ -272,29 +280,3 @@ def _lengths(stated: Sequence[str]) -> list[str]:
                 "ends of a rod, leg1.base:leg1.platform."
             )
     return list(stated)
-
-
-def _check(
-    dataset: Path,
-    result: Path,
-    page: Path | None,
-    workers: int | str,
-    *,
-    quiet: bool,
-    as_json: bool,
-) -> None:
-    """Test an earlier result with new images."""
-    from legcal.calibration.verification import check
-    from legcal.report.calibration import check_summary, check_verdict
-
-    found = check(
-        dataset,
-        result,
-        progress=not quiet,
-        workers=workers,
-    )
-    title = f"Check of {result.resolve().name}"
-    write_page(page, title, check_summary(found), check_verdict(found))
-    show(as_json, found.document, lambda: check_summary(found))
-    if found.movement.moved:
-        raise typer.Exit(1)

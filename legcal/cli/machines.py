@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,9 +18,9 @@ from legcal.cli.options import (
     NoiseOption,
     OnlyOption,
     as_lines,
-    open_browser,
     print_json,
     print_table,
+    serve,
     show,
 )
 from legcal.errors import UsageError, printable
@@ -458,10 +457,7 @@ def view(
     server = ViewServer(open_source(source, dataset), address)
     name = printable(server.source.name)
     print_table(Text(f"{server.address} shows {name}; Ctrl-C ends it.", overflow="fold"))
-    if browser:
-        open_browser(str(server.address))
-    with suppress(KeyboardInterrupt):  # the way to end it
-        server.run()
+    serve(server, browser=browser)
 
 
 def example(

@@ -98,6 +98,7 @@ if TYPE_CHECKING:
 
     from legcal.pages.document import Block, Verdict
     from legcal.report.render import Report
+    from legcal.viewer.server import PageServer
 
 
 def write_page(
@@ -259,6 +260,14 @@ def open_browser(address: str) -> None:
         import webbrowser
 
         webbrowser.open(address)
+
+
+def serve(server: PageServer, *, browser: bool = True) -> None:
+    """Serve a page until an interrupt, the way to end it."""
+    if browser:
+        open_browser(str(server.address))
+    with suppress(KeyboardInterrupt):
+        server.run()
 
 
 def _has_screen() -> bool:

@@ -28,15 +28,14 @@ from legcal.cli.options import (
     command_line,
     image_workers,
     open_browser,
-    print_json,
     print_table,
+    serve,
     show,
 )
 from legcal.errors import UsageError, printable
 from legcal.vision.distortion import CameraProgram, DistortionModel
 
 if TYPE_CHECKING:
-    from legcal.calibration.detection import Detection, Examination
     from legcal.planning.session import Plan
 
 
@@ -379,10 +378,11 @@ def init(
     if not as_json and not quiet:
         print_table(matching_table(dataset))
     written = write_new_dataset(dataset, force=force)
-    if as_json:
-        print_json(dataset.document(written))
-    else:
-        print_table(written_lines(output, written, dataset.machine))
+    show(
+        as_json,
+        lambda: dataset.document(written),
+        lambda: written_lines(output, written, dataset.machine),
+    )
 
 
 def import_(
@@ -444,10 +444,11 @@ def import_(
         print_table(import_table(plan))
     with shown_progress(not quiet) as progress:
         written = import_recordings(plan, force=force, progress=progress)
-    if as_json:
-        print_json(plan.document(written))
-    else:
-        print_table(written_lines(output, written, plan.machine))
+    show(
+        as_json,
+        lambda: plan.document(written),
+        lambda: written_lines(output, written, plan.machine),
+    )
 
 
 def doctor(
@@ -518,17 +519,10 @@ def detect(
     )
     show(as_json, examination.document, lambda: examination_table(examination, output))
     if edit and examination.detection is not None:
-        _serve_clicks(examination, examination.detection, output, port)
+        from legcal.viewer.click_server import ClickServer
+
+        server = ClickServer(examination, examination.detection, output, port)
+        typer.echo(f"Click joints at {server.address}; press Ctrl-C to stop.", err=True)
+        serve(server)
     if any(view.problem for view in examination.views) or not examination.n_used:
         raise typer.Exit(1)
-
-
-def _serve_clicks(examination: Examination, detection: Detection, folder: Path, port: int) -> None:
-    """Serve the page of a detection until it is interrupted."""
-    from legcal.viewer.click_server import ClickServer
-
-    server = ClickServer(examination, detection, folder, port)
-    typer.echo(f"Click joints at {server.address}; press Ctrl-C to stop.", err=True)
-    open_browser(str(server.address))
-    with suppress(KeyboardInterrupt):  # the way to end it
-        server.run()
