@@ -123,7 +123,12 @@ class FileSchema(BaseModel):
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
+    model_config = ConfigDict(
+        frozen=True,
+        allow_inf_nan=False,
+        from_attributes=True,
+        defer_build=True,  # one command writes few of all documents
+    )
 
     @classmethod
     def describing(cls, source: object, **others: Any) -> Self:
