@@ -508,6 +508,8 @@ class GammaTrials:
 
         Minus infinity where the fit failed.
         """
+        if not self.cameras:
+            return np.zeros(self.log_gamma.shape)
         fitted = [solution for solution in self.solutions if solution is not None]
         log_likelihood = np.full(self.log_gamma.shape, -np.inf)
         is_fitted = np.array([solution is not None for solution in self.solutions])
