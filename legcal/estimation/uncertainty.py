@@ -5,7 +5,7 @@ All of them follow from the normal equations at one state, eliminated elements m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -402,12 +402,25 @@ def left_out_blocks(
     their innovations, whitened by the covariance of these. For right models they are as large as
     their number.
     """
-    blocks = list[LeftOut]()
     everything = normal_equations(problem, state, linear)
-    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
-    rank_of_elements = _ranks(everything.V)
+    rank, rank_of_elements = int(_ranks(everything.reduced())), _ranks(everything.V)
+    blocks = list[LeftOut]()
+    for b, (squares, n, rest) in enumerate(innovations(problem, state, linear, block)):
+        determined = rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
+        blocks.append(LeftOut(squares, n - determined, rest.reduced()))
+    return blocks
+
+
+def innovations(
+    problem: EstimationProblem[S], state: S, linear: Linearization, block: IntArray
+) -> Iterator[tuple[float, int, NormalEquations]]:
+    """Yield the squares of innovations of blocks, as :func:`left_out_blocks`.
+
+    With the number of their measurements, and the normal equations of all else.
+    """
+    gradient = _reduced_gradient(normal_equations(problem, state, linear))
     for b in range(int(block.max(initial=-1)) + 1):
-        rows, squares, dof = dict(linear.rows), 0.0, 0
+        rows, squares, n = dict(linear.rows), 0.0, 0
         for factor in problem.factors:
             if factor.element is None:
                 continue
@@ -420,13 +433,10 @@ def left_out_blocks(
             )
             inside = of_factor.squared_norms[is_inside]
             squares += float(inside.sum())
-            dof += factor.n_rows * int(np.sum(inside > 0.0))
+            n += factor.n_rows * int(np.sum(inside > 0.0))
         rest = normal_equations(problem, state, replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
-        squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
-        dof -= rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
-        blocks.append(LeftOut(squares, dof, rest.reduced()))
-    return blocks
+        yield squares + float(pull @ rest.moved_by(pull[:, None])[:, 0]), n, rest
 
 
 def _reduced_gradient(normal: NormalEquations) -> Array:

@@ -185,9 +185,10 @@ def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
             weights = [term.weights(x, robust=k > 0) for term in problem.terms]
             if k > 0 and _change(weights, before) < _CONVERGED:
                 break
-        scale = _column_scale(problem.jacobian(x, weights))
-        if problem.exact_hessian and not weighted:  # some columns of J may vanish
-            scale = np.full_like(scale, scale.min())
+        if k == 0:
+            scale = _column_scale(problem.jacobian(x, weights))
+            if problem.exact_hessian and not weighted:  # some columns of J may vanish
+                scale = np.full_like(scale, scale.min())
         entries = [np.swapaxes(W, 1, 2).ravel() for W in weights if W is not None]
         step = solver(x0=np.zeros(len(x)), p=np.concatenate([x, scale, *entries]))["x"]
         stats = solver.stats()
@@ -225,7 +226,7 @@ def evaluated(function: ca.Function, local: Array, *observed: Array) -> Array:
     """Return the residuals (n, r) of a function of a term, of local unknowns (n, n_local)."""
     n, none = len(local), np.zeros((len(local), function.size1_in(1)))
     arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    return np.asarray(function.map(n)(*arguments).full()).T if n else _nothing(function)
+    return np.asarray(_mapped(function, n)(*arguments).full()).T if n else _nothing(function)
 
 
 def derivatives(function: ca.Function, input_index: int, local: Array, *observed: Array) -> Array:
@@ -233,7 +234,7 @@ def derivatives(function: ca.Function, input_index: int, local: Array, *observed
     n, none = len(local), np.zeros((len(local), function.size1_in(1)))
     r, k = function.size1_out(0), function.size1_in(input_index)
     arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    derivative = _derivative(function, input_index).map(n)(*arguments).full()
+    derivative = _mapped(_derivative(function, input_index), n)(*arguments).full()
     return np.asarray(derivative.reshape(r, n, k).swapaxes(0, 1))
 
 
@@ -263,6 +264,12 @@ def adjusted(
 
 def _nothing(function: ca.Function) -> Array:
     return np.zeros((0, function.size1_out(0)))
+
+
+@lru_cache(maxsize=64)
+def _mapped(function: ca.Function, n: int) -> ca.Function:
+    """Return a function of n observations side by side."""
+    return function.map(n)
 
 
 def _side_by_side(values: Array) -> Array:
