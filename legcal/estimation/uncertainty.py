@@ -18,7 +18,6 @@ from legcal.estimation.problem import (
     Linearization,
     Residuals,
     S,
-    Sparsity,
     linearize,
 )
 from legcal.estimation.solver import (
@@ -218,7 +217,9 @@ def _gradients(
             d = problem.d_element
             unknown = sparsity.element[:, None, None] * d + np.arange(d)
             at = np.broadcast_arrays(unknown, number[..., None])
-            by = csc_array((rows.J_element.ravel(), [x.ravel() for x in at]), (len(elements), n * q))
+            by = csc_array(
+                (rows.J_element.ravel(), [x.ravel() for x in at]), (len(elements), n * q)
+            )
             elements += (by @ flat).toarray()
     return kept, elements.reshape(problem.n_elements, problem.d_element, c), vstack(stacked, "csc")
 

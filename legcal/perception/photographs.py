@@ -37,6 +37,7 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
+from legcal.perception.limb import powers
 from legcal.perception.outline import Method, measure, measure_in_brief, measure_outlines
 from legcal.perception.placement import (
     Joined,
@@ -527,6 +528,7 @@ def _inspect_images(
     exposures, small, pieces = dict[int, Exposure](), dict[int, Grey](), dict[int, Array]()
     count = _counted(report, "Looking at images", len(rows))
     look = partial(_inspect, photographs.search(nominal), first)
+    powers(np.zeros(1))  # tabulated once, not by each process that is forked
     for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
         exposures[row] = exposure
         if own is not None:
