@@ -185,10 +185,9 @@ def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
             weights = [term.weights(x, robust=k > 0) for term in problem.terms]
             if k > 0 and _change(weights, before) < _CONVERGED:
                 break
-        if k == 0:
-            scale = _column_scale(problem.jacobian(x, weights))
-            if problem.exact_hessian and not weighted:  # some columns of J may vanish
-                scale = np.full_like(scale, scale.min())
+        scale = _column_scale(problem.jacobian(x, weights))
+        if problem.exact_hessian and not weighted:  # some columns of J may vanish
+            scale = np.full_like(scale, scale.min())
         entries = [np.swapaxes(W, 1, 2).ravel() for W in weights if W is not None]
         step = solver(x0=np.zeros(len(x)), p=np.concatenate([x, scale, *entries]))["x"]
         stats = solver.stats()
