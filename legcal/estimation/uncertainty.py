@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import null_space
@@ -212,14 +212,15 @@ def _gradients(
         number = np.arange(n * q).reshape(n, q)
         for rows_of_group, unknowns in sparsity.members:
             J, own = rows.J[rows_of_group], number[rows_of_group].ravel()
-            np.add.at(kept, unknowns, (flat[own].T @ J.reshape(len(own), J.shape[2])).T)
+            products = np.asarray(flat[own].T @ J.reshape(len(own), J.shape[2]))
+            np.add.at(kept, unknowns, products.T)
         if sparsity.element is not None:
             d = problem.d_element
-            unknown = sparsity.element[:, None, None] * d + np.arange(d)
-            at = np.broadcast_arrays(unknown, number[..., None])
-            by = csc_array(
-                (rows.J_element.ravel(), [x.ravel() for x in at]), (len(elements), n * q)
+            unknown, measured = np.broadcast_arrays(
+                sparsity.element[:, None, None] * d + np.arange(d), number[..., None]
             )
+            place = unknown.ravel(), measured.ravel()
+            by = csc_array((rows.J_element.ravel(), place), (len(elements), n * q))
             elements += (by @ flat).toarray()
     return kept, elements.reshape(problem.n_elements, problem.d_element, c), vstack(stacked, "csc")
 
@@ -267,7 +268,7 @@ class Projected:
     """
 
     score: Array  # (c,)
-    columns: csc_array  # (n, c) of the measurements of all factors
+    columns: Any  # sparse, (n, c), of the measurements of all factors
     response: Array  # (k, c)
     gradient: Array  # (k, c)
 
