@@ -908,7 +908,7 @@ class _Scores:
         scores = self.scores
         toward = scores.information(slice(None), columns)
         precision = np.diag((noise.further * sigma) ** -2.0) + toward[columns]
-        by_noise = np.linalg.solve(precision, toward.T).T
+        by_noise = np.asarray(np.linalg.solve(precision, toward.T).T, dtype=np.float64)
         scores = scores.less(by_noise, toward, by_noise @ scores.score[columns])
         return _Scores(scores, self.column)
 
