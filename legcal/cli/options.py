@@ -148,11 +148,13 @@ class PageOfResult:
 @contextmanager
 def importing() -> Iterator[None]:
     """Look for no garbage among what imported modules make, now or later: it lives to the end."""
+    n_modules = len(sys.modules)
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()
+        if len(sys.modules) > n_modules:
+            gc.freeze()
         gc.enable()
 
 
