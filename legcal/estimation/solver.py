@@ -255,11 +255,6 @@ class NormalEquations:
         """Derivative of elements at their minimum by kept unknowns, (n_elements, f, n_kept)."""
         return np.asarray(-self.V_inverse @ np.moveaxis(self.W, 0, 2))
 
-    @cached_property
-    def _free(self) -> Array:
-        """Basis (n_kept, f) of the directions that are not held."""
-        return np.asarray(null_space(self.held_directions))
-
     def reduced(self) -> Array:
         """Return the Schur complement (n_kept, n_kept): elements marginalised out."""
         return self._reduced.copy()
@@ -292,21 +287,18 @@ class NormalEquations:
         if len(self.held_directions) == 0:
             covariance = inverse_on_range(self._reduced)
         else:
-            N = self._free
+            N = null_space(self.held_directions)
             covariance = N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T
         return np.asarray(0.5 * (covariance + covariance.T))  # rounding grows with the condition
 
     def moved_by(self, columns: Array) -> Array:
         """Multiply columns (n_kept, c) by the covariance of the kept unknowns."""
-        if "_kept_covariance" not in vars(self):
-            R, right, is_held = self._reduced, columns, len(self.held_directions) > 0
-            if is_held:
-                R, right = self._free.T @ R @ self._free, self._free.T @ columns
-            scale = _scale(R)
-            U, failed = dpotrf(scale[:, None] * R * scale)
+        if len(self.held_directions) == 0 and "_kept_covariance" not in vars(self):
+            scale = _scale(self._reduced)
+            U, failed = dpotrf(scale[:, None] * self._reduced * scale)
             if not failed and np.diagonal(U).min(initial=1.0) ** 2 > _MIN_PIVOT:
-                moved = scale[:, None] * cho_solve((U, False), scale[:, None] * right)
-                return np.asarray(self._free @ moved if is_held else moved)
+                right = scale[:, None] * columns
+                return np.asarray(scale[:, None] * cho_solve((U, False), right))
         return np.asarray(self._kept_covariance @ columns)
 
     def step(self, damping: float) -> tuple[Array, float]:
@@ -326,7 +318,7 @@ class NormalEquations:
         element_part = (V_inverse @ self.g_elements[..., None]).ravel()
         right = -self.g_kept + _as_matrix(self.W) @ element_part
         if len(self.held_directions):
-            N = self._free
+            N = null_space(self.held_directions)
             kept = N @ _solve(N.T @ R @ N, N.T @ right)
         else:
             kept = _solve(R, right)

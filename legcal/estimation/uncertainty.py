@@ -5,7 +5,7 @@ All of them follow from the normal equations at one state, eliminated elements m
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -349,18 +349,6 @@ class Scores:
     information: Array  # (c, c)
     size: Array  # (c,) squares of the columns before the fit absorbs its part
 
-    @classmethod
-    def of(
-        cls,
-        problem: EstimationProblem[S],
-        linear: Linearization,
-        normal: NormalEquations,
-        columns: Mapping[str, Array],
-    ) -> Scores:
-        """Compute the scores of *columns*, as in :func:`score_test`."""
-        projected = Projected.of(problem, linear, normal, columns)
-        return projected.at(np.arange(len(projected.score)))
-
     def estimate(self, columns: IntArray, chosen: Array | None = None) -> Estimated:
         """Estimate numbers together: one for each column, or *chosen* (c, d) sums of columns."""
         chosen = np.eye(len(columns)) if chosen is None else chosen
@@ -404,25 +392,12 @@ def left_out_blocks(
     their innovations, whitened by the covariance of these. For right models they are as large as
     their number.
     """
-    everything = normal_equations(problem, state, linear)
-    rank, rank_of_elements = int(_ranks(everything.reduced())), _ranks(everything.V)
     blocks = list[LeftOut]()
-    for b, (squares, n, rest) in enumerate(innovations(problem, state, linear, block)):
-        determined = rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
-        blocks.append(LeftOut(squares, n - determined, rest.reduced()))
-    return blocks
-
-
-def innovations(
-    problem: EstimationProblem[S], state: S, linear: Linearization, block: IntArray
-) -> Iterator[tuple[float, int, NormalEquations]]:
-    """Yield the squares of innovations of blocks, as :func:`left_out_blocks`.
-
-    With the number of their measurements, and the normal equations of all else.
-    """
-    gradient = _reduced_gradient(normal_equations(problem, state, linear))
+    everything = normal_equations(problem, state, linear)
+    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
+    rank_of_elements = _ranks(everything.V)
     for b in range(int(block.max(initial=-1)) + 1):
-        rows, squares, n = dict(linear.rows), 0.0, 0
+        rows, squares, dof = dict(linear.rows), 0.0, 0
         for factor in problem.factors:
             if factor.element is None:
                 continue
@@ -435,10 +410,13 @@ def innovations(
             )
             inside = of_factor.squared_norms[is_inside]
             squares += float(inside.sum())
-            n += factor.n_rows * int(np.sum(inside > 0.0))
+            dof += factor.n_rows * int(np.sum(inside > 0.0))
         rest = normal_equations(problem, state, replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
-        yield squares + float(pull @ rest.moved_by(pull[:, None])[:, 0]), n, rest
+        squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
+        dof -= rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
+        blocks.append(LeftOut(squares, dof, rest.reduced()))
+    return blocks
 
 
 def _reduced_gradient(normal: NormalEquations) -> Array:

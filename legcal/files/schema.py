@@ -123,12 +123,7 @@ class FileSchema(BaseModel):
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        allow_inf_nan=False,
-        from_attributes=True,
-        defer_build=True,  # one command writes few of all documents
-    )
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
 
     @classmethod
     def describing(cls, source: object, **others: Any) -> Self:

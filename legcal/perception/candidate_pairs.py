@@ -117,17 +117,10 @@ def _moving(pieces: Array, picture: Grey, still: Still) -> BoolArray:
 
 
 def segments_of_reduced(
-    small: Grey,
-    camera: Camera,
-    factor: int,
-    still: Still | None = None,
-    pieces: Array | None = None,
+    small: Grey, camera: Camera, factor: int, still: Still | None = None
 ) -> EdgeSegments:
-    """Return the straight edges of a reduced picture, but of what stands still.
-
-    Its :func:`pieces_of_edges` may be known.
-    """
-    pieces = pieces_of_edges(small) if pieces is None else pieces
+    """Return the straight edges of a reduced picture, but of what stands still."""
+    pieces = _pieces(small)
     if still is not None and len(pieces):
         moving = _moving(pieces, small, still)
         if np.count_nonzero(moving) >= MIN_MOVING:
@@ -141,7 +134,7 @@ def segments_of_reduced(
     return EdgeSegments(ends * pixel, covered, pixel)
 
 
-def pieces_of_edges(small: Grey) -> Array:
+def _pieces(small: Grey) -> Array:
     """Return pieces of edges (n, 2, 2) in a reduced picture [px], longest first.
 
     Pixels of edges in which the light changes in about the same direction make chains, which are

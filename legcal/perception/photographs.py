@@ -25,12 +25,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine, vectors_at
 from legcal.machine.rods import joints_at, measured_readings
-from legcal.perception.candidate_pairs import (
-    CandidatePairs,
-    Still,
-    pieces_of_edges,
-    still_picture,
-)
+from legcal.perception.candidate_pairs import CandidatePairs, Still, still_picture
 from legcal.perception.diagnostics import (
     find_wrong_images,
     reject_images,
@@ -525,20 +520,20 @@ def _inspect_images(
     groups = group_views(measurements, photographs.detect, hints, joined)
     free = not photographs.machine.is_determined
     first = {r for g in groups for r in (g.rows if g.hint is None or free else g.some)}
-    exposures, small, pieces = dict[int, Exposure](), dict[int, Grey](), dict[int, Array]()
+    exposures, small = dict[int, Exposure](), dict[int, Grey]()
     count = _counted(report, "Looking at images", len(rows))
     look = partial(_inspect, photographs.search(nominal), first)
     powers(np.zeros(1))  # tabulated once, not by each process that is forked
     for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
         exposures[row] = exposure
         if own is not None:
-            small[row], pieces[row] = own
+            small[row] = own
         count(row)
     defects = defects_of(measurements, exposures)
     photographs.still.update(_still_pictures(measurements, small, defects))
     search = photographs.search(nominal)
-    pairs = {
-        row: search.pairs_of_reduced(picture, int(measurements.view[row]), pieces[row])
+    pairs = {  # in this process: pictures take about as long to send
+        row: search.pairs_of_reduced(picture, int(measurements.view[row]))
         for row, picture in small.items()
     }
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
@@ -566,15 +561,11 @@ def defects_of(
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
 
 
-def _inspect(
-    search: Search, rows: Collection[int], row: int
-) -> tuple[Exposure, tuple[Grey, Array] | None]:
-    """Return the exposure of an image; if it is one of rows, the reduced one, and edges in it."""
+def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Grey | None]:
+    """Return the exposure of an image, and the reduced image if it is one of rows."""
     image = search.load(row)
-    if row not in rows:
-        return measure_exposure(image), None
-    small = shrink(image, search.reduction(int(search.measurements.view[row])))
-    return measure_exposure(image), (small, pieces_of_edges(small))
+    factor = search.reduction(int(search.measurements.view[row]))
+    return measure_exposure(image), shrink(image, factor) if row in rows else None
 
 
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:

@@ -109,15 +109,10 @@ class Search:
         ]
         return EdgeMaps.of(small, moving, cameras, factors)
 
-    def pairs_of_reduced(
-        self, small: Grey, view: int, pieces: Array | None = None
-    ) -> CandidatePairs:
-        """Return the edge pairs of a reduced image as if the camera of a view had taken it.
-
-        The pieces of edges in it may be known.
-        """
+    def pairs_of_reduced(self, small: Grey, view: int) -> CandidatePairs:
+        """Return the edge pairs of a reduced image as if the camera of a view had taken it."""
         camera, still = self.measurements.views[view].camera, self.still.get(view)
-        segments = segments_of_reduced(small, camera, self.reduction(view), still, pieces)
+        segments = segments_of_reduced(small, camera, self.reduction(view), still)
         return find_candidate_pairs(segments)
 
     @cached_property

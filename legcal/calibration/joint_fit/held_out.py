@@ -28,7 +28,7 @@ from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.problem import Residuals, linearize
 from legcal.estimation.solver import NormalEquations, information, minimise
-from legcal.estimation.uncertainty import innovations, left_out_blocks, leverage
+from legcal.estimation.uncertainty import left_out_blocks, leverage
 from legcal.geometry.types import Array, IntArray
 
 
@@ -243,8 +243,8 @@ def _squares_near(problem: FitProblem, begin: State, block: IntArray) -> float:
     minimum = minimise(
         problem, begin, max_iterations=_STEPS_TO_NOMINAL, tolerance=_NEARLY, must_converge=False
     )
-    of_blocks = innovations(problem, minimum.state, minimum.linear, block)
-    return sum(squares for squares, *_ in of_blocks)
+    left_out = left_out_blocks(problem, minimum.state, minimum.linear, block)
+    return float(sum(one.squares for one in left_out))
 
 
 def _as_if_true(problem: FitProblem, state: State) -> FitProblem:
