@@ -22,6 +22,7 @@ from legcal.calibration.estimate import (
     GAMMA_RANGE,
     GAMMA_STEP,
     MAX_GAMMA_TRIALS,
+    GammaTrials,
     most_likely,
     next_trial,
 )
@@ -338,6 +339,17 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: MachineSession) -> 
     assert found.quality.rms_px is not None
     assert as_linear.quality.rms_px is not None
     assert found.quality.rms_px < 0.7 * as_linear.quality.rms_px
+
+
+@pytest.mark.parametrize(("log_gamma", "is_tried"), [(0.0, False), (0.5 * GAMMA_STEP, True)])
+def test_a_higher_gamma_is_tried_unless_the_first_fit_excludes_it(
+    session: MachineSession, log_gamma: float, *, is_tried: bool
+) -> None:
+    measurements, outlines = without_gamma(session.measurements), encoded(session, log_gamma)
+    first = refine(session.legs, measurements, outlines, session.start)
+    gammas = GammaTrials.begun(first, {}).next()
+    tried = dict.fromkeys(("c1", "c2", "c3"), np.exp(GAMMA_STEP)) if is_tried else {}
+    assert gammas == pytest.approx(tried)
 
 
 @pytest.mark.parametrize("truth", [-0.3, 0.0, 0.15, 0.4, 0.65, 0.79, 1.05, 1.4])

@@ -12,8 +12,9 @@ and residuals increase. The restricted likelihoods of the fits are compared, eac
 noise and common-mode biases, over the outlines that all fits use; otherwise a gamma that loses
 outlines would look right for the remaining ones. Linear photographs have a gamma of 1, sRGB ones
 about 2.2: trials begin at 1 and go on in steps of :data:`GAMMA_STEP` until the likelihood falls.
-The estimate is the vertex of a parabola through the best three. Where the likelihood is flat, the
-first gamma stays.
+There is none where the first fit, which estimates gamma as well, has it significantly below that of
+the next trial. The estimate is the vertex of a parabola through the best three. Where the
+likelihood is flat, the first gamma stays.
 """
 
 from __future__ import annotations
@@ -473,11 +474,16 @@ class GammaTrials:
 
     @classmethod
     def begun(cls, first: Solution, given: Mapping[str, float]) -> GammaTrials:
-        """Start with the first fit; gammas of views in *given* are fixed by earlier outlines."""
+        """Start with the first fit; gammas of views in *given* are fixed by earlier outlines.
+
+        A gamma stays where the fit itself has it significantly below that of the next trial.
+        """
         unknown = [
             estimate
             for estimate in first.gammas
             if not any(view in given for view in estimate.views)
+            and np.log(estimate.gamma / estimate.measured_with) + SIGNIFICANCE * estimate.sigma
+            > GAMMA_STEP
         ]
         logs = np.log([estimate.measured_with for estimate in unknown])
         return cls(tuple(estimate.views for estimate in unknown), (first,), logs[None])
@@ -502,6 +508,8 @@ class GammaTrials:
 
         Minus infinity where the fit failed.
         """
+        if not self.cameras:
+            return np.zeros(self.log_gamma.shape)
         fitted = [solution for solution in self.solutions if solution is not None]
         log_likelihood = np.full(self.log_gamma.shape, -np.inf)
         is_fitted = np.array([solution is not None for solution in self.solutions])

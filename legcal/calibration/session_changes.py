@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain, combinations, pairwise
 from typing import Literal, NamedTuple, cast
 
@@ -38,6 +39,7 @@ from legcal.estimation.solver import NormalEquations, normal_equations
 from legcal.estimation.uncertainty import (
     LEAST_SEEN,
     Estimated,
+    Projected,
     Scores,
     residual_changes,
     response,
@@ -350,7 +352,7 @@ def _forward_selection(
         if best.p_value * n_tests > DOUBT_BY_CHANCE:
             break
         lacking.append(best)
-        scores = replace(scores, scores=scores.scores.given(best.estimated))
+        scores = _Scores(scores.scores.given(best.estimated), scores.column)
         left = [number.test for number in solved if number.test.place != best.test.place]
         solved = [scores.solved(test) for test in left]
     return lacking, scores
@@ -797,7 +799,7 @@ class _Fit:
                     of_factor[:, :, column[k][blocks]] = (
                         values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
                     )
-        return _Scores(Scores.of(self.problem, self.linear, self.normal, stacked), columns)
+        return _Scores(Projected.of(self.problem, self.linear, self.normal, stacked), columns)
 
     def better(self, least: float, by_scatter: float) -> _Solved | None:
         """Return a joint that moved or an error once a turn that explains more than what was found.
@@ -885,8 +887,13 @@ def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Arr
 class _Scores:
     """Rao's scores of all hypotheses in each block of images."""
 
-    scores: Scores
+    scores: Projected
     column: Sequence[IntArray]  # (d, n_blocks) columns of each hypothesis, -1 without any
+
+    @cached_property
+    def _of_hypotheses(self) -> list[Scores]:
+        """The scores of each hypothesis in all blocks."""
+        return [self.scores.at(column[column >= 0]) for column in self.column]
 
     def of_single(
         self, group: Sequence[tuple[int, int]], sigma: Sequence[Array]
@@ -899,12 +906,11 @@ class _Scores:
         """Return the scores where numbers scatter as much as they were found to."""
         columns, sigma = self.of_single(noise.group, noise.sigma)
         scores = self.scores
-        toward = scores.information[:, columns]
+        toward = scores.information(slice(None), columns)
         precision = np.diag((noise.further * sigma) ** -2.0) + toward[columns]
-        by_noise = np.linalg.solve(precision, toward.T)
-        score = scores.score - scores.score[columns] @ by_noise
-        information = scores.information - toward @ by_noise
-        return replace(self, scores=replace(scores, score=score, information=information))
+        by_noise = np.asarray(np.linalg.solve(precision, toward.T).T, dtype=np.float64)
+        scores = scores.less(by_noise, toward, by_noise @ scores.score[columns])
+        return _Scores(scores, self.column)
 
     def solved(self, test: _Test) -> _Solved:
         """Estimate the number of a test."""
@@ -912,7 +918,7 @@ class _Scores:
         used = column >= 0
         number, block = np.nonzero(used)
         chosen = (number[:, None] == np.arange(len(column))) & test.holds[block][:, None]
-        of_blocks = self.scores.at(column[used])
+        of_blocks = self._of_hypotheses[test.place]
         found = of_blocks.estimate(np.arange(len(number)), chosen.astype(np.float64))
         left = of_blocks.given(found)
         variance = np.diagonal(left.information)
@@ -978,10 +984,10 @@ def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | N
         _Scatter.of(kind, subject, group, hypotheses, scores, len(groups))
         for kind, subject, group in groups
     ]
-    best = max(tests, key=lambda test: test.gain, default=None)
-    if best is None or best.p_value > DOUBT_BY_CHANCE or best.ratio < MOST_SCATTER:
+    if all(test.p_value > DOUBT_BY_CHANCE for test in tests):
         return None
-    return best
+    best = max(tests, key=lambda test: test.gain)
+    return None if best.p_value > DOUBT_BY_CHANCE or best.ratio < MOST_SCATTER else best
 
 
 @dataclass(frozen=True, eq=False)
@@ -997,11 +1003,40 @@ class _Scatter:
     subject: str
     group: Sequence[tuple[int, int]]  # hypotheses and their numbers that scatter alike
     p_value: float  # times the number of tests
-    gain: float  # of the logarithm of the likelihood
-    further: float  # standard deviation beside the stated one, over that
-    spread: float  # standard deviation of the logarithm of its square
     sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block [m, rad or 1]
     stated: float  # of a reading, in the median of motors, or of a camera that stands still
+    eigenvalues: Array  # (c,) of K
+    squares: Array  # (c,) of z along the eigenvectors
+
+    @cached_property
+    def _likeliest(self) -> tuple[float, float]:
+        """Logarithm of the likeliest further variance over the stated one, and its likelihood's."""
+        from scipy.optimize import minimize_scalar  # only where something scatters
+
+        own = np.where(self.eigenvalues > 0.0, self.eigenvalues, 1.0)
+
+        def loss(logarithm: float) -> float:
+            more = math.exp(logarithm) * self.eigenvalues
+            return 0.5 * float(np.sum(np.log1p(more) - self.squares / own * more / (1.0 + more)))
+
+        found = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
+        return float(found.x), -float(found.fun)
+
+    @property
+    def gain(self) -> float:
+        """Gain of the logarithm of the likelihood by the further variance."""
+        return self._likeliest[1]
+
+    @property
+    def further(self) -> float:
+        """Standard deviation beside the stated one, over that."""
+        return math.exp(0.5 * self._likeliest[0])
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the logarithm of the further variance."""
+        more = self.further**2 * self.eigenvalues
+        return math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
 
     @property
     def ratio(self) -> float:
@@ -1033,32 +1068,11 @@ class _Scatter:
             sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
         columns, sigma = scores.of_single(group, sigmas)
         z = sigma * scores.scores.score[columns]
-        K = sigma[:, None] * scores.scores.information[np.ix_(columns, columns)] * sigma
+        K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
         own, vector = np.linalg.eigh(K)
         own, squares = np.maximum(own, 0.0), (vector.T @ z) ** 2
         # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
         total = max(float(own.sum()), np.finfo(np.float64).tiny)
         dof = total**2 / max(float(own @ own), np.finfo(np.float64).tiny)
         p_value = min(n_tests * float(chdtrc(dof, float(squares.sum()) * dof / total)), 1.0)
-
-        def loss(logarithm: float) -> float:
-            more = math.exp(logarithm) * own
-            return 0.5 * float(np.sum(np.log1p(more) - squares / own_or_one * more / (1.0 + more)))
-
-        own_or_one = np.where(own > 0.0, own, 1.0)
-        from scipy.optimize import minimize_scalar  # only where something scatters
-
-        likeliest = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
-        more = math.exp(likeliest.x) * own
-        spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
-        return cls(
-            kind,
-            subject,
-            group,
-            p_value,
-            -float(likeliest.fun),
-            math.exp(0.5 * likeliest.x),
-            spread,
-            sigmas,
-            float(np.median(stated)),
-        )
+        return cls(kind, subject, group, p_value, sigmas, float(np.median(stated)), own, squares)

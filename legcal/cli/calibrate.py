@@ -17,6 +17,7 @@ from legcal.cli.options import (
     WorkersOption,
     command_line,
     image_workers,
+    importing,
     show,
     write_page,
 )
@@ -184,12 +185,13 @@ def calibrate(
             "--truth cannot be combined with --no-report, because only the page compares the "
             "result with it; leave one of them out."
         )
-    from legcal.calibration import pipeline
-    from legcal.calibration.result_folder import REPORT_NAME
-    from legcal.data.dataset_file import overrides_of_settings
-    from legcal.pages.document import PAGE
-    from legcal.report import calibration
-    from legcal.report.calibration_page import write_report
+    with importing():
+        from legcal.calibration import pipeline
+        from legcal.calibration.result_folder import REPORT_NAME
+        from legcal.data.dataset_file import overrides_of_settings
+        from legcal.pages.document import PAGE
+        from legcal.report import calibration
+        from legcal.report.calibration_page import write_report
 
     arguments: dict[str, Any] = {
         "criteria": criteria,

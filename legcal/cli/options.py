@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shlex
@@ -143,6 +144,19 @@ class PageOfResult:
         """Print the error on stderr, if there was one."""
         if self.failure and sys.stderr is not None:
             sys.stderr.write(f"legcal: {printable(self.failure)}\n")
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Look for no garbage among what imported modules make, now or later: it lives to the end."""
+    n_modules = len(sys.modules)
+    gc.disable()
+    try:
+        yield
+    finally:
+        if len(sys.modules) > n_modules:
+            gc.freeze()
+        gc.enable()
 
 
 def command_line() -> str:

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import null_space
+from scipy.sparse import csc_array, vstack
 
 from legcal.estimation.problem import (
     EstimationProblem,
     Linearization,
     Residuals,
     S,
-    Sparsity,
     linearize,
 )
 from legcal.estimation.solver import (
@@ -183,12 +183,7 @@ def response(
 
     *changes* has (n, q, c) for factors by name.
     """
-    n_changes = next(iter(changes.values())).shape[-1]
-    gradient = np.zeros((problem.n_kept + 1, n_changes))
-    elements = np.zeros((problem.n_elements, problem.d_element, n_changes))
-    for name, change in changes.items():
-        sparsity, rows = problem.sparsity[name], linear[name]
-        _add_products(sparsity, rows, change, gradient, elements)
+    gradient, elements, _ = _gradients(problem, linear, changes)
     kept = gradient[:-1]
     if normal.tangent is not None:
         kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, elements, optimize=True)
@@ -197,17 +192,37 @@ def response(
     return -normal.moved_by(kept)
 
 
-def _add_products(
-    sparsity: Sparsity, rows: Residuals, columns: Array, kept: Array, elements: Array
-) -> None:
-    """Add J^T times columns (n, q, c) of a factor to *kept* (n_kept + 1, c) and *elements*."""
-    c = columns.shape[-1]
-    for rows_of_group, unknowns in sparsity.members:
-        J = rows.J[rows_of_group]
-        flat = J.reshape(J.shape[0] * J.shape[1], J.shape[2])  # reshape(-1) fails without columns
-        np.add.at(kept, unknowns, flat.T @ columns[rows_of_group].reshape(-1, c))
-    if sparsity.element is not None:
-        np.add.at(elements, sparsity.element, np.swapaxes(rows.J_element, 1, 2) @ columns)
+def _gradients(
+    problem: EstimationProblem[S], linear: Linearization, columns: Mapping[str, Array]
+) -> tuple[Array, Array, csc_array]:
+    """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
+
+    For kept unknowns and fixed ones (n_kept + 1, c), and for elements (n_elements, d, c). Columns
+    are sparse: there may be thousands, each of which acts on few measurements.
+    """
+    c = next(iter(columns.values())).shape[-1]
+    kept = np.zeros((problem.n_kept + 1, c))
+    elements = np.zeros((problem.n_elements * problem.d_element, c))
+    stacked = []
+    for name, of_factor in columns.items():
+        sparsity, rows = problem.sparsity[name], linear[name]
+        n, q = rows.r.shape
+        flat = csc_array(of_factor.reshape(n * q, c))
+        stacked.append(flat)
+        number = np.arange(n * q).reshape(n, q)
+        for rows_of_group, unknowns in sparsity.members:
+            J, own = rows.J[rows_of_group], number[rows_of_group].ravel()
+            products = np.asarray(flat[own].T @ J.reshape(len(own), J.shape[2]))
+            np.add.at(kept, unknowns, products.T)
+        if sparsity.element is not None:
+            d = problem.d_element
+            unknown, measured = np.broadcast_arrays(
+                sparsity.element[:, None, None] * d + np.arange(d), number[..., None]
+            )
+            place = unknown.ravel(), measured.ravel()
+            by = csc_array((rows.J_element.ravel(), place), (len(elements), n * q))
+            elements += (by @ flat).toarray()
+    return kept, elements.reshape(problem.n_elements, problem.d_element, c), vstack(stacked, "csc")
 
 
 def restricted_log_likelihood(problem: EstimationProblem[S], minimum: Minimum[S]) -> float:
@@ -240,43 +255,70 @@ def score_test(
     M is the projector onto the residuals of the fit. *columns* has whitened columns (n, q, c) of
     factors by name; *normal* is of plain squares.
     """
-    c = next(iter(columns.values())).shape[-1]
-    kept_products, score, projected = (
-        np.zeros((problem.n_kept + 1, c)),
-        np.zeros(c),
-        np.zeros((c, c)),
-    )
-    element_products = np.zeros((problem.n_elements, problem.d_element, c))
-    for name, of_factor in columns.items():
-        acting = np.flatnonzero(of_factor.any(axis=(0, 1)))
-        if not len(acting):
-            continue
-        v = of_factor[..., acting]
-        kept, elements = kept_products[:, acting], element_products[..., acting]
-        _add_products(problem.sparsity[name], linear[name], v, kept, elements)
-        kept_products[:, acting], element_products[..., acting] = kept, elements
-        flat = v.reshape(-1, len(acting))
-        score[acting] += flat.T @ linear[name].r.ravel()
-        projected[np.ix_(acting, acting)] += flat.T @ flat
-    following = _element_derivatives(normal).reshape(-1, problem.n_kept)
-    kept = kept_products[:-1] + following.T @ element_products.reshape(-1, c)
-    by_element = element_products
-    if normal.tangent is not None:
-        by_element = np.swapaxes(normal.tangent.Z, 1, 2) @ element_products
-    element_response = normal.V_inverse @ by_element
-    g_kept = _reduced_gradient(normal)
-    kept_response = normal.moved_by(kept)
-    score = (
-        score
-        - kept_response.T @ g_kept
-        - element_response.reshape(-1, c).T @ normal.g_elements.ravel()
-    )
-    projected = (
-        projected
-        - kept_response.T @ kept
-        - element_response.reshape(-1, c).T @ by_element.reshape(-1, c)
-    )
-    return score, projected
+    of = Projected.of(problem, linear, normal, columns)
+    return of.score, of.information(slice(None), slice(None))
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Whitened columns less what the fit absorbs of them, with their scores (:func:`score_test`).
+
+    The information of two of them is the product of the columns less that of the responses of all
+    unknowns to one and their gradients by the other: there may be thousands.
+    """
+
+    score: Array  # (c,)
+    columns: Any  # sparse, (n, c), of the measurements of all factors
+    response: Array  # (k, c)
+    gradient: Array  # (k, c)
+
+    @classmethod
+    def of(
+        cls,
+        problem: EstimationProblem[S],
+        linear: Linearization,
+        normal: NormalEquations,
+        columns: Mapping[str, Array],
+    ) -> Projected:
+        """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
+        kept, elements, stacked = _gradients(problem, linear, columns)
+        c = stacked.shape[1]
+        following = _element_derivatives(normal).reshape(-1, problem.n_kept)
+        kept = kept[:-1] + following.T @ elements.reshape(-1, c)
+        if normal.tangent is not None:
+            elements = np.swapaxes(normal.tangent.Z, 1, 2) @ elements
+        moved = normal.V_inverse @ elements
+        gradient = np.concatenate([kept, elements.reshape(-1, c)])
+        response = np.concatenate([normal.moved_by(kept), moved.reshape(-1, c)])
+        residual = np.concatenate([linear[name].r.ravel() for name in columns])
+        of_fit = np.concatenate([_reduced_gradient(normal), normal.g_elements.ravel()])
+        score = stacked.T @ residual - response.T @ of_fit
+        return cls(np.asarray(score), stacked, response, gradient)
+
+    def information(self, of: IntArray | slice, by: IntArray | slice) -> Array:
+        """Return v^T M v of some columns by others."""
+        products = (self.columns[:, of].T @ self.columns[:, by]).toarray()
+        return np.asarray(products - self.response[:, of].T @ self.gradient[:, by])
+
+    def at(self, columns: IntArray) -> Scores:
+        """Return the scores of some columns."""
+        own = self.columns[:, columns]
+        size = np.asarray(own.multiply(own).sum(axis=0))
+        return Scores(self.score[columns], self.information(columns, columns), size)
+
+    def given(self, numbers: Estimated) -> Projected:
+        """Return the columns less what a fit that has these numbers as well absorbs."""
+        toward = self.information(slice(None), numbers.columns) @ numbers.chosen
+        return self.less(toward @ numbers.covariance, toward, toward @ numbers.amount)
+
+    def less(self, response: Array, gradient: Array, score: Array) -> Projected:
+        """Return the columns less responses (c, k) to further unknowns, with these gradients."""
+        return replace(
+            self,
+            score=self.score - score,
+            response=np.concatenate([self.response, response.T]),
+            gradient=np.concatenate([self.gradient, gradient.T]),
+        )
 
 
 class Estimated(NamedTuple):
@@ -306,23 +348,6 @@ class Scores:
     score: Array  # (c,)
     information: Array  # (c, c)
     size: Array  # (c,) squares of the columns before the fit absorbs its part
-
-    @classmethod
-    def of(
-        cls,
-        problem: EstimationProblem[S],
-        linear: Linearization,
-        normal: NormalEquations,
-        columns: Mapping[str, Array],
-    ) -> Scores:
-        """Compute the scores of *columns*, as in :func:`score_test`."""
-        size = sum(np.einsum("nqc,nqc->c", v, v) for v in columns.values())
-        return cls(*score_test(problem, linear, normal, columns), np.asarray(size))
-
-    def at(self, columns: IntArray) -> Scores:
-        """Return the scores of some columns alone."""
-        information = self.information[np.ix_(columns, columns)]
-        return Scores(self.score[columns], information, self.size[columns])
 
     def estimate(self, columns: IntArray, chosen: Array | None = None) -> Estimated:
         """Estimate numbers together: one for each column, or *chosen* (c, d) sums of columns."""

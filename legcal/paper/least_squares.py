@@ -225,7 +225,7 @@ def evaluated(function: ca.Function, local: Array, *observed: Array) -> Array:
     """Return the residuals (n, r) of a function of a term, of local unknowns (n, n_local)."""
     n, none = len(local), np.zeros((len(local), function.size1_in(1)))
     arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    return np.asarray(function.map(n)(*arguments).full()).T if n else _nothing(function)
+    return np.asarray(_mapped(function, n)(*arguments).full()).T if n else _nothing(function)
 
 
 def derivatives(function: ca.Function, input_index: int, local: Array, *observed: Array) -> Array:
@@ -233,7 +233,7 @@ def derivatives(function: ca.Function, input_index: int, local: Array, *observed
     n, none = len(local), np.zeros((len(local), function.size1_in(1)))
     r, k = function.size1_out(0), function.size1_in(input_index)
     arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    derivative = _derivative(function, input_index).map(n)(*arguments).full()
+    derivative = _mapped(_derivative(function, input_index), n)(*arguments).full()
     return np.asarray(derivative.reshape(r, n, k).swapaxes(0, 1))
 
 
@@ -263,6 +263,12 @@ def adjusted(
 
 def _nothing(function: ca.Function) -> Array:
     return np.zeros((0, function.size1_out(0)))
+
+
+@lru_cache(maxsize=64)
+def _mapped(function: ca.Function, n: int) -> ca.Function:
+    """Return a function of n observations side by side."""
+    return function.map(n)
 
 
 def _side_by_side(values: Array) -> Array:

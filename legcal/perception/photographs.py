@@ -32,6 +32,7 @@ from legcal.perception.diagnostics import (
 )
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
+from legcal.perception.limb import powers
 from legcal.perception.outline import Method, measure, measure_in_brief, measure_outlines
 from legcal.perception.placement import (
     Joined,
@@ -522,6 +523,7 @@ def _inspect_images(
     exposures, small = dict[int, Exposure](), dict[int, Grey]()
     count = _counted(report, "Looking at images", len(rows))
     look = partial(_inspect, photographs.search(nominal), first)
+    powers(np.zeros(1))  # tabulated once, not by each process that is forked
     for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
         exposures[row] = exposure
         if own is not None:
@@ -529,9 +531,11 @@ def _inspect_images(
         count(row)
     defects = defects_of(measurements, exposures)
     photographs.still.update(_still_pictures(measurements, small, defects))
-    pairs_of = photographs.search(nominal).pairs_of_reduced
-    seen_by = [(picture, int(measurements.view[row])) for row, picture in small.items()]
-    pairs = dict(zip(small, photographs.run(pairs_of, seen_by), strict=True))
+    search = photographs.search(nominal)
+    pairs = {  # in this process: pictures take about as long to send
+        row: search.pairs_of_reduced(picture, int(measurements.view[row]))
+        for row, picture in small.items()
+    }
     return defects, pairs, {row: exposure.blur for row, exposure in exposures.items()}
 
 

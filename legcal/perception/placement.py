@@ -90,7 +90,7 @@ class Search:
         view = own if view is None else view
         if view == own and row in self.edge_pairs:
             return self.edge_pairs[row]
-        return self.pairs_of_reduced((shrink(self.load(row), self.reduction(view)), view))
+        return self.pairs_of_reduced(shrink(self.load(row), self.reduction(view)), view)
 
     def reduction(self, view: int) -> int:
         """Return the factor by which the pictures of a view are reduced."""
@@ -109,9 +109,8 @@ class Search:
         ]
         return EdgeMaps.of(small, moving, cameras, factors)
 
-    def pairs_of_reduced(self, seen_by: tuple[Grey, int]) -> CandidatePairs:
+    def pairs_of_reduced(self, small: Grey, view: int) -> CandidatePairs:
         """Return the edge pairs of a reduced image as if the camera of a view had taken it."""
-        small, view = seen_by
         camera, still = self.measurements.views[view].camera, self.still.get(view)
         segments = segments_of_reduced(small, camera, self.reduction(view), still)
         return find_candidate_pairs(segments)

@@ -103,7 +103,8 @@ def place_views(
     T, unplaced = dict(enumerate(hints)), dict[str, NotPlaced]()
     shift = np.zeros((len(T), n_legs, 2, 3))
     error: Array = np.full((len(T), n_legs), search.joint_error)
-    for group, (one, swapped) in zip(groups, run(partial(_placed, search), tasks), strict=True):
+    place = run if unclear else in_turn
+    for group, (one, swapped) in zip(groups, place(partial(_placed, search), tasks), strict=True):
         if swapped or not one.is_convincing:
             cause = _why_not_placed(one, group.hint is not None, is_mirrored=swapped)
             unplaced |= group.not_placed(search.measurements, cause)
@@ -197,6 +198,7 @@ def _pictures(
 ) -> dict[int, Picture]:
     """Return edge pairs and predicted legs of the images of rows."""
     pictures = {}
+    run = run if any(row not in search.edge_pairs for row in rows) else in_turn
     for row, picture in zip(rows, run(search.picture, rows), strict=True):
         pictures[row] = picture
         if progress is not None:

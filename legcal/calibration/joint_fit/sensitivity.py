@@ -19,7 +19,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State, intrinsic_of
 from legcal.estimation.problem import Linearization
 from legcal.estimation.solver import NormalEquations, normal_equations
-from legcal.estimation.uncertainty import Scores, response, size_left
+from legcal.estimation.uncertainty import Projected, Scores, response, size_left
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import ParameterId
 from legcal.vision.camera import shared_cameras
@@ -353,4 +353,5 @@ class CameraResiduals:
             name: np.stack([change[name] for change in changes], axis=-1)
             for name in self.derivatives
         }
-        return Scores.of(self.problem, self.linear, self._plain, columns)
+        projected = Projected.of(self.problem, self.linear, self._plain, columns)
+        return projected.at(np.arange(len(errors)))
