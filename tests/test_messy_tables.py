@@ -109,6 +109,12 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
     "typeset minus, inch of a diameter sign": (
         wide("Bein;" + SIX.format("Boden", "Plattform") + ";Durchmesser", "Ø 20 mm", leg="{}")
         .replace("-", "−"), (10, 10)),
+    "thousands": (
+        wide("Bein;" + SIX.format("Boden", "Plattform").replace("mm", "um")
+             + ";min. Länge (mm);max. Länge (um);Durchmesser (um)", "380", "500\u202f000.0",
+             "?", leg="{}", size=1e3)
+        .replace("289800", "289'800").replace("-77600", "−77,6e3").replace("77600", "77.600")
+        .replace("?", "20.000,0"), (10, 10)),
     "bars": (
         "\n".join(
             f"| {' | '.join(row.split(';'))} |".replace(",", ".")

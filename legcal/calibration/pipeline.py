@@ -158,8 +158,8 @@ def calibrate(
         Leave these images out of the fit: ``p22``, ``p22..p45`` in the order in which they were
         taken, ``c2`` for a view, ``c2:p22`` where several views have that name; by commas.
     split : sequence of str
-        ``MOTOR@IMAGES``: the encoder of that motor had another zero in these images than in the
-        others, whose zero the model has.
+        ``MOTOR@IMAGES``: the encoder of that motor, or of ``all``, had another zero in these images
+        than in the others, whose zero the model has.
     overlays : bool
         Draw the outlines over every photograph, into ``overlays`` of the result folder.
     only : {"zeros", "lengths", "all"}, optional

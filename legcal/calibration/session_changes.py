@@ -142,13 +142,18 @@ class Finding:
         """What was found, as a clause."""
         between = "" if self.between is None else f" between {' and '.join(self.between)}"
         sense = _BY_SIGN.get(self.kind, ("", ""))[int(self.amount < 0.0)]
-        what = _WORDS[self.kind][0].format(subject=self.subject, size=self.size, sense=sense)
+        what = self._words[0].format(subject=self.subject, size=self.size, sense=sense)
         return f"{what}{between}"
 
     @property
     def remedy(self) -> str:
         """What to do, as a clause."""
-        return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
+        return self._words[1].format(subject=self.subject, images=self.images)
+
+    @property
+    def _words(self) -> tuple[str, str]:
+        is_of_all = self.kind == "encoder" and self.subject == ALL_MOTORS
+        return _HOMED if is_of_all else _WORDS[self.kind]
 
 
 _WITHOUT_ORDER: tuple[str, ...] = ("gain", "pitch", "eccentricity", "camera_file")
@@ -160,6 +165,11 @@ _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative 
 _WITHOUT_SIGN: tuple[Kind, ...] = (
     "camera", "backlash", "eccentricity", "joint", "autofocus", "vibration", *_BY_SIGN
 )  # fmt: skip
+_HOMED = (  # in place of the words for one encoder
+    "{subject} were homed anew: the zeros of their encoders changed, one by {size}",
+    "home the machine once before all photographs, and calibrate with zeros of their own before "
+    "that (--split all@{images}), or without the images on one side of it (--leave-out)",
+)
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
@@ -316,7 +326,7 @@ def _tests(
     least = math.sqrt(chdtri(1.0, DOUBT_BY_CHANCE / max(len(tests), 1)))
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
     for number in solved:
-        if number.test.of.kind == "encoder" and number.rank:
+        if number.test.of.kind == "encoder" and number.rank and len(number.amount) == 1:
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(number.test.of.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, solved, len(tests))
@@ -346,7 +356,7 @@ def _forward_selection(
     """Return the numbers that the fit lacks, the most certain first, and the scores given them."""
     lacking = list[_Solved]()
     while solved and sum(one.test.of.kind != "camera_file" for one in lacking) < MAX_FINDINGS:
-        best = min(solved, key=lambda number: (number.p_value, -number.square))
+        best = min(solved, key=lambda number: (number.p_value, -number.explains))
         if best.p_value * n_tests > DOUBT_BY_CHANCE:
             break
         lacking.append(best)
@@ -435,10 +445,15 @@ def _left_out(problem: FitProblem) -> BoolArray:
 def _size(number: _Solved) -> tuple[str, float, float]:
     """Return the unit, the amount and its standard deviation.
 
-    Of a camera, which moves by a rotation vector and a displacement: those of the surer one.
+    Of a camera, which moves by a rotation vector and a displacement: those of the surer one. Of
+    all encoders those of the surest one.
     """
     hypothesis, amount, covariance = number.test.of, number.amount, number.covariance
     parts = {"rad": slice(0, 3), "m": slice(3, 6)}
+    if hypothesis.kind == "encoder":
+        sigma = np.sqrt(np.diagonal(covariance))
+        surest = int(np.argmax(np.abs(amount) / np.maximum(sigma, 1e-300)))
+        return hypothesis.unit, float(amount[surest]), float(sigma[surest])
     if hypothesis.kind != "camera":
         if len(amount) == 1 or hypothesis.kind == "drift":
             return hypothesis.unit, float(amount[0]), float(np.sqrt(covariance[0, 0]))
@@ -654,7 +669,7 @@ class _Fit:
 
     def of_motors(self) -> Iterator[_Hypothesis]:
         """Yield what may be wrong with the readings of motors."""
-        problem, course = self.problem, self.course
+        problem, course, legs = self.problem, self.course, self.problem.legs.nominal
         readings, reading = problem.readings, problem.readings.reading
         row = course.row_of_pose[readings.pose]
         whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
@@ -666,8 +681,12 @@ class _Fit:
             columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
             return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
 
-        for j in np.unique(readings.leg).tolist():
-            leg, of_motor = problem.legs.nominal[j], (readings.leg == j)[:, None]
+        motors = np.unique(readings.leg)
+        if len(motors) > 1 and len(units := {legs[j].reading_unit for j in motors.tolist()}) == 1:
+            of_each = np.equal(readings.leg[:, None], motors)
+            yield wrong_by("encoder", ALL_MOTORS, units.pop(), 1.0 * of_each)
+        for j in motors.tolist():
+            leg, of_motor = legs[j], (readings.leg == j)[:, None]
             unit, subject = leg.reading_unit, leg.motor_label
             yield wrong_by("encoder", subject, unit, 1.0 * of_motor)
             yield wrong_by("drift", subject, unit, of_motor * course.drift(row))
@@ -960,7 +979,9 @@ class _Solved(NamedTuple):
 
 def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
     """Return what scatters from image to image: readings beyond what is stated, or a camera."""
-    encoders = [i for i, h in enumerate(hypotheses) if h.kind == "encoder"]
+    encoders = [
+        i for i, h in enumerate(hypotheses) if h.kind == "encoder" and h.subject != ALL_MOTORS
+    ]
     groups: list[tuple[Kind, str, list[tuple[int, int]]]] = [
         ("reading_noise", hypotheses[i].subject, [(i, 0)]) for i in encoders
     ]

@@ -43,10 +43,18 @@ _MAX_NAMED = 10  # maximum number of columns named in a sentence
 _TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # Windows-1252, without rare characters
 _COMMENTS = re.compile(r"\A(?:\s*#[^\n]*\n)+")  # above the headings
 _UNITS_BELOW = (*LENGTH, *ANGLE, "us", "s")  # units of a row below the headings
-_WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)\s*({'|'.join(_UNITS_BELOW)})", re.ASCII)
+_BLANK = "\u00a0\u2009\u202f"  # that does not break a line, or is thin
+_WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)[\s{_BLANK}]*({'|'.join(_UNITS_BELOW)})", re.ASCII)
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
+# Thousands: beside blanks and apostrophes also commas before a point, and points before a comma
+_GROUPED = re.compile(
+    rf"([-+−–]?\d{{1,3}})((?:[{_BLANK}'’]\d{{3}})+|(?:,\d{{3}})+(?=\.)|(?:\.\d{{3}})+(?=,))"
+    r"([.,]\d+)?\D*"
+)
+_WITH_POINT = re.compile(r"[-+]?\d*(\.\d*)+", re.ASCII)
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
 _RULE = re.compile(r"[:-]*-{3}[:-]*")
 _MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–+-]?)([.,]?\d[^\"″']*)([\"″]?)")
 _BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
@@ -519,9 +527,9 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
             cells = [cell.strip() for cell in cells]
             if loose:
                 cells = [_number_of_people(cell) for cell in cells]
-            if delimiter != ",":
-                cells = [_with_point(cell) for cell in cells]
             lines.append((reader.line_num, cells))
+        if delimiter != ",":
+            lines = _with_points(lines)
     except (UnicodeDecodeError, csv.Error) as error:
         actual = (
             f"the byte 0x{error.object[error.start]:02x} at place {error.start}, which is no text"
@@ -686,7 +694,12 @@ def _has_decimal_commas(line: str) -> bool:
 
 
 def _number_of_people(cell: str) -> str:
-    """Return a number as computers write it: minus, diameter and inch marks; others unchanged."""
+    """Return a number as computers write it: minus, diameter and inch marks, without thousands.
+
+    Other cells are unchanged.
+    """
+    if grouped := _GROUPED.fullmatch(cell):
+        cell = cell.replace(grouped[2], re.sub(r"\D", "", grouped[2]), 1)
     match = _MARKED.fullmatch(cell)
     if match is None:
         return cell
@@ -694,6 +707,18 @@ def _number_of_people(cell: str) -> str:
     return f"{sign}{match[2].replace('−', '-')}{' in' * bool(match[3])}"
 
 
-def _with_point(cell: str) -> str:
-    """Return a cell, its decimal comma as a point if it is a number, or one with a unit."""
-    return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell
+def _with_points(lines: Lines) -> Lines:
+    """Return lines with points for decimal commas, also of numbers with a unit.
+
+    In a column with decimal commas, points are between thousands if all of them can be.
+    """
+    columns = zip_longest(*(cells for _, cells in lines), fillvalue="")
+    changed = list[list[str]]()
+    for column in columns:
+        has_commas = any(map(_COMMA.fullmatch, column))
+        pointed = [cell for cell in column if _WITH_POINT.fullmatch(cell)]
+        if has_commas and all(map(_THOUSANDS.fullmatch, pointed)):
+            column = [cell.replace(".", "") if cell in pointed else cell for cell in column]
+        changed.append([x.replace(",", ".") if _COMMA.fullmatch(x) else x for x in column])
+    rows = zip(lines, zip(*changed, strict=True), strict=True)
+    return [(number, list(row[: len(cells)])) for (number, cells), row in rows]
