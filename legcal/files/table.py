@@ -712,9 +712,9 @@ def _with_points(lines: Lines) -> Lines:
 
     In a column with decimal commas, points are between thousands if all of them can be.
     """
-    columns = zip_longest(*(cells for _, cells in lines), fillvalue="")
     changed = list[list[str]]()
-    for column in columns:
+    for cells_of in zip_longest(*(cells for _, cells in lines), fillvalue=""):
+        column = list(cells_of)
         has_commas = any(map(_COMMA.fullmatch, column))
         pointed = [cell for cell in column if _WITH_POINT.fullmatch(cell)]
         if has_commas and all(map(_THOUSANDS.fullmatch, pointed)):
