@@ -194,6 +194,24 @@ def test_encoders_that_were_homed_anew_accuse_no_joint_and_get_zeros_of_their_ow
     )
 
 
+@pytest.mark.parametrize("times", [1.0, 30.0])
+def test_an_encoder_sigma_far_above_what_readings_scatter_is_noted(
+    healthy: Dataset, unordered: Calibration, times: float
+) -> None:
+    m = healthy.measurements
+    notes = unordered.notes
+    if times > 1.0:
+        notes = calibrate(
+            replace(healthy, measurements=replace(m, sigma_q=times * m.sigma_q))
+        ).notes
+    said = [note for note in notes if note.startswith("Readings scatter by about")]
+    assert len(said) == (times > 1.0)
+    for note in said:
+        found, stated = map(float, re.findall(r"([\d.]+) mm", note))
+        assert stated == pytest.approx(1e3 * times * m.sigma_q)
+        assert 0.5 < 1e-3 * found / m.sigma_q < 2.0
+
+
 def _exchanged(dataset: Dataset) -> Dataset:
     """Exchange two photographs of the first view."""
     outlines = dataset.observations

@@ -59,6 +59,8 @@ _LEADS = (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32, 40)  # of
 _COARSE = 15  # groups of images whose scores say how much those of errors once a turn scatter
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
+_LESS = np.geomspace(1e-3, 0.2, 24)  # of the stated standard deviation of readings
+_SURELY_LESS = 10.0  # of the logarithm of the likelihood
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
 MOST_REJECTED, FEW = 0.5, 0.1  # outlines of an image that is not left out; of images that are
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
@@ -268,12 +270,15 @@ class SessionTests:
     least_slips : dict
         The least changes of encoders that would show half of the time, by motor [m or rad];
         motors of which no change can be seen are not in it.
+    overstated : dict
+        By unit how much readings scatter and what is stated, where that is five times as much.
     periods : dict
         The outlines of the fit (n,) in each quarter of the images in order, by its images.
     """
 
     findings: tuple[Finding, ...] = ()
     least_slips: Mapping[str, float] = field(default_factory=dict)
+    overstated: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     periods: Mapping[str, BoolArray] = field(default_factory=dict)
 
 
@@ -330,7 +335,7 @@ def _tests(
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(number.test.of.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, solved, len(tests))
-    noise = _scatter(hypotheses, left)
+    noise, overstated = _scatter(hypotheses, left), _overstated(hypotheses, left)
     if lacking or noise:
         least = max((number.explains for number in lacking), default=0.0)
         by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
@@ -347,7 +352,7 @@ def _tests(
         findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
     periods = fit.course.periods(fit.problem.outlines) if has_order else {}
-    return SessionTests(tuple(findings), least_slips, periods)
+    return SessionTests(tuple(findings), least_slips, overstated, periods)
 
 
 def _forward_selection(
@@ -1040,23 +1045,7 @@ class _Scatter:
         n_tests: int,
     ) -> _Scatter:
         """Test what scatters."""
-        sigmas, stated = list[Array](), list[float]()
-        for i, row in group:
-            hypothesis = hypotheses[i]
-            if steady := _STEADY.get(hypothesis.kind):
-                stated.append(steady)
-                sigmas.append(np.full(scores.column[i].shape[1], steady))
-                continue
-            ((name, wrong),) = hypothesis.columns.items()
-            read = wrong[:, 0, row] != 0.0
-            stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
-            n = hypothesis.share[name][read].sum(axis=0)
-            sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
-        columns, sigma = scores.of_single(group, sigmas)
-        z = sigma * scores.scores.score[columns]
-        K = sigma[:, None] * scores.scores.information[np.ix_(columns, columns)] * sigma
-        own, vector = np.linalg.eigh(K)
-        own, squares = np.maximum(own, 0.0), (vector.T @ z) ** 2
+        own, squares, sigmas, stated = _spectrum(group, hypotheses, scores)
         # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
         total = max(float(own.sum()), np.finfo(np.float64).tiny)
         dof = total**2 / max(float(own @ own), np.finfo(np.float64).tiny)
@@ -1064,9 +1053,8 @@ class _Scatter:
 
         def loss(logarithm: float) -> float:
             more = math.exp(logarithm) * own
-            return 0.5 * float(np.sum(np.log1p(more) - squares / own_or_one * more / (1.0 + more)))
+            return _loss(more, own, squares)
 
-        own_or_one = np.where(own > 0.0, own, 1.0)
         from scipy.optimize import minimize_scalar  # only where something scatters
 
         likeliest = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
@@ -1081,5 +1069,56 @@ class _Scatter:
             math.exp(0.5 * likeliest.x),
             spread,
             sigmas,
-            float(np.median(stated)),
+            stated,
         )
+
+
+def _spectrum(
+    group: Sequence[tuple[int, int]], hypotheses: Sequence[_Hypothesis], scores: _Scores
+) -> tuple[Array, Array, list[Array], float]:
+    """Return the eigenvalues of K and the squares of z along its vectors, as of :class:`_Scatter`.
+
+    Also what is stated: of single blocks, and in the median of a reading or a camera.
+    """
+    sigmas, stated = list[Array](), list[float]()
+    for i, row in group:
+        hypothesis = hypotheses[i]
+        if steady := _STEADY.get(hypothesis.kind):
+            stated.append(steady)
+            sigmas.append(np.full(scores.column[i].shape[1], steady))
+            continue
+        ((name, wrong),) = hypothesis.columns.items()
+        read = wrong[:, 0, row] != 0.0
+        stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
+        n = hypothesis.share[name][read].sum(axis=0)
+        sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
+    columns, sigma = scores.of_single(group, sigmas)
+    z = sigma * scores.scores.score[columns]
+    K = sigma[:, None] * scores.scores.information[np.ix_(columns, columns)] * sigma
+    own, vector = np.linalg.eigh(K)
+    return np.maximum(own, 0.0), (vector.T @ z) ** 2, sigmas, float(np.median(stated))
+
+
+def _loss(more: Array, own: Array, squares: Array) -> float:
+    """Return minus the logarithm of the likelihood of a further variance, by *more* = its part."""
+    part = squares / np.where(own > 0.0, own, 1.0)
+    return 0.5 * float(np.sum(np.log1p(more) - part * more / (1.0 + more)))
+
+
+def _overstated(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> dict[str, tuple[float, ...]]:
+    """Return how much readings of a unit scatter, and what is stated, where that is far more."""
+    found = {}
+    for unit in ("m", "rad"):
+        group = [
+            (i, 0)
+            for i, h in enumerate(hypotheses)
+            if h.kind == "encoder" and h.subject != ALL_MOTORS and h.unit == unit
+        ]
+        if not group:
+            continue
+        own, squares, _, stated = _spectrum(group, hypotheses, scores)
+        less = np.square(_LESS) - 1.0  # of the variance
+        loss = [_loss(v * np.minimum(own, 1.0), own, squares) for v in less]
+        if min(loss) < -_SURELY_LESS:
+            found[unit] = float(_LESS[int(np.argmin(loss))]) * stated, stated
+    return found
