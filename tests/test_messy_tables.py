@@ -179,6 +179,13 @@ def test_what_a_person_reads_at_once_is_read(kind: str, tmp_path: Path) -> None:
     check(described(tmp_path / "own.csv", text, radii), radii)
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "cp1252"])
+def test_tables_are_read_as_spreadsheets_save_them(encoding: str, tmp_path: Path) -> None:
+    text, radii = TABLES["German"]
+    (tmp_path / "own.csv").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    check(described(tmp_path / "own.csv", text, radii), radii)
+
+
 def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
     joints: dict[str, list[tuple[float, float]]]

@@ -281,8 +281,10 @@ def read_table(
     semicolons, tabs or bars, with decimal commas, below comments and a title, above a row of units.
     """
     lines = _read_lines(path, noun, loose=reshape is not None)
+    if reshape is not None or (lines and "" in lines[0][1]):  # as spreadsheets leave them
+        lines = _without_empty(lines)
     if reshape is not None:
-        lines = _with_units(_without_title(_one_block(_without_empty(lines))))
+        lines = _with_units(_without_title(_one_block(lines)))
         lines = reshape(lines) if lines else lines
     if needed and len(lines) < 2:
         actual = f"{'a' if lines else 'no'} header and no row"
@@ -662,14 +664,15 @@ def _with_units_of_cells(lines: Lines) -> Lines:
 def _decoded(content: bytes, *, loose: bool) -> str:
     """Return the text of a file in UTF-8.
 
-    If ``loose`` also in UTF-16 with its mark, and as Excel writes it in western Europe, without the
+    If ``loose`` also in UTF-16, and as Excel writes it in western Europe, without the
     line that names its delimiter.
     """
     if not loose:
         return content.decode("utf-8-sig")
     is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    bare = {0: "utf-16-be", 1: "utf-16-le"}.get(content[:2].find(b"\0"))  # without its mark
     try:
-        text = content.decode("utf-16" if is_wide else "utf-8-sig")
+        text = content.decode("utf-16" if is_wide else bare or "utf-8-sig")
     except UnicodeDecodeError:
         if is_wide or not _TEXT.fullmatch(content):
             raise
