@@ -1107,7 +1107,7 @@ def _loss(more: Array, own: Array, squares: Array) -> float:
 
 def _overstated(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> dict[str, tuple[float, ...]]:
     """Return how much readings of a unit scatter, and what is stated, where that is far more."""
-    found = {}
+    found = dict[str, tuple[float, ...]]()
     for unit in ("m", "rad"):
         group = [
             (i, 0)

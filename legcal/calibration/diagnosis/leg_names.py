@@ -53,7 +53,7 @@ def exchanged_legs(
         T_base_camera of each view, where it is known.
     """
     o = along_legs(outlines, legs)
-    o = o.choose(np.isfinite(o.h).all(axis=1))
+    o = o.choose(np.asarray(np.isfinite(o.h).all(axis=1)))
     radius = np.array(
         [legs[j].radius_along[part] for j, part in zip(o.leg.tolist(), o.part, strict=True)]
     )
