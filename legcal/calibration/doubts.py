@@ -412,11 +412,13 @@ class _Evidence:
 
     def cameras(self) -> list[Doubt]:
         """Return cameras that the measurements contradict, with what their files do."""
-        views = list(dict.fromkeys(wrong.view for wrong in self.solution.camera_doubts))
-        if not views:
+        doubts, names = self.solution.camera_doubts, self.problem.outlines.views
+        if not doubts:
             return []
+        wrong_in = np.any([one.error.any(axis=1) for one in doubts], axis=0)  # that share a file
+        views = sorted(names[v] for v in np.flatnonzero(wrong_in).tolist())
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
-        wrong = max(self.solution.camera_doubts, key=lambda one: one.apart)
+        wrong = max(doubts, key=lambda one: one.apart)
         what = (
             f"the measurements contradict the camera of {few_views(views)}, above all its "
             f"{wrong.kind.replace('_', ' ')}: {wrong.found}"

@@ -50,8 +50,8 @@ _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
 # Thousands: beside blanks and apostrophes also commas before a point, and points before a comma
 _GROUPED = re.compile(
-    rf"([-+−–]?\d{{1,3}})((?:[{_BLANK}'’]\d{{3}})+|(?:,\d{{3}})+(?=\.)|(?:\.\d{{3}})+(?=,))"
-    r"([.,]\d+)?\D*"
+    rf"([-+−–]?\d{{1,3}})((?:[{_BLANK}'’]\d{{3}})+|(?:,\d{{3}})+(?=\.)|(?:\.\d{{3}})+(?=,)"
+    r"|(?:\.\d{3}){2,})([.,]\d+)?\D*"
 )
 _WITH_POINT = re.compile(r"[-+]?\d*(\.\d*)+", re.ASCII)
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
@@ -710,10 +710,18 @@ def _number_of_people(cell: str) -> str:
     return f"{sign}{match[2].replace('−', '-')}{' in' * bool(match[3])}"
 
 
+def _range_of_sizes(column: Sequence[str]) -> float:
+    """Return the largest number of a column, written with decimal commas, over the smallest."""
+    sizes = [abs(_number_in(cell.replace(",", "."))) for cell in column]
+    sizes = [size for size in sizes if size > 0.0]
+    return max(sizes, default=1.0) / min(sizes, default=1.0)
+
+
 def _with_points(lines: Lines) -> Lines:
     """Return lines with points for decimal commas, also of numbers with a unit.
 
-    In a column with decimal commas, points are between thousands if all of them can be.
+    In a column with decimal commas, points are between thousands if all of them can be, and its
+    numbers are of more similar size then.
     """
     changed = list[list[str]]()
     for cells_of in zip_longest(*(cells for _, cells in lines), fillvalue=""):
@@ -721,7 +729,8 @@ def _with_points(lines: Lines) -> Lines:
         has_commas = any(map(_COMMA.fullmatch, column))
         pointed = [cell for cell in column if _WITH_POINT.fullmatch(cell)]
         if has_commas and all(map(_THOUSANDS.fullmatch, pointed)):
-            column = [cell.replace(".", "") if cell in pointed else cell for cell in column]
+            joined = [cell.replace(".", "") if cell in pointed else cell for cell in column]
+            column = min(joined, column, key=_range_of_sizes)
         changed.append([x.replace(",", ".") if _COMMA.fullmatch(x) else x for x in column])
     rows = zip(lines, zip(*changed, strict=True), strict=True)
     return [(number, list(row[: len(cells)])) for (number, cells), row in rows]
