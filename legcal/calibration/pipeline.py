@@ -213,12 +213,8 @@ def calibrate(
         identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
     except DatasetError:  # readings out of reach are refused below, with likely mistakes
         identify_notes = ()
-    except NotIdentifiable as error:  # encoders that stand still come first
-        motors, q = legs_with_readings(dataset.machine.legs), dataset.measurements.q
-        still = still_encoders(dataset.table_path, motors, q[:, dataset.machine.motors])
-        refusal = NotIdentifiable([*still, *error.facts])
-        refusal.notes = tuple(note for note in dataset.table_notes if note not in still)
-        raise refusal from None
+    except NotIdentifiable as error:
+        raise _with_notes(error, error.facts, dataset, dataset.table_notes) from None
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)
@@ -378,12 +374,27 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         refused: Sequence[str | Problem] = error.facts
         if diagnosis:
             refused = notes_beside(diagnosis, error.problems, "legcal calibrate")
-        refusal = type(error)([*(one.sentence for one in diagnosis), *refused])
-        refusal.notes = notes
+        said = [*(one.sentence for one in diagnosis), *refused]
+        refusal = _with_notes(error, said, data.dataset, notes)
         if diagnosis:
             refusal.diagnosis = tuple(mistake.document().document() for mistake in diagnosis)
             refusal.consequences = error.facts
         raise refusal from error
+
+
+def _with_notes(
+    error: LegcalError,
+    said: Sequence[str | Problem],
+    dataset: Dataset,
+    notes: Sequence[str],
+) -> LegcalError:
+    """Return a refusal beside notes; encoders that stand still come first as its likely cause."""
+    motors, q = legs_with_readings(dataset.machine.legs), dataset.measurements.q
+    still = still_encoders(dataset.table_path, motors, q[:, list(dataset.machine.motors)])
+    causes = still if isinstance(error, NotIdentifiable) else []
+    refusal = type(error)([*causes, *said])
+    refusal.notes = tuple(note for note in notes if note not in causes)
+    return refusal
 
 
 def _estimate(
