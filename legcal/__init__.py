@@ -22,4 +22,16 @@ are x right, y down, z forward.
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """Return what is public, imported at the first use."""
+    from types import FunctionType
+
+    from legcal.arguments import with_arguments_in_words
+
+    found = _loaded(name)
+    if isinstance(found, FunctionType):
+        found = globals()[name] = with_arguments_in_words(found, __name__)
+    return found

@@ -154,11 +154,14 @@ class LegcalError(Exception):
     consequences : tuple of Problem
         Problems that may follow from these mistakes. The message only counts them; documents have
         them with their codes.
+    notes : tuple of str
+        What is odd, allowed, and perhaps the cause; the command line shows it below the problems.
     """
 
     exit_code = 1
     diagnosis: tuple[dict[str, object], ...] = ()
     consequences: tuple[Problem, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -177,7 +180,7 @@ class LegcalError(Exception):
         super().__init__("\n".join(_shortened(self.facts, self.problems)))
 
     def __reduce__(self) -> tuple[type, tuple[tuple[Problem, ...]], dict[str, object]]:
-        state: dict[str, object] = {"diagnosis": self.diagnosis}
+        state: dict[str, object] = {"diagnosis": self.diagnosis, "notes": self.notes}
         state["consequences"] = self.consequences
         return type(self), (self.facts,), state
 
@@ -189,7 +192,7 @@ class LegcalError(Exception):
     def told(self, change: Callable[[Problem], Problem]) -> LegcalError:
         """Return an error of the same kind whose problems are changed."""
         error = type(self)([change(problem) for problem in self.facts])
-        error.diagnosis = self.diagnosis
+        error.diagnosis, error.notes = self.diagnosis, self.notes
         error.consequences = tuple(map(change, self.consequences))
         return error
 

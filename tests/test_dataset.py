@@ -44,6 +44,19 @@ def test_a_dataset_is_named_by_its_folder_or_its_file(
         np.testing.assert_array_equal(load_dataset(name).measurements.q, expected.measurements.q)
 
 
+def test_a_dataset_that_went_without_its_model_says_so(folder: Folder) -> None:
+    folder.entry["mechanism"] = "../models/own.yaml"
+    folder.write()
+    with pytest.raises(DatasetError, match=r"mechanism could not be used: found '../models/own"):
+        load_dataset(folder.path)
+
+
+def test_empty_columns_at_the_end_of_a_table_are_none(folder: Folder) -> None:
+    expected, table = read(folder).q, folder.path / "measurements.csv"
+    table.write_text("".join(f"{line},,\n" for line in table.read_text().splitlines()))
+    np.testing.assert_array_equal(load_dataset(folder.path).measurements.q, expected)
+
+
 def test_cameras_in_millimetres_are_taken_so_and_said(folder: Folder) -> None:
     near = read(folder).views[0].T_base_camera
     assert near is not None

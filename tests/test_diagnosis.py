@@ -1,5 +1,6 @@
 """Common mistakes of owners are named: in readings, models and images that disagree."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -19,7 +20,7 @@ from legcal.calibration.diagnosis.mistakes import Mistake, mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names
-from legcal.errors import DatasetError, NotIdentifiable
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
@@ -175,6 +176,54 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
+
+
+@pytest.mark.parametrize(
+    ("model", "names", "what"),
+    [
+        ("hexapod", {1: 2, 2: 1}, "leg2 and leg3 appear to be exchanged"),
+        ("hexapod", {1: 4, 4: 1}, "leg2 and leg5 appear to be exchanged"),  # no fit
+        (
+            "hexapod",
+            {0: 4, 4: 2, 2: 0},
+            "leg1, leg3, leg5 name other legs (leg1 those of leg3, leg3 those of leg5, leg5 those "
+            "of leg1)",
+        ),
+    ],
+)
+def test_outlines_under_the_names_of_other_legs_in_a_view_are_named(
+    outlines: Callable[[str], Dataset], model: str, names: dict[int, int], what: str
+) -> None:
+    d = outlines(model)
+    assert diagnose(order_dataset(d, in_turn, no_progress)) == ()
+    renamed = _misnamed(d, names)
+    (mistake,) = diagnose(order_dataset(renamed, in_turn, no_progress))
+    assert mistake.what == f"the outlines of {what} in view c2"
+    assert (mistake.images, mistake.before, mistake.after) == (6, 0, 6)
+    with pytest.raises(DidNotConverge, match=re.escape(mistake.sentence)):
+        calibrate(renamed)
+
+
+def _misnamed(d: Dataset, names: dict[int, int]) -> Dataset:
+    """Give outlines of the second view the names of other legs."""
+    given, m, legs = d.observations, d.measurements, d.machine.legs
+    assert given is not None
+    leg, part = given.leg.copy(), list(given.part)
+    for i in np.flatnonzero(m.view[given.row] == 1).tolist():
+        j = int(leg[i])
+        leg[i] = names.get(j, j)
+        part[i] = part[i].replace(legs[j].name, legs[leg[i]].name)
+    return replace(d, observations=replace(given, leg=leg, part=tuple(part)))
+
+
+def test_a_fit_that_leaves_out_exchanged_legs_names_them_and_accuses_no_reading(
+    tmp_path: Path,
+) -> None:
+    d = load_dataset(simulated(tmp_path / "set", "hexapod", views=3, poses=8).folder)
+    fitted = calibrate(_misnamed(d, {0: 1, 1: 0}))
+    assert [doubt.code for doubt in fitted.doubts] == ["mistake"]
+    assert "leg1 and leg2 appear to be exchanged in view c2" in fitted.doubts[0].what
+    assert calibrate(d).diagnosis == ()
 
 
 @pytest.mark.system

@@ -46,7 +46,17 @@ PUBLIC = {
     room: set(modules.split()) for room, modules in re.findall(r"^(\w+):([^:]*)$", LISTED, re.M)
 }
 ROOMS = tuple(room for room in PUBLIC if room != BESIDE)
-OUTSIDE = {"__main__", "brief", "causes", "errors", "progress", "signals", "version", "workers"}
+OUTSIDE = {
+    "__main__",
+    "arguments",
+    "brief",
+    "causes",
+    "errors",
+    "progress",
+    "signals",
+    "version",
+    "workers",
+}
 
 
 @cache

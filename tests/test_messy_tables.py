@@ -15,6 +15,7 @@ from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description, assemble
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.errors import DatasetError, ModelError
+from legcal.files.table import Column, read_table
 from legcal.machine.kinematics import forward_kinematics_many
 from legcal.machine.model import Machine, readings_at
 
@@ -109,6 +110,12 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
     "typeset minus, inch of a diameter sign": (
         wide("Bein;" + SIX.format("Boden", "Plattform") + ";Durchmesser", "Ø 20 mm", leg="{}")
         .replace("-", "−"), (10, 10)),
+    "thousands": (
+        wide("Bein;" + SIX.format("Boden", "Plattform").replace("mm", "um")
+             + ";min. Länge (mm);max. Länge (um);Durchmesser (um)", "380", "500\u202f000.0",
+             "?", leg="{}", size=1e3)
+        .replace("289800", "289'800").replace("-77600", "−77,6e3").replace("77600", "77.600")
+        .replace("?", "20.000,0"), (10, 10)),
     "bars": (
         "\n".join(
             f"| {' | '.join(row.split(';'))} |".replace(",", ".")
@@ -171,6 +178,22 @@ def test_what_a_person_reads_at_once_is_read(kind: str, tmp_path: Path) -> None:
     text, radii = TABLES[kind]
     (tmp_path / "own.csv").write_text(text)
     check(described(tmp_path / "own.csv", text, radii), radii)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "cp1252"])
+def test_tables_are_read_as_spreadsheets_save_them(encoding: str, tmp_path: Path) -> None:
+    text, radii = TABLES["German"]
+    (tmp_path / "own.csv").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    check(described(tmp_path / "own.csv", text, radii), radii)
+
+
+def test_points_beside_decimal_commas_are_what_makes_sizes_alike(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    path.write_text("a;b;c\n1.234;123.456;1.234.567\n987,5;100,5;-987.654,25\n")
+    columns = [Column(name) for name in "abc"]
+    table = read_table(path, "table", "row", columns, reshape=lambda lines: lines)
+    expected = [[1234.0, 123.456, 1234567.0], [987.5, 100.5, -987654.25]]
+    np.testing.assert_array_equal(table.numbers("abc"), expected)
 
 
 def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path) -> None:

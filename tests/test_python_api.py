@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import pickle
 import re
 import subprocess
 import sys
@@ -171,6 +172,31 @@ def test_readings_are_taken_by_leg_or_by_motor_and_in_metres_and_radians() -> No
             legcal.forward_kinematics(machine, readings)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="found a str, needed a Machine"):
         legcal.inverse_kinematics("hexapod", hexapod.home)  # type: ignore[arg-type]
+
+
+def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
+    example_run: Run, tmp_path: Path
+) -> None:
+    machine, folder = legcal.load_mechanism("hexapod"), example_run.output
+    public: Any = legcal  # without its types
+    example = ROOT / "examples/hexapod"
+    calls: list[tuple[Any, str]] = [
+        (lambda: public.evaluate(3, machine), "found 3 (int) as model, needed a text or a path"),
+        (lambda: public.evaluate(machine, folder, dataset=0), "found 0 (int) as dataset"),
+        (lambda: public.plot_machine("hexapod"), "(str) as machine, needed Machine;"),
+        (lambda: public.calibrate(example, holdout="a"), "as holdout, needed a number or None;"),
+        (lambda: public.new(family="delta", rod_length="0.2"), "as rod_length, needed a number"),
+        (lambda: public.Follower("hexapod"), "found a str, needed a Machine"),
+    ]
+    for call, sentence in calls:
+        with pytest.raises(UsageError) as refused:
+            call()
+        assert sentence in str(refused.value)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'hold_out'"):
+        public.calibrate(folder, hold_out=0.2)
+    pose = np.asarray(machine.home.as_matrix(), dtype=np.float32).tolist()  # of no annotated type
+    assert np.isfinite(legcal.inverse_kinematics(machine, pose)).all()
+    assert pickle.loads(pickle.dumps(legcal.calibrate)) is legcal.calibrate
 
 
 def test_models_are_written_and_exported_without_the_command_line(

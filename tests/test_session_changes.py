@@ -17,7 +17,7 @@ from simulated import settings, simulated, standing
 from legcal import Calibration, Dataset, calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
-from legcal.calibration.session_changes import Finding, session_tests
+from legcal.calibration.session_changes import ALL_MOTORS, Finding, session_tests
 from legcal.calibration.verdict import commanded
 from legcal.data.image_choice import chosen_images, dataset_at, image_sequences, own_zeros
 from legcal.errors import UsageError
@@ -30,6 +30,7 @@ pytestmark = pytest.mark.usefixtures("without_steps")
 CHANGED_AT = 7  # of the 12 images of the second view
 SLIP, LAG, GAIN, BACKLASH, DRIFT, SCATTER = 3e-4, 4e-3, 2e-3, 2e-4, 4e-4, 1e-4
 TURN, ZOOM = 4e-4, 1e-3
+CHANGED_IN = "c1,c2:p13..p19"
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +174,42 @@ def test_a_slip_is_found_where_readings_are_stated_as_exact(healthy: Dataset, st
     m = replace(slipped.measurements, sigma_q=1e-9, sigma_by_joint={})
     finding = _findings(replace(slipped, measurements=m), start)[0]
     assert (finding.kind, finding.subject) == ("encoder", "leg2")
+
+
+def test_encoders_that_were_homed_anew_accuse_no_joint_and_get_zeros_of_their_own(
+    healthy: Dataset, start: Start
+) -> None:
+    by = SLIP * np.array([2.0, -1.5, -4.0, 3.0, 1.0, 2.5])
+    homed = _with_readings(lambda q: q + np.outer(_later(len(q)), by))(healthy)
+    (finding,) = _findings(homed, start)
+    assert (finding.kind, finding.subject, finding.images) == ("encoder", ALL_MOTORS, CHANGED_IN)
+    assert "all motors were homed anew" in finding.what
+    assert min(abs(finding.amount - by)) < 4.0 * finding.sigma
+    result = calibrate(homed, split=[f"all@{finding.images}"])
+    assert result.verdict.trustworthy
+    state, sigma = result.solution.posterior.state, result.solution.posterior.covariance
+    at = result.solution.posterior.problem.where("own_zeros")
+    np.testing.assert_array_less(
+        np.abs(state.own_zeros + by), 4.0 * np.sqrt(np.diagonal(sigma)[at])
+    )
+
+
+@pytest.mark.parametrize("times", [1.0, 30.0])
+def test_an_encoder_sigma_far_above_what_readings_scatter_is_noted(
+    healthy: Dataset, unordered: Calibration, times: float
+) -> None:
+    m = healthy.measurements
+    notes = unordered.notes
+    if times > 1.0:
+        notes = calibrate(
+            replace(healthy, measurements=replace(m, sigma_q=times * m.sigma_q))
+        ).notes
+    said = [note for note in notes if note.startswith("Readings scatter by about")]
+    assert len(said) == (times > 1.0)
+    for note in said:
+        found, stated = map(float, re.findall(r"([\d.]+) mm", note))
+        assert stated == pytest.approx(1e3 * times * m.sigma_q)
+        assert 0.5 < 1e-3 * found / m.sigma_q < 2.0
 
 
 def _exchanged(dataset: Dataset) -> Dataset:

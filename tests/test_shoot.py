@@ -1,5 +1,6 @@
 """Guided shooting: photographs that arrive become a dataset, one by one."""
 
+import errno
 import json
 import shutil
 import threading
@@ -125,6 +126,25 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
     loaded = load_dataset(session)  # with the photographs checked
     assert loaded.measurements.image == ("images/c1_k01.jpg", "images/c1_k02.jpg")
     assert len(list(watched.iterdir())) == 9  # copied, not moved
+
+
+def test_a_photograph_that_finds_no_room_is_kept_by_word_once_there_is_some(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dialogues, "PAUSE", 0.05)
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with talking(session, tmp_path / "phone") as dialogue:
+        heard(dialogue, "pose c1_k01")
+        monkeypatch.setattr(shooting, "write_atomically", full)
+        (tmp_path / "phone/1.jpg").write_bytes(photograph("c1_k01"))
+        assert "free some space" in heard(dialogue, "'No space left on device'")
+        monkeypatch.setattr(shooting, "write_atomically", write_atomically)
+        dialogue.words.put("keep")
+        heard(dialogue, "1.jpg is c1 c1_k01")
+    assert len(read_rows(session / "measurements.csv")) == 1
 
 
 def test_a_session_that_is_killed_between_its_files_goes_on(

@@ -60,6 +60,13 @@ def test_a_coordinate_of_the_pose_moves_the_legs_and_no_other_coordinate(name: s
     )
 
 
+def test_a_folder_with_one_model_is_shown(tmp_path: Path) -> None:
+    spec = of_types(["US"] * 6, ["passive"] * 6)
+    (tmp_path / "models").mkdir()
+    written = write_machine(tmp_path / "models", spec, Layout())
+    assert open_source(tmp_path).machine.yaml_path == written
+
+
 def test_a_machine_without_motors_is_moved_by_its_pose(tmp_path: Path) -> None:
     spec = of_types(["US"] * 6, ["passive"] * 6)
     motion = Motion(load_mechanism(write_machine(tmp_path, spec, Layout())))

@@ -39,7 +39,13 @@ from legcal.calibration.joint_fit.scale import (
 )
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.session_changes import OF_MOTORS, OF_SCATTER, Finding, SessionTests
+from legcal.calibration.session_changes import (
+    ALL_MOTORS,
+    OF_MOTORS,
+    OF_SCATTER,
+    Finding,
+    SessionTests,
+)
 from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
@@ -108,7 +114,9 @@ def doubts_of(
     codes = {doubt.code for doubt in course}
     motors = {one.subject for one in session.findings if one.kind in codes}
     motors |= {subject.partition(".")[0] for subject in motors}  # legs of joints
-    explained = {leg.name for leg in dataset.machine.legs if motors & {leg.motor_label, leg.name}}
+    explained = {
+        leg.name for leg in dataset.machine.legs if motors & {leg.motor_label, leg.name, ALL_MOTORS}
+    }
     causes = [*_not_round(dataset.machine.legs, solution.outlines), *causes]
     symptoms = (
         []
@@ -404,11 +412,13 @@ class _Evidence:
 
     def cameras(self) -> list[Doubt]:
         """Return cameras that the measurements contradict, with what their files do."""
-        views = list(dict.fromkeys(wrong.view for wrong in self.solution.camera_doubts))
-        if not views:
+        doubts, names = self.solution.camera_doubts, self.problem.outlines.views
+        if not doubts:
             return []
+        wrong_in = np.any([one.error.any(axis=1) for one in doubts], axis=0)  # that share a file
+        views = sorted(names[v] for v in np.flatnonzero(wrong_in).tolist())
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
-        wrong = max(self.solution.camera_doubts, key=lambda one: one.apart)
+        wrong = max(doubts, key=lambda one: one.apart)
         what = (
             f"the measurements contradict the camera of {few_views(views)}, above all its "
             f"{wrong.kind.replace('_', ' ')}: {wrong.found}"

@@ -32,6 +32,7 @@ from legcal.calibration.diagnosis.diagnosis import (
     agreement_with_zeros,
     diagnose,
     notes_beside,
+    wrong_names,
 )
 from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
@@ -71,8 +72,9 @@ from legcal.data.cache import (
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import Override, listed, overrides_of_call
 from legcal.data.image_choice import chosen_images, dataset_at, own_zeros, split_images
-from legcal.data.measurements import few_views, image_notes
+from legcal.data.measurements import few_views, image_notes, still_encoders
 from legcal.data.outlines import reject_unused_legs
+from legcal.data.reading_units import legs_with_readings
 from legcal.errors import (
     DatasetError,
     DidNotConverge,
@@ -84,8 +86,10 @@ from legcal.errors import (
 )
 from legcal.files.folder import check_destination, output_path
 from legcal.files.quantity import SHOWN_IN
+from legcal.geometry.motions import components
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.machine.leg import ParameterId
+from legcal.machine.rods import ends_at_poses
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.outline import measure_in_brief
@@ -158,8 +162,8 @@ def calibrate(
         Leave these images out of the fit: ``p22``, ``p22..p45`` in the order in which they were
         taken, ``c2`` for a view, ``c2:p22`` where several views have that name; by commas.
     split : sequence of str
-        ``MOTOR@IMAGES``: the encoder of that motor had another zero in these images than in the
-        others, whose zero the model has.
+        ``MOTOR@IMAGES``: the encoder of that motor, or of ``all``, had another zero in these images
+        than in the others, whose zero the model has.
     overlays : bool
         Draw the outlines over every photograph, into ``overlays`` of the result folder.
     only : {"zeros", "lengths", "all"}, optional
@@ -209,8 +213,8 @@ def calibrate(
         identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
     except DatasetError:  # readings out of reach are refused below, with likely mistakes
         identify_notes = ()
-    except NotIdentifiable as error:  # encoders that stand still, or views without a row, first
-        raise NotIdentifiable([*dataset.table_notes, *error.facts]) from None
+    except NotIdentifiable as error:
+        raise _with_notes(error, error.facts, dataset, dataset.table_notes) from None
 
     # 2 to 5. Recognise, measure, four steps, joint fit, measure again.
     key, missing = outline_key(dataset, choices), note_on_missing_photographs(dataset)
@@ -344,8 +348,8 @@ def _guesses(data: OrderedDataset, step: float) -> Iterator[dict[str, float]]:
 def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Options) -> Estimate:
     """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
 
-    A refusal names the likely mistakes of the session before their consequences, and also notes on
-    odd readings and files of photographs that contradict their camera: they may be the cause.
+    A refusal names the likely mistakes of the session before their consequences, and has the notes
+    on odd readings and files of photographs that contradict their camera: they may be the cause.
 
     Raises
     ------
@@ -370,11 +374,27 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         refused: Sequence[str | Problem] = error.facts
         if diagnosis:
             refused = notes_beside(diagnosis, error.problems, "legcal calibrate")
-        refusal = type(error)([*(one.sentence for one in diagnosis), *refused, *notes])
+        said = [*(one.sentence for one in diagnosis), *refused]
+        refusal = _with_notes(error, said, data.dataset, notes)
         if diagnosis:
             refusal.diagnosis = tuple(mistake.document().document() for mistake in diagnosis)
             refusal.consequences = error.facts
         raise refusal from error
+
+
+def _with_notes(
+    error: LegcalError,
+    said: Sequence[str | Problem],
+    dataset: Dataset,
+    notes: Sequence[str],
+) -> LegcalError:
+    """Return a refusal beside notes; encoders that stand still come first as its likely cause."""
+    motors, q = legs_with_readings(dataset.machine.legs), dataset.measurements.q
+    still = still_encoders(dataset.table_path, motors, q[:, list(dataset.machine.motors)])
+    causes = still if isinstance(error, NotIdentifiable) else []
+    refusal = type(error)([*causes, *said])
+    refusal.notes = tuple(note for note in notes if note not in causes)
+    return refusal
 
 
 def _estimate(
@@ -400,7 +420,8 @@ def _estimate(
             estimate,
             image_notes=data.plan.notes,
             fit_notes=_notes_on_images(estimate),
-            diagnosis=diagnosed(data) if _leaves_out_many(estimate) else (),
+            diagnosis=_wrong_names(estimate)
+            or (diagnosed(data) if _leaves_out_many(estimate) else ()),
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
@@ -449,6 +470,16 @@ def _estimate(
         other_radii=other_radii,
         diagnosis=diagnosis or (diagnosed(data) if _leaves_out_many(estimate) else ()),
     )
+
+
+def _wrong_names(estimate: Estimate) -> tuple[Diagnosis, ...]:
+    """Return given outlines that the fit has at the place of other legs."""
+    solution, m = estimate.solution, estimate.fitted.measurements
+    ends = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
+    seen = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
+    cameras = [T.inv() if v in seen else None for v, T in enumerate(solution.T_camera_Rb)]
+    A, B = (joints[m.pose] for joints in ends)
+    return wrong_names(solution.outlines, m, solution.legs, (A, B), cameras)
 
 
 def _leaves_out_many(estimate: Estimate) -> bool:

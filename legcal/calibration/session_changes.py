@@ -61,6 +61,8 @@ _LEADS = (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32, 40)  # of
 _COARSE = 15  # groups of images whose scores say how much those of errors once a turn scatter
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
+_LESS = np.geomspace(1e-3, 0.2, 24)  # of the stated standard deviation of readings
+_SURELY_LESS = 10.0  # of the logarithm of the likelihood
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
 MOST_REJECTED, FEW = 0.5, 0.1  # outlines of an image that is not left out; of images that are
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
@@ -144,13 +146,18 @@ class Finding:
         """What was found, as a clause."""
         between = "" if self.between is None else f" between {' and '.join(self.between)}"
         sense = _BY_SIGN.get(self.kind, ("", ""))[int(self.amount < 0.0)]
-        what = _WORDS[self.kind][0].format(subject=self.subject, size=self.size, sense=sense)
+        what = self._words[0].format(subject=self.subject, size=self.size, sense=sense)
         return f"{what}{between}"
 
     @property
     def remedy(self) -> str:
         """What to do, as a clause."""
-        return _WORDS[self.kind][1].format(subject=self.subject, images=self.images)
+        return self._words[1].format(subject=self.subject, images=self.images)
+
+    @property
+    def _words(self) -> tuple[str, str]:
+        is_of_all = self.kind == "encoder" and self.subject == ALL_MOTORS
+        return _HOMED if is_of_all else _WORDS[self.kind]
 
 
 _WITHOUT_ORDER: tuple[str, ...] = ("gain", "pitch", "eccentricity", "camera_file")
@@ -162,6 +169,11 @@ _BY_SIGN: Mapping[Kind, tuple[str, str]] = {  # words for positive and negative 
 _WITHOUT_SIGN: tuple[Kind, ...] = (
     "camera", "backlash", "eccentricity", "joint", "autofocus", "vibration", *_BY_SIGN
 )  # fmt: skip
+_HOMED = (  # in place of the words for one encoder
+    "{subject} were homed anew: the zeros of their encoders changed, one by {size}",
+    "home the machine once before all photographs, and calibrate with zeros of their own before "
+    "that (--split all@{images}), or without the images on one side of it (--leave-out)",
+)
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
         "the zero of the encoder of {subject} changed by {size}",
@@ -260,12 +272,15 @@ class SessionTests:
     least_slips : dict
         The least changes of encoders that would show half of the time, by motor [m or rad];
         motors of which no change can be seen are not in it.
+    overstated : dict
+        By unit how much readings scatter and what is stated, where that is five times as much.
     periods : dict
         The outlines of the fit (n,) in each quarter of the images in order, by its images.
     """
 
     findings: tuple[Finding, ...] = ()
     least_slips: Mapping[str, float] = field(default_factory=dict)
+    overstated: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     periods: Mapping[str, BoolArray] = field(default_factory=dict)
 
 
@@ -318,11 +333,11 @@ def _tests(
     least = math.sqrt(chdtri(1.0, DOUBT_BY_CHANCE / max(len(tests), 1)))
     slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
     for number in solved:
-        if number.test.of.kind == "encoder" and number.rank:
+        if number.test.of.kind == "encoder" and number.rank and len(number.amount) == 1:
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(number.test.of.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, solved, len(tests))
-    noise = _scatter(hypotheses, left)
+    noise, overstated = _scatter(hypotheses, left), _overstated(hypotheses, left)
     if lacking or noise:
         least = max((number.explains for number in lacking), default=0.0)
         by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
@@ -339,7 +354,7 @@ def _tests(
         findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
     periods = fit.course.periods(fit.problem.outlines) if has_order else {}
-    return SessionTests(tuple(findings), least_slips, periods)
+    return SessionTests(tuple(findings), least_slips, overstated, periods)
 
 
 def _forward_selection(
@@ -348,7 +363,7 @@ def _forward_selection(
     """Return the numbers that the fit lacks, the most certain first, and the scores given them."""
     lacking = list[_Solved]()
     while solved and sum(one.test.of.kind != "camera_file" for one in lacking) < MAX_FINDINGS:
-        best = min(solved, key=lambda number: (number.p_value, -number.square))
+        best = min(solved, key=lambda number: (number.p_value, -number.explains))
         if best.p_value * n_tests > DOUBT_BY_CHANCE:
             break
         lacking.append(best)
@@ -437,10 +452,15 @@ def _left_out(problem: FitProblem) -> BoolArray:
 def _size(number: _Solved) -> tuple[str, float, float]:
     """Return the unit, the amount and its standard deviation.
 
-    Of a camera, which moves by a rotation vector and a displacement: those of the surer one.
+    Of a camera, which moves by a rotation vector and a displacement: those of the surer one. Of
+    all encoders those of the surest one.
     """
     hypothesis, amount, covariance = number.test.of, number.amount, number.covariance
     parts = {"rad": slice(0, 3), "m": slice(3, 6)}
+    if hypothesis.kind == "encoder":
+        sigma = np.sqrt(np.diagonal(covariance))
+        surest = int(np.argmax(np.abs(amount) / np.maximum(sigma, 1e-300)))
+        return hypothesis.unit, float(amount[surest]), float(sigma[surest])
     if hypothesis.kind != "camera":
         if len(amount) == 1 or hypothesis.kind == "drift":
             return hypothesis.unit, float(amount[0]), float(np.sqrt(covariance[0, 0]))
@@ -656,7 +676,7 @@ class _Fit:
 
     def of_motors(self) -> Iterator[_Hypothesis]:
         """Yield what may be wrong with the readings of motors."""
-        problem, course = self.problem, self.course
+        problem, course, legs = self.problem, self.course, self.problem.legs.nominal
         readings, reading = problem.readings, problem.readings.reading
         row = course.row_of_pose[readings.pose]
         whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
@@ -668,8 +688,12 @@ class _Fit:
             columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
             return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
 
-        for j in np.unique(readings.leg).tolist():
-            leg, of_motor = problem.legs.nominal[j], (readings.leg == j)[:, None]
+        motors = np.unique(readings.leg)
+        if len(motors) > 1 and len(units := {legs[j].reading_unit for j in motors.tolist()}) == 1:
+            of_each = np.equal(readings.leg[:, None], motors)
+            yield wrong_by("encoder", ALL_MOTORS, units.pop(), 1.0 * of_each)
+        for j in motors.tolist():
+            leg, of_motor = legs[j], (readings.leg == j)[:, None]
             unit, subject = leg.reading_unit, leg.motor_label
             yield wrong_by("encoder", subject, unit, 1.0 * of_motor)
             yield wrong_by("drift", subject, unit, of_motor * course.drift(row))
@@ -966,7 +990,9 @@ class _Solved(NamedTuple):
 
 def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
     """Return what scatters from image to image: readings beyond what is stated, or a camera."""
-    encoders = [i for i, h in enumerate(hypotheses) if h.kind == "encoder"]
+    encoders = [
+        i for i, h in enumerate(hypotheses) if h.kind == "encoder" and h.subject != ALL_MOTORS
+    ]
     groups: list[tuple[Kind, str, list[tuple[int, int]]]] = [
         ("reading_noise", hypotheses[i].subject, [(i, 0)]) for i in encoders
     ]
@@ -1013,11 +1039,9 @@ class _Scatter:
         """Logarithm of the likeliest further variance over the stated one, and its likelihood's."""
         from scipy.optimize import minimize_scalar  # only where something scatters
 
-        own = np.where(self.eigenvalues > 0.0, self.eigenvalues, 1.0)
-
         def loss(logarithm: float) -> float:
             more = math.exp(logarithm) * self.eigenvalues
-            return 0.5 * float(np.sum(np.log1p(more) - self.squares / own * more / (1.0 + more)))
+            return _loss(more, self.eigenvalues, self.squares)
 
         found = minimize_scalar(loss, bounds=_FURTHER, method="bounded")
         return float(found.x), -float(found.fun)
@@ -1054,25 +1078,60 @@ class _Scatter:
         n_tests: int,
     ) -> _Scatter:
         """Test what scatters."""
-        sigmas, stated = list[Array](), list[float]()
-        for i, row in group:
-            hypothesis = hypotheses[i]
-            if steady := _STEADY.get(hypothesis.kind):
-                stated.append(steady)
-                sigmas.append(np.full(scores.column[i].shape[1], steady))
-                continue
-            ((name, wrong),) = hypothesis.columns.items()
-            read = wrong[:, 0, row] != 0.0
-            stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
-            n = hypothesis.share[name][read].sum(axis=0)
-            sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
-        columns, sigma = scores.of_single(group, sigmas)
-        z = sigma * scores.scores.score[columns]
-        K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
-        own, vector = np.linalg.eigh(K)
-        own, squares = np.maximum(own, 0.0), (vector.T @ z) ** 2
+        own, squares, sigmas, stated = _spectrum(group, hypotheses, scores)
         # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
         total = max(float(own.sum()), np.finfo(np.float64).tiny)
         dof = total**2 / max(float(own @ own), np.finfo(np.float64).tiny)
         p_value = min(n_tests * float(chdtrc(dof, float(squares.sum()) * dof / total)), 1.0)
-        return cls(kind, subject, group, p_value, sigmas, float(np.median(stated)), own, squares)
+        return cls(kind, subject, group, p_value, sigmas, stated, own, squares)
+
+
+def _spectrum(
+    group: Sequence[tuple[int, int]], hypotheses: Sequence[_Hypothesis], scores: _Scores
+) -> tuple[Array, Array, list[Array], float]:
+    """Return the eigenvalues of K and the squares of z along its vectors, as of :class:`_Scatter`.
+
+    Also what is stated: of single blocks, and in the median of a reading or a camera.
+    """
+    sigmas, stated = list[Array](), list[float]()
+    for i, row in group:
+        hypothesis = hypotheses[i]
+        if steady := _STEADY.get(hypothesis.kind):
+            stated.append(steady)
+            sigmas.append(np.full(scores.column[i].shape[1], steady))
+            continue
+        ((name, wrong),) = hypothesis.columns.items()
+        read = wrong[:, 0, row] != 0.0
+        stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
+        n = hypothesis.share[name][read].sum(axis=0)
+        sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
+    columns, sigma = scores.of_single(group, sigmas)
+    z = sigma * scores.scores.score[columns]
+    K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
+    own, vector = np.linalg.eigh(K)
+    return np.maximum(own, 0.0), (vector.T @ z) ** 2, sigmas, float(np.median(stated))
+
+
+def _loss(more: Array, own: Array, squares: Array) -> float:
+    """Return minus the logarithm of the likelihood of a further variance, by *more* = its part."""
+    part = squares / np.where(own > 0.0, own, 1.0)
+    return 0.5 * float(np.sum(np.log1p(more) - part * more / (1.0 + more)))
+
+
+def _overstated(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> dict[str, tuple[float, ...]]:
+    """Return how much readings of a unit scatter, and what is stated, where that is far more."""
+    found = dict[str, tuple[float, ...]]()
+    for unit in ("m", "rad"):
+        group = [
+            (i, 0)
+            for i, h in enumerate(hypotheses)
+            if h.kind == "encoder" and h.subject != ALL_MOTORS and h.unit == unit
+        ]
+        if not group:
+            continue
+        own, squares, _, stated = _spectrum(group, hypotheses, scores)
+        less = np.square(_LESS) - 1.0  # of the variance
+        loss = [_loss(v * np.minimum(own, 1.0), own, squares) for v in less]
+        if min(loss) < -_SURELY_LESS:
+            found[unit] = float(_LESS[int(np.argmin(loss))]) * stated, stated
+    return found

@@ -140,6 +140,7 @@ def judge(
             *click_notes(dataset, solution),
             *commanded(dataset),
             *_asked_lengths(dataset, solution, doubts),
+            *_overstated(session),
             *_untested(dataset, sequences, session, platform),
         ),
         held_out,
@@ -190,6 +191,19 @@ def _asked_lengths(dataset: Dataset, solution: Solution, doubts: Sequence[Doubt]
         f"{few(stated)}: the stated length is the nominal one to all digits; state a measured one, "
         "or leave it out if there is another."
     ]
+
+
+def _overstated(session: SessionTests) -> list[str]:
+    """Return a note on readings that scatter far less than is stated."""
+    notes = []
+    for of, sizes in session.overstated.items():
+        scale, unit = SHOWN_IN[of]
+        found, stated = (f"{scale * size:.2g} {unit}" for size in sizes)
+        notes.append(
+            f"Readings scatter by about {found} or less, where {stated} are stated or assumed: "
+            "the result is less certain than it need be; state encoder_sigma as it is."
+        )
+    return notes
 
 
 def _untested(

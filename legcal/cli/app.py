@@ -189,6 +189,7 @@ def run(*, as_json: bool) -> int:
                 as_json=as_json,
                 problems=error.documents(),
                 diagnosis=error.diagnosis,
+                notes=error.notes,
             )
             return error.exit_code
         if isinstance(error, usage_error):

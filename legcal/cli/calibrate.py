@@ -101,8 +101,9 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="MOTOR@IMAGES",
-            help="The encoder of MOTOR had another zero in these images (leg4@p01..p21), as before "
-            "a slip; the model has that of the others. May be repeated.",
+            help="The encoder of MOTOR, or of all, had another zero in these images "
+            "(leg4@p01..p21), as before a slip; the model has that of the others. May be "
+            "repeated.",
             rich_help_panel=_TESTS,
         ),
     ] = None,

@@ -251,6 +251,7 @@ def print_failure(
     as_json: bool,
     problems: Sequence[dict[str, object]] = (),
     diagnosis: Sequence[dict[str, object]] = (),
+    notes: Sequence[str] = (),
 ) -> None:
     """Print why a command failed, on stderr, or in JSON on stdout.
 
@@ -261,11 +262,13 @@ def print_failure(
         with suppress(OutOfResources):
             error: dict[str, object] = {"kind": kind, "message": message}
             error["problems"] = list(problems) or [{"code": code_of_kind(kind), "what": message}]
+            error |= {"notes": list(notes)} if notes else {}
             extra = {"diagnosis": list(diagnosis)} if diagnosis else {}
             print_json({"error": error, **extra})
             return
     if sys.stderr is not None:
-        sys.stderr.write(f"legcal: {message}\n")
+        beside = "".join(f"Note: {printable(note)}\n" for note in notes)
+        sys.stderr.write(f"legcal: {message}\n{beside}")
 
 
 def open_browser(address: str) -> None:

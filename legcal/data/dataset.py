@@ -303,6 +303,13 @@ def load_dataset(
         except DatasetError as error:
             problems += error.facts
     mechanism = _mechanism_path(folder, entry.mechanism)
+    if not os.path.exists(mechanism):
+        found = f"{describe(entry.mechanism)}, no file there"
+        needed = "the model, relative to this file, or the name of a shipped one"
+        remedy = f"copy it there with its URDF, or correct the path ({mechanism})"
+        raise DatasetError(
+            [*problems, entry_problem(yaml_path, "mechanism", found, needed, remedy)]
+        )
     machine = load_mechanism(mechanism)
     problems += [
         entry_problem(

@@ -125,7 +125,8 @@ def own_zeros(
 ) -> tuple[OwnZero, ...]:
     """Return the images of each ``MOTOR@IMAGES``, in which that motor has a zero of its own.
 
-    All images of a pose have its readings, and so belong to it if one of them is named.
+    ``all@IMAGES`` gives all motors one, as after homing. All images of a pose have its readings,
+    and so belong to it if one of them is named.
 
     Raises
     ------
@@ -135,8 +136,8 @@ def own_zeros(
     """
     pose, zeros = dataset.measurements.pose, list[OwnZero]()
     kept = np.ones(len(pose), dtype=np.bool_) if left_out is None else ~left_out
-    for text in texts:
-        motor, images = _motor_and_images(dataset, text)
+    split = [(text, *one) for text in texts for one in _motors_and_images(dataset, text)]
+    for text, motor, images in split:
         named = chosen_images(dataset, images)
         rows = np.isin(pose, pose[named])
         used = [one.rows & kept for one in zeros if one.motor == motor]
@@ -161,18 +162,18 @@ def own_zeros(
     return tuple(zeros)
 
 
-def _motor_and_images(dataset: Dataset, text: str) -> tuple[str, str]:
-    """Return both parts of ``MOTOR@IMAGES``."""
+def _motors_and_images(dataset: Dataset, text: str) -> list[tuple[str, str]]:
+    """Return both parts of ``MOTOR@IMAGES``, for each motor that it is of."""
     motor, _, images = text.partition("@")
     legs = [dataset.machine.legs[j] for j in dataset.machine.motors]
     motors = [leg.motor_label for leg in legs]
     needed = f"needed MOTOR@IMAGES such as {motors[0]}@p22..p45"
-    if motor not in motors:
+    if motor not in (*motors, "all"):
         cause = f"found no motor of that name, {needed}; {closest(motor, motors)}"
     elif not images.strip():
         cause = f"found no images, {needed}; name them."
     else:
-        return motor, images
+        return [(one, images) for one in ([motor] if motor in motors else motors)]
     raise UsageError(f"The split {describe(text)} could not be used: {cause}")
 
 

@@ -309,13 +309,7 @@ def readings_in(
                 f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
-    still = np.ptp(readings, axis=0) == 0.0 if len(readings) else np.ones(len(motors), dtype=bool)
-    if still.any() and not still.all():
-        constant = few([str(leg.prismatic) for leg, one in zip(motors, still, strict=True) if one])
-        notes.append(
-            f"{table.path}: found the same reading in all rows of {constant}, while other encoders "
-            "move; check that these were recorded, and move these legs as well."
-        )
+    notes += still_encoders(table.path, motors, readings)
     groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
@@ -339,6 +333,18 @@ def readings_in(
         for problem in doubtful_units(table.path, values, motors, stated, statement):
             table.refuse_file(problem)
     return readings, tuple(notes)
+
+
+def still_encoders(path: Path, motors: Sequence[Leg], readings: Array) -> list[str]:
+    """Return a sentence on encoders that read the same in all rows while others move."""
+    still = np.ptp(readings, axis=0) == 0.0 if len(readings) else np.ones(len(motors), dtype=bool)
+    if still.all() or not still.any():
+        return []
+    constant = few([str(leg.prismatic) for leg, one in zip(motors, still, strict=True) if one])
+    return [
+        f"{path}: found the same reading in all rows of {constant}, while other encoders move; "
+        "check that these were recorded, and move these legs as well."
+    ]
 
 
 def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
+from legcal.arguments import check_arguments
 from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
 from legcal.descriptions.table import BESIDE, described_machine, read_description
 from legcal.errors import LegcalError, Problem, UsageError
@@ -113,6 +114,7 @@ def new(
             f"The model could not be written: found the dimension '{unknown[0]}', needed some of "
             f"{', '.join(known)}; correct its name."
         )
+    check_arguments("legcal.new", get_type_hints(Dimensions), dimensions)
     given = Dimensions(**dimensions)  # type: ignore[arg-type]
     path = None if table is None else Path(table)
     return create_model(description_of(path, given), Path(output), force=force)

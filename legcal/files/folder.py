@@ -262,9 +262,11 @@ def result_folder(
                 os.rename(new, destination)
     except OSError as error:
         raise OutOfResources(
-            f"{destination}: the {kind.noun} could not be written: found "
-            f"'{error.strerror or error}', needed a folder that takes its files; free some space "
-            "or give another output folder; nothing was written."
+            f"the {kind.noun} could not be written",
+            f"'{error.strerror or error}'",
+            "a folder that takes its files",
+            "free some space or give another output folder; nothing was written",
+            destination,
         ) from error
 
 

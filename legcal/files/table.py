@@ -43,10 +43,18 @@ _MAX_NAMED = 10  # maximum number of columns named in a sentence
 _TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # Windows-1252, without rare characters
 _COMMENTS = re.compile(r"\A(?:\s*#[^\n]*\n)+")  # above the headings
 _UNITS_BELOW = (*LENGTH, *ANGLE, "us", "s")  # units of a row below the headings
-_WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)\s*({'|'.join(_UNITS_BELOW)})", re.ASCII)
+_BLANK = "\u00a0\u2009\u202f"  # that does not break a line, or is thin
+_WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)[\s{_BLANK}]*({'|'.join(_UNITS_BELOW)})", re.ASCII)
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
+# Thousands: beside blanks and apostrophes also commas before a point, and points before a comma
+_GROUPED = re.compile(
+    rf"([-+−–]?\d{{1,3}})((?:[{_BLANK}'’]\d{{3}})+|(?:,\d{{3}})+(?=\.)|(?:\.\d{{3}})+(?=,)"
+    r"|(?:\.\d{3}){2,})([.,]\d+)?\D*"
+)
+_WITH_POINT = re.compile(r"[-+]?\d*(\.\d*)+", re.ASCII)
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
 _RULE = re.compile(r"[:-]*-{3}[:-]*")
 _MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–+-]?)([.,]?\d[^\"″']*)([\"″]?)")
 _BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
@@ -273,8 +281,10 @@ def read_table(
     semicolons, tabs or bars, with decimal commas, below comments and a title, above a row of units.
     """
     lines = _read_lines(path, noun, loose=reshape is not None)
+    if reshape is not None or (lines and "" in lines[0][1]):  # as spreadsheets leave them
+        lines = _without_empty(lines)
     if reshape is not None:
-        lines = _with_units(_without_title(_one_block(_without_empty(lines))))
+        lines = _with_units(_without_title(_one_block(lines)))
         lines = reshape(lines) if lines else lines
     if needed and len(lines) < 2:
         actual = f"{'a' if lines else 'no'} header and no row"
@@ -519,9 +529,9 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
             cells = [cell.strip() for cell in cells]
             if loose:
                 cells = [_number_of_people(cell) for cell in cells]
-            if delimiter != ",":
-                cells = [_with_point(cell) for cell in cells]
             lines.append((reader.line_num, cells))
+        if delimiter != ",":
+            lines = _with_points(lines)
     except (UnicodeDecodeError, csv.Error) as error:
         actual = (
             f"the byte 0x{error.object[error.start]:02x} at place {error.start}, which is no text"
@@ -654,14 +664,15 @@ def _with_units_of_cells(lines: Lines) -> Lines:
 def _decoded(content: bytes, *, loose: bool) -> str:
     """Return the text of a file in UTF-8.
 
-    If ``loose`` also in UTF-16 with its mark, and as Excel writes it in western Europe, without the
+    If ``loose`` also in UTF-16, and as Excel writes it in western Europe, without the
     line that names its delimiter.
     """
     if not loose:
         return content.decode("utf-8-sig")
     is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    bare = {0: "utf-16-be", 1: "utf-16-le"}.get(content[:2].find(b"\0"))  # without its mark
     try:
-        text = content.decode("utf-16" if is_wide else "utf-8-sig")
+        text = content.decode("utf-16" if is_wide else bare or "utf-8-sig")
     except UnicodeDecodeError:
         if is_wide or not _TEXT.fullmatch(content):
             raise
@@ -686,7 +697,12 @@ def _has_decimal_commas(line: str) -> bool:
 
 
 def _number_of_people(cell: str) -> str:
-    """Return a number as computers write it: minus, diameter and inch marks; others unchanged."""
+    """Return a number as computers write it: minus, diameter and inch marks, without thousands.
+
+    Other cells are unchanged.
+    """
+    if grouped := _GROUPED.fullmatch(cell):
+        cell = cell.replace(grouped[2], re.sub(r"\D", "", grouped[2]), 1)
     match = _MARKED.fullmatch(cell)
     if match is None:
         return cell
@@ -694,6 +710,27 @@ def _number_of_people(cell: str) -> str:
     return f"{sign}{match[2].replace('−', '-')}{' in' * bool(match[3])}"
 
 
-def _with_point(cell: str) -> str:
-    """Return a cell, its decimal comma as a point if it is a number, or one with a unit."""
-    return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell
+def _range_of_sizes(column: Sequence[str]) -> float:
+    """Return the largest number of a column, written with decimal commas, over the smallest."""
+    sizes = [abs(_number_in(cell.replace(",", "."))) for cell in column]
+    sizes = [size for size in sizes if size > 0.0]
+    return max(sizes, default=1.0) / min(sizes, default=1.0)
+
+
+def _with_points(lines: Lines) -> Lines:
+    """Return lines with points for decimal commas, also of numbers with a unit.
+
+    In a column with decimal commas, points are between thousands if all of them can be, and its
+    numbers are of more similar size then.
+    """
+    changed = list[list[str]]()
+    for cells_of in zip_longest(*(cells for _, cells in lines), fillvalue=""):
+        column = list(cells_of)
+        has_commas = any(map(_COMMA.fullmatch, column))
+        pointed = [cell for cell in column if _WITH_POINT.fullmatch(cell)]
+        if has_commas and all(map(_THOUSANDS.fullmatch, pointed)):
+            joined = [cell.replace(".", "") if cell in pointed else cell for cell in column]
+            column = min(joined, column, key=_range_of_sizes)
+        changed.append([x.replace(",", ".") if _COMMA.fullmatch(x) else x for x in column])
+    rows = zip(lines, zip(*changed, strict=True), strict=True)
+    return [(number, list(row[: len(cells)])) for (number, cells), row in rows]

@@ -120,6 +120,7 @@ class Follower:
     """
 
     def __init__(self, mechanism: Machine, start: Pose | None = None) -> None:
+        _check_machine(mechanism)
         _check_determined(mechanism)
         self._machine = mechanism
         self.configuration = mechanism.home_configuration

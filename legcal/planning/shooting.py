@@ -39,7 +39,7 @@ from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reading_units import reading_units
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import DatasetError, DidNotConverge, LegcalError, UsageError
+from legcal.errors import DatasetError, DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
@@ -336,14 +336,24 @@ class GuidedSession:
             cells |= self._readings(asked.q)
         if photograph is not None:
             image = asked.image + photograph.suffix.lower()
-            (self.folder / image).parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.folder / image, photograph.read_bytes())
         cells["image"] = image
+        try:
+            if photograph is not None:
+                (self.folder / image).parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(self.folder / image, photograph.read_bytes())
+            self._write_tables([*self._cells, cells])
+        except OSError as error:
+            raise OutOfResources(
+                "the photograph could not be taken into the dataset",
+                f"'{error.strerror or error}'",
+                "a folder that takes it",
+                "free some space there, and keep it then",
+                self.folder,
+            ) from error
         if checked is not None and checked.exposure is not None:
             self.exposures[image], self.facts[image] = checked.exposure, checked.facts
             if checked.legs is not None:
                 self.found[image] = checked.legs
-        self._write_tables([*self._cells, cells])
         self._accepted.append(image)
         if photograph is not None:
             self._digests[image] = _digest(photograph)

@@ -122,6 +122,7 @@ class Dialogue:
         self._take(asked, photograph, checked)
 
     def _take(self, asked: Asked, photograph: Path, checked: Checked) -> None:
+        self._refused = photograph, checked  # until it is taken
         self.session.accept(asked, photograph, checked=checked)
         legs = "" if checked.legs is None else f", {checked.legs.sum()} of {checked.n_visible} legs"
         blur = "" if checked.exposure is None else f", blur {checked.exposure.blur:.1f} px"

@@ -50,7 +50,8 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Subject
             "that name, needed a dataset, a result of legcal calibrate, a model, or one of "
             f"{', '.join(shipped_names())}; check the path."
         )
-    if os.path.isdir(path) and not any(os.path.exists(path / name) for name in _MARKERS):
+    has_models = any((path / "models").glob("*.yaml"))
+    if os.path.isdir(path) and not (has_models or any((path / x).exists() for x in _MARKERS)):
         raise UsageError(
             f"{path}: nothing could be shown: found a folder without {', '.join(_MARKERS[:-1])} or "
             f"{_MARKERS[-1]}, needed a dataset, a result of legcal calibrate, or a model; give one."

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.board import observe_board
+from legcal.calibration.diagnosis.leg_names import exchanged_legs
 from legcal.calibration.diagnosis.mistakes import (
     TURNS,
     Assumed,
@@ -30,8 +31,11 @@ from legcal.calibration.diagnosis.mistakes import (
 )
 from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
 from legcal.errors import LegcalError
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.perception.agreement import (
     Agreement,
@@ -61,6 +65,7 @@ _SAME_AMOUNT = 2  # of these that differ by how much
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 # kinds that may begin during a session, and how many of these are tried
 _OF_SOME, _MOST_OF_SOME = ("columns exchanged", "direction of an encoder", "readings shifted"), 3
+_RARE = ("joints exchanged",)  # kinds that are tried where no other makes all images agree
 _FINER = (0.5, 0.25)  # steps of an amount between those that are tried
 _SYMMETRIC = 0.03  # of the size of the machine, and the sine of angles
 _SAME = 0.03  # in the share of legs: no more than the lens makes of mirrored images
@@ -165,7 +170,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
         return ()
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
-        return ()
+        return judge.exchanged_legs()
     common = mistakes(data)
     tried = [
         *common,
@@ -181,6 +186,30 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
     first = [what for what, _ in likeliest]
     return (_diagnosis(first, likeliest[0][1], judge.own, by_hints=by_hints),)
+
+
+def wrong_names(
+    outlines: Outlines,
+    measurements: Measurements,
+    legs: Sequence[Leg],
+    ends: tuple[Array, Array],
+    cameras: Sequence[RigidTransform | None],
+) -> tuple[Diagnosis, ...]:
+    """Return given outlines that name other legs, as of :func:`exchanged_legs`."""
+    return tuple(
+        Diagnosis(
+            kind="legs exchanged",
+            what=one.what,
+            same_as=(),
+            mended="with the names corrected",
+            images=one.images,
+            before=one.before,
+            after=one.after,
+            score=one.score,
+            remedy=one.remedy,
+        )
+        for one in exchanged_legs(outlines, measurements, legs, ends, cameras)
+    )
 
 
 def agreement_with_zeros(data: OrderedDataset, zeros: Sequence[Mapping[str, float]]) -> list[float]:
@@ -260,6 +289,17 @@ class _Judge:
             self.pool[g] += [T for T in one.cameras if T is not None]
         self.own = Agreement.joined(self.of_groups)
         self.symmetries = symmetries(data.machine)
+
+    def exchanged_legs(self) -> tuple[Diagnosis, ...]:
+        """Return given outlines whose names contradict images that agree but for names."""
+        m, machine = self.data.measurements, self.data.machine
+        cameras: dict[int, RigidTransform | None] = {}
+        for group, one in zip(self.groups, self.of_groups, strict=True):
+            if one.cameras[0] is not None:
+                cameras |= group.cameras(one.cameras[0])
+        ends = self.given.joints(range(m.n_rows))
+        of_views = [cameras.get(v) for v in range(len(m.views))]
+        return wrong_names(self.data.photographs.keep, m, machine.legs, ends, of_views)
 
     def in_some_images(self, tried: Sequence[Mistake]) -> list[Mistake]:
         """Return mistakes in the readings of images that follow each other in the file.
@@ -567,7 +607,11 @@ class _Look:
         """Return the gains near known cameras, (n_tried,)."""
         if not self.is_near:
             known = [] if self.T_near is None else self.judge.alike(self.T_near)
-            self._at(self.some, (), [*known, *self.judge.known(self.g)] if known else ())
+            known += self.judge.known(self.g) if known else []
+            rare = [k for k in self.some if self.tried[k].kind in _RARE]
+            self._at([k for k in self.some if k not in rare], (), known)
+            if self.support.max(initial=0.0) < _AGREE_ALREADY * self.before.expected.sum():
+                self._at(rare, (), known)
             self.is_near = True
         return self._gained()
 

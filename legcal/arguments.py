@@ -1,0 +1,102 @@
+"""Calls of the public functions with arguments that they do not take, in words.
+
+Annotations say what a function takes; what works is never refused. A call that fails with an error
+of Python is looked at again: arguments that do not fit their annotations are its likely cause.
+"""
+
+from __future__ import annotations
+
+import inspect
+import numbers
+import os
+import sys
+import types
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from legcal.errors import LegcalError, UsageError
+
+_UNIONS = (Union, types.UnionType)
+_WORDS: dict[object, tuple[Any, str]] = {  # what may stand for a type, and what it is called
+    float: (numbers.Real, "a number"),
+    int: (numbers.Integral, "a whole number"),
+    bool: (bool, "True or False"),
+    str: (str, "a text"),
+    Path: (os.PathLike, "a path"),
+    type(None): (type(None), "None"),
+    Sequence: (Sequence, "a list"),
+    Mapping: (Mapping, "a mapping"),
+    Callable: (Callable, "a function"),
+}
+
+
+def with_arguments_in_words(function: Callable[..., Any], public: str) -> Callable[..., Any]:
+    """Return a function of the module *public* that raises UsageError for wrong arguments."""
+
+    @wraps(function)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except LegcalError:
+            raise
+        except (TypeError, ValueError, AttributeError) as error:
+            try:
+                given = inspect.signature(function).bind(*args, **kwargs).arguments
+            except TypeError:  # names the argument that is missing or not known
+                raise error from None
+            check_arguments(f"{public}.{function.__name__}", _annotations(function, public), given)
+            raise
+
+    called.__module__ = public  # where processes that are handed it find it
+    return called
+
+
+def check_arguments(name: str, annotations: Mapping[str, Any], given: Mapping[str, object]) -> None:
+    """Raise UsageError with all arguments that do not fit their annotations."""
+    wrong = [
+        f"{name} could not be run: found {value!r:.60} ({type(value).__name__}) as {argument}, "
+        f"needed {' or '.join(dict.fromkeys(_in_words(annotations[argument])))}; correct it."
+        for argument, value in given.items()
+        if argument in annotations and not _fits(value, annotations[argument])
+    ]
+    if wrong:
+        raise UsageError(wrong)
+
+
+def _annotations(function: Callable[..., Any], public: str) -> dict[str, Any]:
+    """Return the types of a function, also those that its module does not import."""
+
+    class Names(dict[str, Any]):
+        def __missing__(self, name: str) -> Any:
+            try:
+                return getattr(sys.modules[public], name)
+            except AttributeError:
+                raise KeyError(name) from None
+
+    return get_type_hints(function, localns=Names())
+
+
+def _fits(value: object, annotation: Any) -> bool:
+    """Return whether a value may be of a type; whatever is not known fits."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin in _UNIONS:
+        return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return value in parts
+    sought = origin or annotation
+    if not isinstance(sought, type) or getattr(sought, "_is_protocol", False):
+        return True
+    return isinstance(value, _WORDS.get(sought, (sought, ""))[0])
+
+
+def _in_words(annotation: Any) -> list[str]:
+    """Return the types that fit in words."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin in _UNIONS:
+        return [word for part in parts for word in _in_words(part)]
+    if origin is Literal:
+        return [str(part) for part in parts]
+    sought = origin or annotation
+    return [_WORDS[sought][1] if sought in _WORDS else getattr(sought, "__name__", str(sought))]

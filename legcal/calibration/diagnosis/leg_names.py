@@ -1,0 +1,139 @@
+"""Outlines that were given under the names of other legs, as exchanged in one view.
+
+Where the legs and a camera are known, nearly, it is seen which leg each outline belongs to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data.measurements import Measurements, few, few_views
+from legcal.data.outlines import Outlines, along_legs
+from legcal.geometry.lines import cross
+from legcal.geometry.types import Array
+from legcal.machine.leg import Leg
+
+_NEARER = 0.2  # of the distance from the leg that they name: to the one that they belong to
+_MIN_OUTLINES = 4  # of each leg
+
+
+class WrongNames(NamedTuple):
+    """Legs of some views whose outlines lie at each other's place."""
+
+    what: str  # clauses, as of a Diagnosis
+    remedy: str
+    images: int  # that show them
+    before: int  # with their outlines nearer to the legs that they name
+    after: int
+    score: float  # share of the outlines that are nearer to others
+
+
+def exchanged_legs(
+    outlines: Outlines,
+    measurements: Measurements,
+    legs: Sequence[Leg],
+    ends: tuple[Array, Array],
+    cameras: Sequence[RigidTransform | None],
+) -> list[WrongNames]:
+    """Return legs whose outlines lie at each other's place in views.
+
+    Parameters
+    ----------
+    outlines : Outlines
+        The outlines that were given, whatever a fit rejected.
+    measurements, legs
+        Those of the session.
+    ends : (n_rows, n_legs, 3) arrays
+        Joints A and B in each image, in the base; NaN where they are not known.
+    cameras : sequence of RigidTransform or None
+        T_base_camera of each view, where it is known.
+    """
+    o = along_legs(outlines, legs)
+    o = o.choose(np.asarray(np.isfinite(o.h).all(axis=1)))
+    radius = np.array(
+        [legs[j].radius_along[part] for j, part in zip(o.leg.tolist(), o.part, strict=True)]
+    )
+    off, at = np.full((len(o), len(legs)), np.nan), measurements.view[o.row]
+    for v, T_base_camera in enumerate(cameras):
+        of_view = np.flatnonzero(at == v)
+        if T_base_camera is not None and len(of_view):
+            camera, T = measurements.views[v].camera, T_base_camera.inv()
+            xy = camera.undistort(o.ends[of_view].reshape(-1, 2))
+            rays = np.column_stack([xy, np.ones(len(xy))]).reshape(-1, 2, 3)
+            A, B = (T.apply(x[o.row[of_view]].reshape(-1, 3)).reshape(-1, len(legs), 3)
+                    for x in ends)  # fmt: skip
+            off[of_view] = _distances(rays, A, B, radius[of_view])
+    found = dict[tuple[tuple[int, int], ...], list[int]]()
+    for v in range(len(cameras)):
+        for names in _permuted(off[at == v], o.leg[at == v]):
+            found.setdefault(names, []).append(v)
+    return [_in_words(measurements, legs, o, off, *one) for one in found.items()]
+
+
+def _distances(rays: Array, A: Array, B: Array, radius: Array) -> Array:
+    """Return how far outlines are from where those of each leg would be, (n, n_legs) [m].
+
+    By rays (n, 2, 3) through their ends and joints (n, n_legs, 3) in the camera: an outline touches
+    the cylinder, so that its rays pass the axis at the radius.
+    """
+    along, toward = (B - A)[:, None], rays[:, :, None]
+    # Distance of two lines: the axis, and the ray through the camera centre
+    across = np.linalg.norm(cross(toward, along), axis=-1)
+    passes = np.abs(np.sum(toward * cross(A[:, None], along), axis=-1)) / across
+    return np.asarray(np.abs(passes - radius[:, None, None]).max(axis=1))
+
+
+def _permuted(off: Array, leg: Array) -> Iterator[tuple[tuple[int, int], ...]]:
+    """Yield legs of a view with those whose place their outlines take, a cycle at a time."""
+    belongs = dict[int, int]()
+    for j in np.unique(leg).tolist():
+        of_leg = off[leg == j]
+        if len(of_leg) >= _MIN_OUTLINES and np.isfinite(of_leg).all():
+            median = np.median(of_leg, axis=0)
+            k = int(np.argmin(median))
+            if median[k] < _NEARER * median[j]:
+                belongs[j] = k
+    while belongs:
+        first, cycle = next(iter(belongs)), list[tuple[int, int]]()
+        j = first
+        while j in belongs:
+            cycle.append((j, belongs.pop(j)))
+            j = cycle[-1][1]
+        if j == first:
+            yield tuple(cycle)
+
+
+def _in_words(
+    m: Measurements,
+    legs: Sequence[Leg],
+    o: Outlines,
+    off: Array,
+    names: tuple[tuple[int, int], ...],
+    views: Sequence[int],
+) -> WrongNames:
+    """Return outlines that name other legs in some views, in words."""
+    renamed = dict(names)
+    of = np.flatnonzero(np.isin(m.view[o.row], views) & np.isin(o.leg, list(renamed)))
+    own = off[of, o.leg[of]]
+    other = off[of, [renamed[j] for j in o.leg[of].tolist()]]
+    rows, image = np.unique(o.row[of], return_inverse=True)
+    nearer = np.bincount(image, np.where(other < own, 1.0, -1.0))
+    named = [legs[j].name for j in renamed]
+    where = few_views([m.views[v].name for v in views])
+    if len(named) == 2:
+        what, remedy = f"{' and '.join(named)} appear to be exchanged", "exchange these names"
+    else:
+        pairs = [f"{legs[j].name} those of {legs[k].name}" for j, k in names]
+        what, remedy = f"{few(named)} name other legs ({few(pairs)})", "correct these names"
+    return WrongNames(
+        f"the outlines of {what} in {where}",
+        f"{remedy} there (columns leg and part of observations.csv)",
+        len(rows),
+        int(np.sum(nearer <= 0.0)),
+        int(np.sum(nearer > 0.0)),
+        float(np.mean(other < own)),
+    )
