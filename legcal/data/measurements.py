@@ -21,11 +21,13 @@ from legcal.brief import brief
 from legcal.causes import Cause, by_cause
 from legcal.data.reading_units import (
     ReadingUnit,
+    UnitPlace,
     default_unit,
     doubtful_units,
     joint_values,
     legs_with_readings,
     likely_cause,
+    readings_of_lengths,
     sigmas_of_legs,
 )
 from legcal.errors import DatasetError, Problem
@@ -274,20 +276,28 @@ def unread_motors(path: Path, legs: Sequence[Leg]) -> tuple[str, ...]:
 def readings_in(
     table: Table,
     legs: Sequence[Leg],
-    units: Mapping[str, ReadingUnit] | None = None,
+    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
     sigma: Array | None = None,
+    *,
+    place: UnitPlace = "",
+    lengths: bool = False,
+    headings: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
     Readings outside their travel by more than 5 % of it are refused; smaller excesses are noted if
     they exceed rounding and noise. Many readings that hardly move in their unit and use the travel
-    in a larger one are refused as well. *units* and standard deviations *sigma* (n_motors,) come
-    from a dataset; without units, tables are in m and rad.
+    in a larger one are refused as well.
+
+    *units* are stated in a *place*, m and rad by default; *sigma* (n_motors,) are their standard
+    deviations. The numbers may be whole *lengths* of legs, under *headings* of the owner.
     """
     motors = legs_with_readings(legs)
     values = table.numbers(str(leg.prismatic) for leg in motors)
-    stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in motors]
+    names = [headings.get(str(leg.prismatic), str(leg.prismatic)) for leg in motors]
+    stated = [units.get(str(leg.prismatic), default_unit(leg)) for leg in motors]
     readings = joint_values(values, stated)
+    readings = readings_of_lengths(readings, motors) if lengths else readings
     noise = np.zeros(len(motors)) if sigma is None else NOISY * sigma
     notes, outside, often = [], dict[int, str](), dict[tuple[bool, str], list[int]]()
     for j, (leg, unit, column) in enumerate(zip(motors, stated, readings.T, strict=True)):
@@ -297,8 +307,9 @@ def readings_in(
         beyond = np.maximum(lower - column, column - upper)
         is_odd = beyond > max(ROUNDED * (upper - lower), float(noise[j]))
         is_far = (beyond > 0.0) & ~leg.in_travel(column)
-        ends = sorted(map(unit.reading, leg.travel))
-        travel = f"{ends[0]:g} to {ends[1]:g} {unit.name} (the joint limits of the model)"
+        ends = [leg.length_at(q) if lengths else q for q in leg.travel]
+        low, high = sorted(map(unit.reading, ends))
+        travel = f"{low:g} to {high:g} {unit.name} (the joint limits of the model)"
         if np.any(is_far):
             some, n = _some(table, values[:, j], is_far, unit.name), len(column)
             outside[j] = f"found {some}, needed {travel} with a margin of {TRAVEL_MARGIN:.0%}"
@@ -306,12 +317,12 @@ def readings_in(
                 often.setdefault((leg.reads_angle, unit.name), []).append(j)
         elif np.any(is_odd):
             notes.append(
-                f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
+                f"{table.path}, column {names[j]}: readings are a little outside the travel "
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
     still = np.ptp(readings, axis=0) == 0.0 if len(readings) else np.ones(len(motors), dtype=bool)
     if still.any() and not still.all():
-        constant = few([str(leg.prismatic) for leg, one in zip(motors, still, strict=True) if one])
+        constant = few([name for name, one in zip(names, still, strict=True) if one])
         notes.append(
             f"{table.path}: found the same reading in all rows of {constant}, while other encoders "
             "move; check that these were recorded, and move these legs as well."
@@ -319,24 +330,23 @@ def readings_in(
     groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
-        if cause := likely_cause(values[:, alike], *of_alike, in_dataset=units is not None):
+        if not lengths and (cause := likely_cause(values[:, alike], *of_alike, place)):
             groups |= {j: ([], "") for j in alike} | {alike[0]: (alike, cause)}
     for j, actual in outside.items():
         columns, remedy = groups.get(j, ([j], "correct the readings or the limits"))
         if not columns:
             continue
-        where = f"in {motors[j].prismatic} " * (len(columns) > 1)
+        where = f"in {names[j]} " * (len(columns) > 1)
         table.refuse_file(
             Problem(
                 f"readings are outside the travel: {where}{actual}",
                 remedy=remedy,
                 file=str(table.path),
-                columns=tuple(str(motors[k].prismatic) for k in columns),
+                columns=tuple(names[k] for k in columns),
             )
         )
-    if not outside:
-        statement = "write readings: {} in the dataset file"
-        for problem in doubtful_units(table.path, values, motors, stated, statement):
+    if not outside and not lengths:
+        for problem in doubtful_units(table.path, values, motors, stated, place):
             table.refuse_file(problem)
     return readings, tuple(notes)
 
@@ -386,7 +396,7 @@ def read_measurements(
     _refuse_images(table, images, folder)
     motors = legs_with_readings(legs)
     sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
-    readings, notes = readings_in(table, legs, units, sigma)
+    readings, notes = readings_in(table, legs, units, sigma, place="dataset file")
     pose, labels = _poses(table.text("pose"))
     q = np.full((len(table), len(legs)), math.nan)
     q[:, [not leg.has_value for leg in legs]] = 0.0

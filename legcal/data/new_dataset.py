@@ -273,6 +273,7 @@ def plan_new_dataset(
         encoder_sigma=sigma,
         notes=(
             *sheet.notes,
+            *sheet_readings.notes,
             *matching.notes,
             *sigma_notes,
             *_made_notes(cameras, made),

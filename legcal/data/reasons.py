@@ -23,7 +23,7 @@ class Reason(StrEnum):
     words: str
     words_of_detail: str  # with a place for the detail; "" if none is shown
 
-    def __new__(cls, code: str, words: str, words_of_detail: str = "") -> Reason:
+    def __new__(cls, code: str, words: str = "", words_of_detail: str = "") -> Reason:
         """Return a row of the table."""
         member = str.__new__(cls, code)
         member._value_ = code

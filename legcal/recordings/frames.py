@@ -406,7 +406,7 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
     times = _seconds(sheet.text("time"), path)
     in_words = f"{readings.unit}, {readings.unit_from}"
     return _in_order(
-        Series(str(path), times, readings.q, sheet.taken, in_words, tuple(sheet.notes))
+        Series(str(path), times, readings.q, sheet.taken, in_words, (*sheet.notes, *readings.notes))
     )
 
 
