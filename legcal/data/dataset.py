@@ -34,8 +34,8 @@ from legcal.data.measurements import (
     View,
     few,
     few_views,
-    read_measurements,
-    unread_motors,
+    measurement_table,
+    measurements_in,
 )
 from legcal.data.outlines import Outlines, are_of_bodies, read_observations
 from legcal.data.photograph_notes import notes_on_photographs
@@ -332,7 +332,7 @@ def load_dataset(
     table_path = folder / entry.measurements
     units = reading_units(yaml_path, machine.legs, entry.readings)
     sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
-    unread = unread_motors(table_path, machine.legs)
+    table, unread = measurement_table(table_path, machine.legs, units)
     if unread:
         # Without readings of what moves joints at A, their positions are unknown.
         moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
@@ -345,9 +345,7 @@ def load_dataset(
             )
         machine = load_mechanism(mechanism, without=unread)
         by_joint = {name: sigma for name, sigma in by_joint.items() if name not in unread}
-    rows, notes = read_measurements(
-        table_path, folder, views, machine.legs, sigma_q, by_joint, units, unread
-    )
+    rows, notes = measurements_in(table, folder, views, machine.legs, sigma_q, by_joint, units)
     if unread:
         notes = (*notes, _without_readings(table_path, machine, unread))
     if in_mm:

@@ -197,14 +197,7 @@ def find_dataset_file(location: Path) -> Path:
 
 def read_dataset_file(path: Path) -> DatasetEntry:
     """Return the checked content of dataset.yaml."""
-    document = read_yaml(path, "dataset file")
-    version = document.get("legcal_dataset", 1)
-    if version != 1 or isinstance(version, bool):
-        raise DatasetError(
-            f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
-            "needed version 1; use the legcal that wrote it, or write the file as version 1."
-        )
-    return validate(DatasetEntry, document, path)
+    return validate(DatasetEntry, read_yaml(path, "dataset file"), path)
 
 
 def entry_problem(path: Path, entry: str, found: str, needed: str, remedy: str) -> Problem:

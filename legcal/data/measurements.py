@@ -9,7 +9,7 @@ name their rows by view and image, see :func:`row_names`.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -30,7 +30,7 @@ from legcal.data.reading_units import (
     readings_of_lengths,
     sigmas_of_legs,
 )
-from legcal.errors import DatasetError, Problem
+from legcal.errors import Problem
 from legcal.files.folder import path_problem
 from legcal.files.schema import closest, describe
 from legcal.files.table import Column, Table, read_table
@@ -256,23 +256,6 @@ def reading_columns(
     ]
 
 
-def unread_motors(path: Path, legs: Sequence[Leg]) -> tuple[str, ...]:
-    """Return the motors with empty readings in all rows of a table.
-
-    Other problems of the table are ignored here.
-    """
-    motors = [str(leg.prismatic) for leg in legs_with_readings(legs)]
-    others = [Column(name, "text", blank=True, required=False) for name in _TEXTS]
-    columns = [Column(name, "text", blank=True, required=False) for name in motors]
-    try:
-        table = read_table(path, "table of measurements", "row", [*others, *columns])
-    except DatasetError:
-        return ()
-    return tuple(
-        name for name in motors if name in table and len(table) and not any(table.text(name))
-    )
-
-
 def readings_in(
     table: Table,
     legs: Sequence[Leg],
@@ -359,34 +342,40 @@ def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:
     return shown + (f" and {len(index) - _MAX_SHOWN} more" if len(index) > _MAX_SHOWN else "")
 
 
-def read_measurements(
-    path: Path,
-    folder: Path,
-    views: Sequence[View],
-    legs: Sequence[Leg],
-    sigma_q: float,
-    sigma_by_joint: Mapping[str, float] = MappingProxyType({}),
-    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
-    unread: Collection[str] = (),
-) -> tuple[Measurements, tuple[str, ...]]:
-    """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
-
-    Images are relative to ``folder``; their existence is not checked. Columns of *unread* motors
-    are empty: *legs* have no readings of these. Raises DatasetError with one sentence for each
-    problem.
-    """
-    texts = [
-        *(Column(name, "text", required=name != "pose") for name in _TEXTS),
-        *(Column(name, "text", blank=True) for name in unread),
-        Column("time", unit="seconds", required=False, blank=True),
-    ]
+def measurement_table(
+    path: Path, legs: Sequence[Leg], units: Mapping[str, ReadingUnit]
+) -> tuple[Table, tuple[str, ...]]:
+    """Return the table ``measurements.csv``, and the motors whose column of readings is empty."""
     table = read_table(
         path,
         "table of measurements",
         "row",
-        [*texts, *reading_columns(legs, units)],
+        [
+            *(Column(name, "text", required=name != "pose") for name in _TEXTS),
+            Column("time", unit="seconds", required=False, blank=True),
+            *reading_columns(legs, units),
+        ],
         needed="one row for each image; record measurements",
     )
+    unread = tuple(name for name in units if len(table) and not any(table.text(name)))
+    table.forgive(unread)
+    return table, unread
+
+
+def measurements_in(
+    table: Table,
+    folder: Path,
+    views: Sequence[View],
+    legs: Sequence[Leg],
+    sigma_q: float,
+    sigma_by_joint: Mapping[str, float],
+    units: Mapping[str, ReadingUnit],
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Return the rows of the table ``measurements.csv`` in its order, and notes on odd readings.
+
+    Images are relative to ``folder``; their existence is not checked. *legs* have no readings of
+    motors whose column is empty. Raises DatasetError with one sentence for each problem.
+    """
     view_index = {view.name: i for i, view in enumerate(views)}
     view_names, images = table.text("view"), table.text("image")
     for row, name in enumerate(view_names):

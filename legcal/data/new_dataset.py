@@ -28,7 +28,7 @@ from legcal.data.photograph_matching import (
     match,
     with_likely_views,
 )
-from legcal.data.reading_units import are_commands, default_unit, sigma_in, usual_sigma
+from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_path, holds_files, new_files, result_folder
@@ -378,27 +378,20 @@ def _sigmas(
     least: float,  # minimum default [m]
 ) -> tuple[float | dict[str, float], list[str]]:
     """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
-    sigmas = dict[str, float]()
-    for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
-        name = str(leg.prismatic)
-        sigma = stated.get(name) if isinstance(stated, Mapping) else stated
-        if sigma is None:
-            sigmas[name] = max(digit, usual_sigma(leg, least, unit))
-            continue
-        try:
-            of_number = unit if isinstance(sigma, str) else default_unit(leg)
-            sigmas[name] = sigma_in(sigma, of_number, leg)
-        except ValueError as error:
-            raise UsageError(f"--encoder-sigma could not be used: {error}") from None
+    units = dict(zip((str(leg.prismatic) for leg in motors), readings.units, strict=True))
+    sigmas = {
+        name: max(digit, usual_sigma(leg, least, units[name]))
+        for name, leg, digit in zip(units, motors, readings.digits.tolist(), strict=True)
+    }
+    sigmas |= {} if stated is None else sigmas_of(stated, motors, units)
     slides = not any(leg.reads_angle for leg in motors)
     smallest = min(sigmas.values())
     notes = []
     if stated is None:
         shown = f"{1e6 * smallest:.3g} um"
         if not slides:
-            units = [leg.reading_unit for leg in motors]
-            of_motor = zip(sigmas.items(), units, strict=True)
-            shown = few([f"{name} {sigma:.2g} {unit}" for (name, sigma), unit in of_motor])
+            of_motor = zip(motors, sigmas.items(), strict=True)
+            shown = few([f"{name} {x:.2g} {leg.reading_unit}" for leg, (name, x) in of_motor])
         why = "the last digit of the table, at least that of a good encoder"
         if any(map(are_commands, motors, readings.units)):
             why = "half a degree of what a hobby servo makes of its command"

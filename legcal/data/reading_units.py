@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -243,25 +244,39 @@ def usual_sigma(leg: Leg, sigma_q: float, unit: ReadingUnit | None = None) -> fl
     return SERVO_SIGMA if are_commands(leg, unit) else SIGMA_ANGLE
 
 
-def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
-    """Return the standard deviations of readings [m or rad] from one statement, by motor.
+def sigmas_of(
+    stated: float | str | Mapping[str, float | str],
+    legs: Sequence[Leg],
+    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
+) -> dict[str, float]:
+    """Return the standard deviations of readings [m or rad] that are stated, by motor.
 
-    A number applies to every motor in its own unit [m or rad], a text with a unit to the motors
-    of that kind, sliding or turning.
+    A number applies to every motor in its own unit [m or rad], a text with a unit (of lengths,
+    angles, or pulses of *units*) to the motors of that kind, sliding or turning.
 
     Raises
     ------
     UsageError
         If no motor can have it.
     """
-    motors = legs_with_readings(legs)
-    unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
-    alike = [leg for leg in motors if unit in (ANGLE if leg.reads_angle else LENGTH)]
-    some = alike or motors
+    motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
+    if not isinstance(stated, Mapping):
+        unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
+        alike = [name for name, leg in motors.items() if takes_unit(unit, turns=leg.reads_angle)]
+        stated = dict.fromkeys(alike or motors, stated)
     try:
-        return {str(leg.prismatic): sigma_in(stated, default_unit(leg), leg) for leg in some}
+        return {
+            name: sigma_in(
+                sigma,
+                units.get(name, default_unit(motors[name]))
+                if isinstance(sigma, str)
+                else default_unit(motors[name]),
+                motors[name],
+            )
+            for name, sigma in stated.items()
+        }
     except ValueError as error:
-        raise UsageError(f"The encoder sigma could not be used: {error}") from error
+        raise UsageError(f"--encoder-sigma could not be used: {error}") from error
 
 
 def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:

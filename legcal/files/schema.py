@@ -91,13 +91,16 @@ def plain_name(name: object) -> object:
     return name
 
 
+_THIS_VERSION = "version 1"
+
+
 def _version(value: object) -> object:
     """Refuse ``true``, which equals 1 in Python, and the formats of later versions."""
     if isinstance(value, bool):
         raise BadValue(str(value).lower(), "1", "correct the value")
     if isinstance(value, int) and value > 1:
         remedy = "use the legcal that wrote it, or write the file as version 1"
-        raise BadValue(describe(value), "version 1", remedy)
+        raise BadValue(describe(value), _THIS_VERSION, remedy)
     return value
 
 
@@ -277,8 +280,10 @@ def validate(
     try:
         return schema.model_validate(dict(document))
     except ValidationError as error:
-        details = error.errors(include_url=False)
-        raise kind([_problem(schema, e, path, prefix) for e in details]) from error
+        problems = [_problem(schema, e, path, prefix) for e in error.errors(include_url=False)]
+        if any(problem.needed == _THIS_VERSION for problem in problems):  # has keys of its own
+            problems = [p for p in problems if p.code is not Code.UNKNOWN_KEY]
+        raise kind(problems) from error
 
 
 class _Short(reprlib.Repr):

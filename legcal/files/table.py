@@ -15,7 +15,7 @@ import math
 import re
 import unicodedata
 import zipfile
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
@@ -210,6 +210,10 @@ class Table:
         self._cells = [self._cells[row] for row in kept_rows]
         self._numbers = {name: values[kept_rows] for name, values in self._numbers.items()}
         self._problems = [problem for problem in self._problems if problem.line not in gone]
+
+    def forgive(self, names: Container[str]) -> None:
+        """Discard the problems of cells of some columns."""
+        self._problems = [p for p in self._problems if not any(name in names for name in p.columns)]
 
     def check(self) -> None:
         """Raise DatasetError with everything that is wrong, by line."""

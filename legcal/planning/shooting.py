@@ -34,7 +34,7 @@ from legcal.data.dataset import POSES_NAME, Dataset, inspect_files, load_dataset
 from legcal.data.dataset_file import read_dataset_file
 from legcal.data.image_choice import dataset_at
 from legcal.data.image_tables import measurements_at
-from legcal.data.measurements import read_measurements
+from legcal.data.measurements import measurement_table, measurements_in
 from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reading_units import reading_units
@@ -150,8 +150,9 @@ class GuidedSession:
         self._planned, planned = rows, m
         if path.is_file():
             self._planned = _cells(path)[1]
-            planned, _ = read_measurements(
-                path, self.folder, m.views, self.machine.legs, m.sigma_q, m.sigma_by_joint,
+            whole, _ = measurement_table(path, self.machine.legs, self._units)
+            planned, _ = measurements_in(
+                whole, self.folder, m.views, self.machine.legs, m.sigma_q, m.sigma_by_joint,
                 self._units,
             )  # fmt: skip
         done = {_label(cells) for cells in self._cells}
