@@ -184,7 +184,7 @@ def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path
     given = Dimensions(type="RPR", min_length=230.0, max_length=370.0, leg_radius=12.0)
     made = assemble(description_of(path, given))
     assert made.planar
-    at_home = [made.home.motion().apply(leg.B_platform)[:2] for leg in made.legs]
+    at_home = [made.home.apply(leg.B_platform)[:2] for leg in made.legs]
     np.testing.assert_allclose(at_home, 1e-3 * np.array(joints["B"]), atol=1e-9)
     rows[3:] = ["B1;0;-140", "B2;121.2;70", "B3;-121.2;70"]  # in the platform link
     path.write_text("\n".join(["Gelenk;X (mm);Y (mm)", *rows]))

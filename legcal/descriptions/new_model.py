@@ -17,10 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
+from legcal.descriptions.description import (
+    ROUNDING,
+    Assembled,
+    AssembledLeg,
+    Description,
+    assemble,
+    leg_type,
+)
 from legcal.descriptions.table import BESIDE, described_machine, read_description
 from legcal.errors import LegcalError, Problem, UsageError
 from legcal.files.folder import new_files, with_schema
+from legcal.files.motions import motion_to_xyz_quat
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import plain_name
 from legcal.geometry.lines import cross, normal_basis
@@ -382,7 +390,7 @@ def urdf_text(machine: Assembled) -> str:
     tree.link("base")
     tree.link("platform")
     if machine.planar:
-        height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
+        height = np.array([0.0, 0.0, machine.home.translation[2]])
         tree.connect("platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
     else:
         tree.connect("platform_free", "floating", ("base", "platform"))
@@ -407,7 +415,10 @@ def yaml_text(machine: Assembled) -> str:
             "platform": "platform",
             "platform_joint": "platform_free",
             "base_frame": list(machine.base_frame),
-            "home": {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)},
+            "home": {
+                key: [x if abs(x) > ROUNDING else 0.0 for x in numbers]
+                for key, numbers in motion_to_xyz_quat(machine.home).items()
+            },
             **({"home_readings": dict(machine.home_readings)} if machine.home_readings else {}),
             **({"motors": stated} if stated else {}),
             "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
@@ -462,8 +473,8 @@ class _Branch:
     def __init__(self, tree: UrdfBuilder, machine: Assembled, leg: AssembledLeg) -> None:
         self._tree, self._leg = tree, leg
         self._from_base = _hangs_from_base(leg)
-        self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
-        self._T = machine.T_base_platform
+        self._R_base_platform = machine.home.rotation.as_matrix()
+        self._T = machine.home
         self._carrier, self._A = "base", leg.A_base  # the link at the start, and A in it
         self._R_base_carrier = np.eye(3)  # at home
         if leg.actuator is not None:

@@ -42,7 +42,6 @@ from legcal.descriptions.description import (
     MAX_NUMBER,
     NEEDED_TYPE,
     Description,
-    Home,
     LegEntry,
     LegType,
     check_links,
@@ -77,6 +76,7 @@ from legcal.files.table import (
     read_table,
     split_heading,
 )
+from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind, Pulses
 from legcal.machine.files import FrameLegs
@@ -676,15 +676,20 @@ def _description(file: TableFile, source: str) -> Description:
                 None if motor is None else actuators[motor],
             )
         )  # fmt: skip
+    home = turn = None
+    if file.home is not None and file.home.quat_xyzw is not None:
+        turn = Rotation.from_quat(file.home.quat_xyzw)
+    elif file.home is not None and file.home.rpy_deg is not None:
+        turn = Rotation.from_euler("xyz", file.home.rpy_deg, degrees=True)
+    if file.home is not None and file.home.xyz is not None and turn is not None:
+        home = motion_of(turn.as_matrix(), np.array(file.metres(file.home.xyz)))
     frame = None if file.base_frame is None else tuple(file.base_frame)
     described = Description(
-        file.name, source, file.unit, tuple(legs), _home(file), frame, tuple(notes),
+        file.name, source, file.unit, tuple(legs), home, frame, tuple(notes),
         {name: file.metres(q) for name, q in (file.home_readings or {}).items()}
         | {name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
     )  # fmt: skip
     if file.home is not None and file.home.height is not None:
-        has_turn = file.home.quat_xyzw is not None or file.home.rpy_deg is not None
-        turn = _turn(file.home) if has_turn else None
         return home_at_height(described, in_metres(file.home.height, file.unit), turn)
     if file.platform_in == "base":
         return joints_from_base(described)
@@ -697,21 +702,6 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
         return None
     axis = np.array(axes[j], dtype=float)
     return np.asarray(axis / np.linalg.norm(axis))
-
-
-def _home(file: TableFile) -> Home | None:
-    if file.home is None or file.home.xyz is None:
-        return None
-    xyz = tuple(file.metres(file.home.xyz))
-    if file.home.quat_xyzw is not None:
-        return Home(xyz, file.home.quat_xyzw)
-    return Home.of(xyz, _turn(file.home))
-
-
-def _turn(home: HomeEntry) -> Rotation:
-    if home.quat_xyzw is not None:
-        return Rotation.from_quat(home.quat_xyzw)
-    return Rotation.from_euler("xyz", home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
 
 
 def _check_legs(described: Description, problems: Problems) -> None:
