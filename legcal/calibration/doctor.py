@@ -50,12 +50,13 @@ from legcal.causes import Cause, by_cause
 from legcal.data.cache import note_on_missing_photographs
 from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
 from legcal.data.image_choice import dataset_at
-from legcal.data.measurements import few, few_views, images_in_words, reading_columns, row_names
+from legcal.data.measurements import few_views, images_in_words, reading_columns, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
 from legcal.data.photograph_notes import compression_notes, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, Problem
 from legcal.files.folder import output_path
+from legcal.files.schema import few
 from legcal.geometry.types import Array, BoolArray
 from legcal.perception.diagnostics import defect_notes, is_out_of_sight
 from legcal.perception.image_quality import Exposure, measure_exposure

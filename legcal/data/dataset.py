@@ -32,7 +32,6 @@ from legcal.data.landmarks import (
 from legcal.data.measurements import (
     Measurements,
     View,
-    few,
     few_views,
     measurement_table,
     measurements_in,
@@ -51,7 +50,7 @@ from legcal.data.reading_units import (
 from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
 from legcal.files.motions import motion_from_xyz_quat
-from legcal.files.schema import closest, describe
+from legcal.files.schema import closest, describe, few
 from legcal.machine.files import shipped_folder, shipped_names
 from legcal.machine.leg import Link
 from legcal.machine.loader import load_mechanism

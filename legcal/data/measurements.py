@@ -32,13 +32,12 @@ from legcal.data.reading_units import (
 )
 from legcal.errors import Problem
 from legcal.files.folder import path_problem
-from legcal.files.schema import closest, describe
+from legcal.files.schema import closest, describe, few
 from legcal.files.table import Column, Table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import TRAVEL_MARGIN, Leg
 from legcal.vision.camera import Camera
 
-MAX_NAMED = 5  # maximum number of names in one sentence
 # Fraction of the travel, and standard deviations: readings outside by less are within the travel
 # but for rounding and noise.
 ROUNDED, NOISY = 1e-3, 3.0
@@ -208,12 +207,6 @@ def refuse_outside(
     for i, k in np.argwhere(outside).tolist():
         needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"
         table.refuse(i, f"{px[i, k]:g} px", needed, columns[k], remedy="correct it")
-
-
-def few(names: Sequence[str]) -> str:
-    """Return a list of at most a few names: ``c1, c2 and 3 more``."""
-    more = len(names) - MAX_NAMED
-    return ", ".join(names[:MAX_NAMED]) + f" and {more} more" * (more > 0)
 
 
 def few_views(names: Sequence[str]) -> str:

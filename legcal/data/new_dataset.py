@@ -18,7 +18,7 @@ from typing import Any
 
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import MEASUREMENTS, dataset_texts
-from legcal.data.measurements import few, few_views, reading_columns
+from legcal.data.measurements import few_views, reading_columns
 from legcal.data.photograph_matching import (
     Matching,
     Photograph,
@@ -31,9 +31,9 @@ from legcal.data.photograph_matching import (
 from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import OutputKind, check_path, holds_files, new_files, result_folder
+from legcal.files.folder import OutputKind, check_empty, check_path, new_files, result_folder
 from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
+from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
 from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -49,10 +49,10 @@ from legcal.vision.image_file import (
     read_facts,
 )
 
-DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
+DATASET_FOLDER = OutputKind("dataset", "", "")  # may contain other files
 _WIDENED = 1.2  # uncertainty of a focal length, over the usual one, that is explained
 _EXAMPLE = "examples/hexapod"
-_EXAMPLE_KIND = OutputKind("example", "", "legcal_dataset")
+_EXAMPLE_KIND = OutputKind("example", "", "")
 # Without results of a calibration beside them
 _EXAMPLE_FILES = (
     "dataset.yaml", "measurements.csv", "camera_info.yaml", "images", "models", "urdf"
@@ -106,7 +106,6 @@ class NewDataset:
     destination: Path  # the folder of the dataset
     # Meaning of each heading of the table: a joint, view, image, pose or time
     columns: Mapping[str, str]
-    are_lengths: bool  # whether the table holds whole lengths of legs
     rows: tuple[Row, ...]  # the entries of each row of the table about its photograph
     poses: tuple[str, ...]  # the pose of each row; empty where the table does not name them
     matching: Matching  # pairs of row and photograph
@@ -133,7 +132,7 @@ class NewDataset:
             columns=dict(self.columns),
             unit=self.readings.unit,
             unit_from=self.readings.unit_from,
-            lengths=self.are_lengths,
+            lengths=self.readings.are_lengths,
             matched=self.matching.how,
             encoder_sigma=self.encoder_sigma,
             views={view: ViewToWrite(camera=str(path)) for view, path in self.cameras.items()},
@@ -263,7 +262,6 @@ def plan_new_dataset(
         table=path,
         destination=destination,
         columns=sheet.taken,
-        are_lengths=sheet_readings.are_lengths,
         rows=rows,
         poses=sheet.text("pose") if "pose" in sheet else (),
         matching=matching,
@@ -515,12 +513,7 @@ def copy_example(destination: Path) -> None:
     OutOfResources
         If it does not take the files, or legcal was installed without them.
     """
-    check_path(destination, _EXAMPLE_KIND)
-    if destination.is_dir() and holds_files(destination):
-        raise UsageError(
-            f"{destination}: the example could not be written: found a folder with files, needed "
-            "a new or empty one; give another folder with -o."
-        )
+    check_empty(destination, _EXAMPLE_KIND)
     source = shipped_folder(_EXAMPLE)
     if not (source / DATASET_YAML).is_file():
         raise OutOfResources(

@@ -17,10 +17,9 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.image_choice import moment_of
-from legcal.data.measurements import few
 from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
+from legcal.files.schema import NAME_NEEDED, closest, describe, few, is_name
 from legcal.vision.image_file import (
     CONVERT,
     CONVERT_HEIC,

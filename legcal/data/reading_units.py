@@ -276,7 +276,9 @@ def sigmas_of(
             for name, sigma in stated.items()
         }
     except ValueError as error:
-        raise UsageError(f"--encoder-sigma could not be used: {error}") from error
+        raise UsageError(
+            f"The encoder sigma (--encoder-sigma) could not be used: {error}"
+        ) from error
 
 
 def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data.measurements import few, reading_columns, readings_in
+from legcal.data.measurements import reading_columns, readings_in
 from legcal.data.reading_units import (
     NEEDED_UNIT,
     PULSES,
@@ -31,7 +31,7 @@ from legcal.data.reading_units import (
     unit_named,
 )
 from legcal.errors import DatasetError, Place, UsageError
-from legcal.files.schema import describe
+from legcal.files.schema import describe, few
 from legcal.files.table import (
     WORDS,
     Column,

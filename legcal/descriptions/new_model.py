@@ -618,27 +618,19 @@ def create_model(
         for name, text in zip(names, (yaml_text(machine), urdf_text(machine)), strict=True):
             (temporary / name).parent.mkdir()
             (temporary / name).write_bytes(text.encode())
-        before(_load(temporary / names[0], temporary, machine.source), machine.notes)
+        try:
+            loaded = load_mechanism(temporary / names[0])
+        except LegcalError as error:
+            raise error.told(lambda problem: _of_source(problem, temporary, machine)) from error
+        before(loaded, machine.notes)
     yaml_path, urdf_path = (output / name for name in names)
     return Created(load_mechanism(yaml_path), yaml_path, urdf_path, machine.notes)
 
 
-def _load(path: Path, temporary: Path, source: str) -> Machine:
-    """Load the files in the temporary folder; errors name the source instead."""
-    try:
-        return load_mechanism(path)
-    except LegcalError as error:
-        raise error.told(
-            lambda problem: _attributed_to_source(problem, temporary, source)
-        ) from error
-
-
-def _attributed_to_source(problem: Problem, temporary: Path, source: str) -> Problem:
-    """Return a problem of a file in the temporary folder as a problem of the source."""
-    file = Path(problem.file)
-    if not file.is_relative_to(temporary):
-        return problem
-    return replace(problem, file=f"{source}: {file.relative_to(temporary)}")
+def _of_source(problem: Problem, temporary: Path, machine: Assembled) -> Problem:
+    """Return a problem of a file in the temporary folder as one of what it is made of."""
+    moved = problem.moved(temporary, Path())
+    return problem if moved is problem else replace(moved, file=f"{machine.source}: {moved.file}")
 
 
 THICK, WIDE = 2.0, 3.0  # size of arms and rails, in radii of a rod

@@ -33,6 +33,7 @@ from legcal.files.schema import (
     closest,
     content_of,
     describe,
+    few,
     is_name,
     nearest,
 )
@@ -346,9 +347,7 @@ def _of_header(
 
 def _names(names: Iterable[str]) -> str:
     """Return names of columns in a sentence, a few of them."""
-    quoted = [describe(name) for name in names]
-    more = len(quoted) - _MAX_NAMED
-    return ", ".join(quoted[:_MAX_NAMED]) + f" and {more} more" * (more > 0)
+    return few(list(map(describe, names)), _MAX_NAMED)
 
 
 def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str:

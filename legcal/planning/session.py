@@ -27,11 +27,9 @@ from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.dataset_file import dataset_texts
 from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
-from legcal.errors import UsageError
 from legcal.files.folder import (
     OutputKind,
-    check_destination,
-    holds_files,
+    check_empty,
     output_path,
     result_folder,
 )
@@ -60,12 +58,7 @@ PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 def check_session(output: str | Path) -> Path:
     """Return the folder of a session; refuse to replace other files."""
     destination = output_path(output, PLANNED)
-    check_destination(destination, PLANNED)
-    if destination.is_dir() and holds_files(destination):
-        raise UsageError(
-            f"{destination}: the session could not be written: found an earlier session, needed a "
-            "new or empty folder; give another folder, or remove that one."
-        )
+    check_empty(destination, PLANNED)
     return destination
 
 

@@ -53,7 +53,7 @@ def matching_table(new: NewDataset) -> Report:
     if len(pairs) > _MOST:
         rows.append(("...", "", f"{len(pairs) - _MOST} more", "", ""))
     counts = {view: new.views.count(view) for view in new.cameras}
-    noun = "whole lengths of legs" if new.are_lengths else "readings"
+    noun = "whole lengths of legs" if new.readings.are_lengths else "readings"
     unit_in_table = f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
         heading(
