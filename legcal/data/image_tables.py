@@ -94,12 +94,6 @@ def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Ord
     legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
     view_names = np.array([view.name for view in measurements.views], dtype=object)
     views = np.argsort(view_names, kind="stable")
-    return Order(sort_rows(measurements, legs), views, legs)
-
-
-def sort_rows(measurements: Measurements, legs: IntArray | None = None) -> IntArray:
-    """Return the rows by view name, image, pose label and readings, the legs' in a given order."""
-    q = np.nan_to_num(measurements.q if legs is None else measurements.q[:, legs])
     labels = measurements.pose_labels or ("",) * measurements.n_poses
     keys = [
         (measurements.views[v].name, image, labels[p], readings)
@@ -107,11 +101,12 @@ def sort_rows(measurements: Measurements, legs: IntArray | None = None) -> IntAr
             measurements.view.tolist(),
             measurements.image,
             measurements.pose.tolist(),
-            q.tolist(),
+            np.nan_to_num(measurements.q[:, legs]).tolist(),
             strict=True,
         )
     ]
-    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+    rows = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+    return Order(rows, views, legs)
 
 
 def reorder_measurements(measurements: Measurements, order: Order) -> Measurements:

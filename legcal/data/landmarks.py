@@ -26,7 +26,6 @@ from legcal.data.measurements import (
     row_names,
 )
 from legcal.errors import DatasetError
-from legcal.files.schema import closest, describe
 from legcal.files.table import Column, format_table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.kinematics import followed_poses
@@ -118,22 +117,15 @@ def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measureme
     )
     row = find_rows(table, measurements)
     joints = joint_names(leg_names)
-    chosen = table.text("joint")
-    for i, name in enumerate(chosen):
-        if name not in joints:
-            remedy = f"a joint of the mechanism, as leg1.base; {closest(name, joints)}"
-            table.refuse(i, f"the unknown joint {describe(name)}", remedy, "joint")
+    joint = table.positions("joint", [*joints], "a joint of the mechanism, as leg1.base")
     px = table.numbers(("u", "v"))
     refuse_outside(table, row, COLUMNS[3:5], measurements)
     table.once(
-        [
-            (image, name) if image >= 0 and name in joints else None
-            for image, name in zip(row.tolist(), chosen, strict=True)
-        ],
+        [key if min(key) >= 0 else None for key in zip(row.tolist(), joint.tolist(), strict=True)],
         "the same image and joint",
     )
     table.check()
-    leg, end = np.array([joints[name] for name in chosen], dtype=np.intp).T
+    leg, end = np.array([*joints.values()], dtype=np.intp)[joint].T
     sigma = table.number("sigma") if "sigma" in table else np.full(len(table), np.nan)
     return Landmarks(row, leg, end, px, np.where(np.isfinite(sigma), sigma, SIGMA_PX))
 

@@ -185,17 +185,6 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
     return rows
 
 
-def find_legs(table: Table, leg_names: Sequence[str], *, refuse: bool = True) -> IntArray:
-    """Return the leg that each row of a table names, -1 where unknown; these are refused."""
-    index = {name: j for j, name in enumerate(leg_names)}
-    names = table.text("leg")
-    legs = np.array([index.get(name, -1) for name in names], dtype=np.intp)
-    for i in np.flatnonzero(legs < 0).tolist() if refuse else ():
-        unknown, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
-        table.refuse(i, unknown, "a leg of the mechanism", "leg", remedy=remedy)
-    return legs
-
-
 def refuse_outside(
     table: Table, rows: IntArray, columns: Sequence[str], measurements: Measurements
 ) -> None:
@@ -369,12 +358,8 @@ def measurements_in(
     Images are relative to ``folder``; their existence is not checked. *legs* have no readings of
     motors whose column is empty. Raises DatasetError with one sentence for each problem.
     """
-    view_index = {view.name: i for i, view in enumerate(views)}
-    view_names, images = table.text("view"), table.text("image")
-    for row, name in enumerate(view_names):
-        if name not in view_index:
-            unknown, remedy = f"the unknown view {describe(name)}", closest(name, view_index)
-            table.refuse(row, unknown, "a view of the dataset file", "view", remedy=remedy)
+    view_names, images = [view.name for view in views], table.text("image")
+    view = table.positions("view", view_names, "a view of the dataset file")
     _refuse_images(table, images, folder)
     motors = legs_with_readings(legs)
     sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
@@ -385,7 +370,7 @@ def measurements_in(
     measurements = Measurements(
         views=tuple(views),
         image=images,
-        view=np.array([view_index.get(name, 0) for name in view_names], dtype=np.intp),
+        view=np.maximum(view, 0),
         pose=pose,
         q=q,
         sigma_q=sigma_q,

@@ -20,7 +20,6 @@ from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
-    find_legs,
     find_rows,
     places,
 )
@@ -294,12 +293,12 @@ def read_observations(
     Raises DatasetError with one sentence for each problem.
     """
     leg_names = [leg.name for leg in legs]
-    parts = [list(leg.radius_of_part) for leg in legs]
+    parts, needed = [list(leg.radius_of_part) for leg in legs], "a leg of the mechanism"
     remedy = "delete the file to have it written again"
     table = read_table(path, "table of observations", "outline", OUTLINE_COLUMNS, remedy=remedy)
     if skip_stale:
         row = find_rows(table, measurements, refuse=False)
-        leg = find_legs(table, leg_names, refuse=False)
+        leg = table.positions("leg", leg_names, needed, refuse=False)
         exists = np.array(
             [j >= 0 and part in parts[j] for j, part in zip(leg, table.text("part"), strict=True)],
             dtype=np.bool_,
@@ -307,13 +306,13 @@ def read_observations(
         exists |= (leg >= 0) & (table.number("edge") >= FIRST_EDGE)
         detected = np.array([source == "detected" for source in table.text("source")], dtype=bool)
         table.keep((exists & (row >= 0)) | ~detected)
-    row, leg = find_rows(table, measurements), find_legs(table, leg_names)
+    row, leg = find_rows(table, measurements), table.positions("leg", leg_names, needed)
     part, of_body = table.text("part"), table.number("edge") >= FIRST_EDGE
     for i in np.flatnonzero(leg >= 0).tolist():
         if part[i] not in parts[leg[i]] and not of_body[i]:
             unknown_part = f"the unknown part {describe(part[i])}"
-            needed = f"a link with a cylinder of {leg_names[leg[i]]}"
-            table.refuse(i, unknown_part, needed, "part", remedy=closest(part[i], parts[leg[i]]))
+            cylinder = f"a link with a cylinder of {leg_names[leg[i]]}"
+            table.refuse(i, unknown_part, cylinder, "part", remedy=closest(part[i], parts[leg[i]]))
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
     edited = np.array([source == "edited" for source in table.text("source")], dtype=np.bool_)
     table.need(NUMBERS, used)
@@ -344,14 +343,15 @@ def read_observations(
     # second end is that to the first plus a piece of u, so that (second x first) . h > 0.
     xy = _rays(outlines, measurements)
     rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
-    swap = np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0
-    ends = np.where(swap[:, None, None], outlines.ends[:, ::-1], outlines.ends)
-    turned = outlines.covariance[:, ::-1, ::-1]
-    covariance = np.where(swap[:, None, None], turned, outlines.covariance)
-    outlines = replace(outlines, ends=ends, covariance=covariance)
-    _refuse_ends_off_line(table, outlines, measurements)
+    swap = (np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0)[:, None, None]
+    _refuse_ends_off_line(table, outlines, measurements, xy)
     table.check()
-    return outlines
+    turned = outlines.covariance[:, ::-1, ::-1]
+    return replace(
+        outlines,
+        ends=np.where(swap, outlines.ends[:, ::-1], outlines.ends),
+        covariance=np.where(swap, turned, outlines.covariance),
+    )
 
 
 def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
@@ -395,9 +395,10 @@ def _rays(outlines: Outlines, measurements: Measurements) -> Array:
     return xy
 
 
-def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measurements) -> None:
-    """Refuse used outlines whose ends do not lie on their line."""
-    xy = _rays(outlines, measurements)
+def _refuse_ends_off_line(
+    table: Table, outlines: Outlines, measurements: Measurements, xy: Array
+) -> None:
+    """Refuse used outlines whose ends (n, 2, 2) on the sensor plane do not lie on their line."""
     view = measurements.view[outlines.row]
     offset = np.zeros(len(outlines))
     for v in np.unique(view):

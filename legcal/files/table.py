@@ -37,7 +37,7 @@ from legcal.files.schema import (
     is_name,
     nearest,
 )
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _MAX_NAMED = 10  # maximum number of columns named in a sentence
@@ -96,7 +96,6 @@ class Column:
 class Table:
     """The complete rows of a CSV file with stripped cells, and their problems.
 
-    ``places[i]`` is the place of row i in the file, ``where[i]`` the place with the file;
     ``name in table`` is true if there is such a column.
     """
 
@@ -104,14 +103,13 @@ class Table:
         self.path = path
         self.thing = thing  # noun for a row in messages
         self.columns = {column.name: column for column in columns}  # in the order of the header
-        self._rows: list[int] = []
-        self._lines: list[int] = []
+        self.where: list[Place] = []  # of each row, with its file
         self._cells: list[list[str]] = []
         self._numbers: dict[str, Array] = {}  # of the columns of numbers
         self._problems: list[Problem] = []
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._cells)
 
     def __contains__(self, name: str) -> bool:
         return name in self.columns
@@ -119,14 +117,7 @@ class Table:
     @property
     def places(self) -> list[str]:
         """The place of each row in the file."""
-        numbers = zip(self._rows, self._lines, strict=True)
-        return [f"row {row} (line {line})" for row, line in numbers]
-
-    @property
-    def where(self) -> list[Place]:
-        """The place of each row with its file."""
-        rows = zip(self._rows, self._lines, strict=True)
-        return [Place(str(self.path), row, line) for row, line in rows]
+        return [f"row {place.row} (line {place.line})" for place in self.where]
 
     def text(self, name: str) -> tuple[str, ...]:
         """Return the cells of a column; empty cells for an absent column."""
@@ -166,9 +157,7 @@ class Table:
                 found,
                 needed,
                 remedy,
-                str(self.path),
-                self._rows[row],
-                self._lines[row],
+                *self.where[row],
                 columns,
                 code=code or (Code.BAD_CELL if columns else Code.BAD_ROW),
             )
@@ -193,6 +182,24 @@ class Table:
                 if not texts[row]:
                     self.refuse_cell(row, name, "a finite number")
 
+    def positions(
+        self, column: str, names: Sequence[str], needed: str, *, refuse: bool = True
+    ) -> IntArray:
+        """Return for each row the position of its cell among names, -1 where it is not there.
+
+        Unknown names are refused, unless said otherwise.
+        """
+        index = {name: i for i, name in enumerate(names)}
+        texts = self.text(column)
+        found = np.array([index.get(text, -1) for text in texts], dtype=np.intp)
+        for row in np.flatnonzero(found < 0).tolist() if refuse else ():
+            unknown, remedy = (
+                f"the unknown {column} {describe(texts[row])}",
+                closest(texts[row], names),
+            )
+            self.refuse(row, unknown, needed, column, remedy=remedy)
+        return found
+
     def once(self, keys: Sequence[Hashable], repeated: str) -> None:
         """Refuse rows with the key of an earlier row; a key of None is ignored."""
         first: dict[Hashable, int] = {}
@@ -204,10 +211,9 @@ class Table:
 
     def keep(self, rows: BoolArray) -> None:
         """Keep some rows only, and discard the problems of the others."""
-        gone = {line for line, kept in zip(self._lines, rows, strict=True) if not kept}
+        gone = {place.line for place, kept in zip(self.where, rows, strict=True) if not kept}
         kept_rows = np.flatnonzero(rows).tolist()
-        self._rows = [self._rows[row] for row in kept_rows]
-        self._lines = [self._lines[row] for row in kept_rows]
+        self.where = [self.where[row] for row in kept_rows]
         self._cells = [self._cells[row] for row in kept_rows]
         self._numbers = {name: values[kept_rows] for name, values in self._numbers.items()}
         self._problems = [problem for problem in self._problems if problem.line not in gone]
@@ -227,8 +233,7 @@ class Table:
         columns, n = list(self.columns.values()), len(header)
         order = [header.index(column.name) for column in columns]
         for row, (line, cells) in enumerate(lines, start=1):
-            self._rows.append(row)
-            self._lines.append(line)
+            self.where.append(Place(str(self.path), row, line))
             self._cells.append([cells[i] for i in order] if len(cells) == n else [])
             if len(cells) != n:
                 remedy = "complete or remove the row"
