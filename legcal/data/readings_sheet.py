@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from legcal.files.table import (
     Column,
     Lines,
     concepts,
+    in_unit,
     is_number,
     read_table,
     split_heading,
@@ -49,7 +49,9 @@ LEAST_USED = 0.01  # minimum fraction of the travel in use: with less, the unit 
 # Units tried where none is stated, of motors that slide and that turn
 GUESSED = {False: ("m", "mm"), True: ("rad", "deg", PULSES)}
 _DECIMALS = 12  # of readings in metres and radians
-_SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+# Seconds in a unit of times; with a decimal, since 1200 may be a time of the day, 1200.0 is not
+_SECONDS = {"s": "1.0", "sec": "1.0", "seconds": "1.0", "ms": "1.0e-3", "us": "1.0e-6",
+            "µs": "1.0e-6", "ns": "1.0e-9"}  # fmt: skip
 _COLUMNS = ("view", "image", "pose", "time")
 _TIME = re.compile(rf"(?:{WORDS['time'].replace(' ', '|')}|t)({'|'.join(_SECONDS)})")
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
@@ -176,7 +178,7 @@ class ReadingsSheet:
         known = (*UNITS[False], *UNITS[True])
         readings = [split_heading(x.replace("°", "deg"), known, others=True) for x in header]
         meaning: dict[int, str] = {}
-        clock: dict[int, float] = {}  # seconds in a unit of a column of times
+        clock: dict[int, Decimal] = {}  # seconds in a unit of a column of times
         for i in sorted(range(len(header)), key=lambda i: _is_vague(header[i])):
             key = split[i][0]
             for name in _COLUMNS:
@@ -184,7 +186,7 @@ class ReadingsSheet:
                 if (_means(header[i]) == name or timed) and name not in meaning.values():
                     meaning[i] = name
                 if timed and meaning.get(i) == name:
-                    clock = {i: _SECONDS[timed[1]]}
+                    clock = {i: Decimal(_SECONDS[timed[1]])}
         free = [i for i in range(len(header)) if i not in meaning]
         meaning |= self._joints_of_columns(free, readings, header)
         for i, name in meaning.items():
@@ -206,7 +208,7 @@ class ReadingsSheet:
             )
         kept = sorted(meaning)
         below = [
-            (line, [_dated(cells[i], clock.get(i)) for i in kept])
+            (line, [in_unit(cells[i], clock[i]) if i in clock else cells[i] for i in kept])
             if len(cells) == len(header)
             else (line, cells)
             for line, cells in lines[1:]
@@ -368,16 +370,6 @@ def _foreign(key: str) -> str:
     """Return the unit at the end of a heading that readings cannot have, "" if none is there."""
     end = _NUMBERED.fullmatch(key)
     return end[3] if end is not None and end[3] in _FOREIGN else ""
-
-
-def _dated(cell: str, size: float | None) -> str:
-    """Return a number of seconds, or of a part *size* of them, as a date; other cells unchanged."""
-    if size is None:
-        return cell
-    try:
-        return datetime.fromtimestamp(float(cell) * size, UTC).replace(tzinfo=None).isoformat()
-    except (ValueError, OverflowError, OSError):
-        return cell
 
 
 def _needed(leg: Leg, *, has_pulses: bool) -> str:

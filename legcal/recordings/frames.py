@@ -25,12 +25,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from legcal.data.image_choice import unix_seconds
 from legcal.data.measurements import reading_columns
-from legcal.data.photograph_matching import Photograph, find_photographs, photograph_time
+from legcal.data.photograph_matching import find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import describe
+from legcal.files.table import is_number
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.vision.image_file import (
@@ -159,7 +161,7 @@ class ImageFolder(Recording):
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of their times."""
         photographs = find_photographs(self.path)
-        times = {p.name: stamp_in(p.path.stem) or _taken(p) for p in photographs}
+        times = {p.name: stamp_in(p.path.stem) or photograph_time(p) for p in photographs}
         lost = [name for name, time in times.items() if time is None]
         if lost:
             raise DatasetError(
@@ -187,12 +189,6 @@ class ImageFolder(Recording):
                     "complete PNG, JPEG or TIFF; copy it again or remove it."
                 )
             yield Frame(times[photograph.name] or 0.0, np.asarray(image, dtype=np.uint8))
-
-
-def _taken(photograph: Photograph) -> float | None:
-    """Return the time of a photograph [s], from its EXIF data."""
-    moment = photograph_time(photograph)
-    return None if moment is None else moment.replace(tzinfo=UTC).timestamp()
 
 
 def stamp_in(text: str) -> float | None:
@@ -367,20 +363,6 @@ def _decoded(message: Any) -> NDArray[np.uint8] | None:
 # Readings over time: a table with a column of times, or joint states
 
 
-_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-
-
-def unix_seconds(number: float) -> float | None:
-    """Return a Unix time [s] from s, ms, us or ns, distinguished by years 2001 to 2286.
-
-    Other numbers, such as 20261123101500, give None; numbers before 2001 are seconds.
-    """
-    for unit in (1e9, 1e6, 1e3, 1.0):
-        if number >= 1e9 * unit:
-            return number / unit if number < 1e10 * unit else None
-    return number
-
-
 @dataclass(frozen=True, eq=False)
 class Series:
     """Readings of all encoders at times."""
@@ -447,16 +429,15 @@ def _in_order(series: Series) -> Series:
 
 def _seconds(texts: Sequence[str], path: Path) -> Array:
     """Return times [s] of numbers (Unix times in s, ms, us or ns, or seconds) or of dates."""
-    others = [text for text in texts if not _NUMBER.fullmatch(text)]
+    others = [text for text in texts if not is_number(text)]
     if 2 * len(others) < len(texts):
         if others:
             raise _no_time(others[0], path)
         numbers = np.array([float(text) for text in texts])
         size = float(np.median(np.abs(numbers)))
         seconds = unix_seconds(size)
-        wrong = np.flatnonzero(~np.isfinite(numbers) | (seconds is None))
-        if seconds is None or len(wrong):
-            raise _no_time(texts[wrong[0]], path)
+        if seconds is None:
+            raise _no_time(texts[0], path)
         return numbers * (seconds / size if size else 1.0)
     stamps = []
     for text in texts:
