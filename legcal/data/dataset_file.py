@@ -28,7 +28,7 @@ from legcal.files.motions import MotionEntry
 from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
 from legcal.files.table import format_table
-from legcal.machine.files import DATASET_YAML
+from legcal.machine.files import DATASET_YAML, different_legs
 from legcal.machine.leg import Link
 from legcal.machine.model import Machine
 from legcal.machine.parameters import list_in_words
@@ -67,15 +67,8 @@ class ViewEntry(FileSchema):
     gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # None: unknown
     T_base_camera: MotionEntry | None = None
     hand_held: Annotated[bool, Strict()] = False
-    legs: list[str] | None = None  # none of them where a board on the platform is all that counts
-
-    @field_validator("legs")
-    @classmethod
-    def _names_each_leg_once(cls, legs: list[str] | None) -> list[str] | None:
-        twice = sorted({name for name in legs or () if (legs or []).count(name) > 1})
-        if twice:
-            raise ValueError(f"found {', '.join(twice)} twice, needed each leg once; remove one.")
-        return legs
+    # none of them where a board on the platform is all that counts
+    legs: Annotated[list[str], AfterValidator(different_legs)] | None = None
 
 
 def _can_be_fixed(text: str) -> str:

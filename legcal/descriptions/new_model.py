@@ -474,7 +474,6 @@ class _Branch:
         self._tree, self._leg = tree, leg
         self._from_base = _hangs_from_base(leg)
         self._R_base_platform = machine.home.rotation.as_matrix()
-        self._T = machine.home
         self._carrier, self._A = "base", leg.A_base  # the link at the start, and A in it
         self._R_base_carrier = np.eye(3)  # at home
         if leg.actuator is not None:

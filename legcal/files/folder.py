@@ -369,8 +369,8 @@ def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path
 
 
 SCHEMAS = ".schemas"  # folder of schemas beside a YAML
-_HEADER = "# yaml-language-server: $schema={}/{}.json\n"
-_NAMED = re.compile(re.escape(_HEADER).replace(r"\{\}", r"([\w.-]+)").encode())
+_HEADER = f"# yaml-language-server: $schema={SCHEMAS}/%s.json\n"
+_NAMED = re.compile(re.escape(_HEADER).replace("%s", r"([\w.-]+)").encode())
 
 
 def schema_names() -> list[str]:
@@ -386,24 +386,16 @@ def schema_content(name: str) -> bytes:
 
 def with_schema(name: str, text: str) -> str:
     """Return the text of a YAML with a header that names its schema."""
-    return _HEADER.format(SCHEMAS, name) + text
-
-
-def schemas_beside(path: Path, content: bytes) -> dict[Path, bytes]:
-    """Return the schema that a YAML names, by its place beside *path*; none if it names none."""
-    named = _NAMED.match(content) if path.suffix == ".yaml" else None
-    if named is None or named[1].decode() != SCHEMAS or named[2].decode() not in schema_names():
-        return {}
-    name = named[2].decode()
-    return {path.parent / SCHEMAS / f"{name}.json": schema_content(name)}
+    return _HEADER % name + text
 
 
 def write_schemas(path: Path) -> None:
     """Write the schema that a YAML names beside it, or nothing where there is no place for it."""
     with suppress(OSError):  # it only helps editors
         with path.open("rb") as file:
-            named = schemas_beside(path, file.readline())
-        for place, content in named.items():
+            named = _NAMED.match(file.readline())
+        if named is not None and (name := named[1].decode()) in schema_names():
+            place = path.parent / SCHEMAS / f"{name}.json"
             if not place.is_symlink() and not place.parent.is_symlink():
                 place.parent.mkdir(exist_ok=True)
-                place.write_bytes(content)
+                place.write_bytes(schema_content(name))
