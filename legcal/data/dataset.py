@@ -110,24 +110,14 @@ class Dataset:
 
     def image_reader(self, rows: Sequence[int]) -> ImageReader:
         """Return a reader of the images of these rows, in this order, for use in any process."""
+        m = self.measurements
         return ImageReader(
             tuple(None if path is None else path.absolute() for path in map(self.image_path, rows)),
-            tuple(self._camera(row) for row in rows),
-            tuple(self._where(row) for row in rows),
+            tuple(m.views[m.view[row]].camera for row in rows),
+            tuple(map(self.where, rows)),
         )
 
-    def inspect_image(self, row: int) -> tuple[ImageFacts, Problem | None]:
-        """Return the metadata of the image of a row, and the problem that prevents its use."""
-        path = self.image_path(row)
-        if path is None:
-            return ImageFacts(), None
-        return inspect_image(path, self._camera(row), self._where(row))
-
-    def _camera(self, row: int) -> Camera:
-        """Return the camera that took the image of a row."""
-        return self.measurements.views[int(self.measurements.view[row])].camera
-
-    def _where(self, row: int) -> Place:
+    def where(self, row: int) -> Place:
         """Return the place of a row in its table."""
         return Place(str(self.table_path), row + 1)
 
@@ -414,13 +404,6 @@ def _without_photographs(dataset: Dataset) -> str:
     )
 
 
-def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
-    """Return a dataset with the metadata of its images, and the problems by row."""
-    facts, problems = inspect_rows(dataset)
-    notes = notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
-    return replace(dataset, facts=facts, file_notes=tuple(note.what for note in notes)), problems
-
-
 def _invisible(dataset: Dataset) -> list[str]:
     """Return the problems of legs without a visible cylinder, unless a table has outlines.
 
@@ -511,8 +494,8 @@ def read_given_corners(
     return read_corners(path, boards, measurements)
 
 
-def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, Problem]]]:
-    """Return the metadata of images by their names, and the problems by row.
+def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
+    """Return a dataset with the metadata of its images, and the problems by row.
 
     There is one problem for each row that neither an image nor tables make usable.
     """
@@ -520,7 +503,7 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
     facts, problems = dict[str, ImageFacts](), list[tuple[int, Problem]]()
 
     def refuse(row: int, what: str, found: str, needed: str, remedy: str, *columns: str) -> None:
-        place = str(dataset.table_path), row + 1
+        place = dataset.where(row)
         problems.append((row, Problem(what, found, needed, remedy, *place, columns=columns)))
 
     by_board = dataset.board_on("base") is not None
@@ -554,9 +537,11 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
         if path is None and row not in in_tables:
             refuse(row, no_use, f"neither an image nor {tables}", "one of them", remedy, "image")
         elif path is not None and (os.path.exists(path) or row not in in_tables):
-            facts[measurements.image[row]], problem_of_image = dataset.inspect_image(row)
+            camera, place = measurements.views[measurements.view[row]].camera, dataset.where(row)
+            facts[measurements.image[row]], problem_of_image = inspect_image(path, camera, place)
             problems += [(row, problem_of_image)] if problem_of_image else []
-    return facts, problems
+    notes = notes_on_photographs(measurements, dataset.camera_paths, facts)
+    return replace(dataset, facts=facts, file_notes=tuple(note.what for note in notes)), problems
 
 
 def expand_hand_held(

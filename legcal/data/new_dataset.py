@@ -240,14 +240,15 @@ def plan_new_dataset(
     photographs = find_photographs(folder)
     by_names, pattern = with_likely_views(photographs)
     sheet = ReadingsSheet(path, machine, "photograph")
-    named = {view.casefold() for view in sheet.text("view") if view}
+    table = sheet.table
+    named = {view.casefold() for view in table.text("view") if view}
     if named <= {photograph.folder.casefold() for photograph in by_names}:
         photographs = by_names
     else:
         pattern = None  # the table names other views
     sheet_readings = sheet.readings(options.unit, lengths=options.lengths)
-    texts = (sheet.text(name) for name in ("image", "view", "time"))
-    rows = tuple(itertools.starmap(Row, zip(sheet.where, *texts, strict=True)))
+    texts = map(table.text, ("image", "view", "time"))
+    rows = tuple(itertools.starmap(Row, zip(table.where, *texts, strict=True)))
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
     cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
@@ -263,7 +264,7 @@ def plan_new_dataset(
         destination=destination,
         columns=sheet.taken,
         rows=rows,
-        poses=sheet.text("pose") if "pose" in sheet else (),
+        poses=table.text("pose") if "pose" in table else (),
         matching=matching,
         views=view_of,
         readings=sheet_readings,

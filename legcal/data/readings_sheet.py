@@ -29,7 +29,7 @@ from legcal.data.reading_units import (
     takes_unit,
     unit_named,
 )
-from legcal.errors import DatasetError, Place, UsageError
+from legcal.errors import DatasetError, UsageError
 from legcal.files.schema import describe, few
 from legcal.files.table import (
     WORDS,
@@ -84,6 +84,8 @@ class ReadingsSheet:
 
     Attributes
     ----------
+    table : Table
+        Its rows under our names: view, image, pose and time as texts, readings by joint.
     motors : list of Leg
         The legs whose readings it holds.
     taken : dict
@@ -111,7 +113,7 @@ class ReadingsSheet:
         self._heading_units: dict[str, str] = {}  # by joint
         columns = [Column(name, "text", required=False) for name in _COLUMNS]
         columns += [Column(joint, what="reading") for joint in self._joints]
-        self._table = read_table(
+        self.table = read_table(
             path,
             "table of readings",
             "row",
@@ -119,19 +121,7 @@ class ReadingsSheet:
             needed=f"one row for each {row_noun}; write them",
             reshape=self._renamed_columns,
         )
-        self._table.check()
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._table
-
-    def text(self, name: str) -> tuple[str, ...]:
-        """Return the cells of a column of texts by row, empty where there is no such column."""
-        return self._table.text(name)
-
-    @property
-    def where(self) -> list[Place]:
-        """The place of each row in the file, for messages."""
-        return self._table.where
+        self.table.check()
 
     def readings(self, unit: str | None = None, *, lengths: bool = False) -> SheetReadings:
         """Return the readings [m, rad], with the precision of their decimal digits.
@@ -153,12 +143,12 @@ class ReadingsSheet:
         units, unit_from, lengths = self._units(unit, lengths)
         headings = {name: text for text, name in self.taken.items()}
         q, notes = readings_in(
-            self._table, self.motors, units, place="headings", lengths=lengths, headings=headings
+            self.table, self.motors, units, place="headings", lengths=lengths, headings=headings
         )
-        self._table.check()
+        self.table.check()
         last = [
             abs(units[joint].size)
-            * 10.0 ** min(int(Decimal(x).as_tuple().exponent) for x in self._table.text(joint))
+            * 10.0 ** min(int(Decimal(x).as_tuple().exponent) for x in self.table.text(joint))
             for joint in self._joints
         ]
         q = np.round(q, _DECIMALS) + 0.0  # as decimal as they were written
@@ -304,7 +294,7 @@ class ReadingsSheet:
         It is the stated unit, else the first of GUESSED in which most readings lie in the travel
         and use a part of it. If no reading does, whole lengths of legs may.
         """
-        values = self._table.numbers(str(leg.prismatic) for leg in legs)
+        values = self.table.numbers(str(leg.prismatic) for leg in legs)
         turns, start = legs[0].reads_angle, f"{self.path}: the "
         if stated:
             try:

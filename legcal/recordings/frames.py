@@ -378,14 +378,14 @@ class Series:
 def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Series:
     """Return the readings of a CSV with a column of times, in the order of times."""
     sheet = ReadingsSheet(path, machine, "time")
-    if "time" not in sheet:
+    if "time" not in sheet.table:
         raise DatasetError(
             f"{path}: the readings could not be used: found no column 'time', needed one in "
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
             f"single poses. {' '.join(sheet.notes)}".rstrip()
         )
     readings = sheet.readings(lengths=lengths)
-    times = _seconds(sheet.text("time"), path)
+    times = _seconds(sheet.table.text("time"), path)
     in_words = f"{readings.unit}, {readings.unit_from}"
     return _in_order(
         Series(str(path), times, readings.q, sheet.taken, in_words, (*sheet.notes, *readings.notes))
