@@ -351,7 +351,7 @@ def load_dataset(
         measurements, of_clicks = place_by_landmarks(
             path, machine, measurements, landmarks, may_be_wrong=not check_clicks
         )
-    observations, body_edges = _read_observed(folder, machine, measurements)
+    observations, body_edges = read_observed(folder, machine, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
@@ -453,12 +453,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera, unit: float) -> View:
     )
 
 
-def read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
-    """Return the outlines beside the dataset, if there are any."""
-    return _read_observed(folder, machine, measurements)[0]
-
-
-def _read_observed(
+def read_observed(
     folder: Path, machine: Machine, measurements: Measurements
 ) -> tuple[Outlines | None, Outlines | None]:
     """Return the outlines beside the dataset and the edges of bodies; None where there are none."""

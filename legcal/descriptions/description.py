@@ -19,9 +19,9 @@ from legcal.geometry.motions import frame_on_points, motion_of, pose_distance
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.equations import posture_constraints
 from legcal.machine.leg import (
+    LINKS,
     MAX_LENGTH,
     MAX_RADIUS,
     MIN_LENGTH,
@@ -299,20 +299,11 @@ def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
 def wrong_axes(
     described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
 ) -> list[str]:
-    """Return the problems of axes that do not fit their leg at home."""
+    """Return the problems of outer axes of U joints along their leg at home."""
     problems = []
-    for side, joint, axis in (
-        ("base", entry.type.base, axes[0]),
-        ("platform", entry.type.platform, axes[1]),
-    ):
+    for side, axis in zip(LINKS, axes, strict=True):
         angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
-        if joint is JointType.REVOLUTE and 90.0 - angle > np.degrees(PERPENDICULAR):
-            problems.append(
-                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
-                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
-                f"correct {side}_axes or home."
-            )
-        if joint is JointType.UNIVERSAL and angle < ALONG:
+        if getattr(entry.type, side) is JointType.UNIVERSAL and angle < ALONG:
             problems.append(
                 f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
                 f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
@@ -414,13 +405,14 @@ def is_planar(legs: Sequence[AssembledLeg], T: RigidTransform) -> bool:
 
 def across_leg(u: Array, outward: Array) -> Array:
     """Return the horizontal direction across a leg; across the way outward for upright legs."""
-    z = np.array([0.0, 0.0, 1.0])
-    for other in (u, outward, np.array([1.0, 0.0, 0.0])):
-        across = cross(z, other)
-        if np.linalg.norm(across) > 1e-6 * max(1.0, float(np.linalg.norm(other))):
-            across = across - (across @ u) * u
-            return np.asarray(across / np.linalg.norm(across))
-    return np.array([0.0, 1.0, 0.0])
+    x, _, z = np.eye(3)
+    across = next(
+        across
+        for other in (u, outward, x)
+        if np.linalg.norm(across := cross(z, other)) > 1e-6 * max(1.0, float(np.linalg.norm(other)))
+    )
+    across = across - (across @ u) * u
+    return np.asarray(across / np.linalg.norm(across))
 
 
 def _axes(entry: LegEntry, tangent: Array, T: RigidTransform, q: float) -> tuple[Array, Array]:
