@@ -146,21 +146,13 @@ def through_cameras(
         old_lens, new_lens = ((camera[v].K, camera[v].distortion) for camera in (measured, wanted))
         if len(indices) == 0 or all(map(np.array_equal, old_lens, new_lens)):
             continue
-        before, after = (
-            _plane_through(camera[v].undistort(outlines.ends[indices]))
-            for camera in (measured, wanted)
-        )
+        ends = (camera[v].rays(outlines.ends[indices]) for camera in (measured, wanted))
+        before, after = (cross(rays[:, 0], rays[:, 1]) for rays in ends)
         size = np.linalg.norm(after, axis=1)
         size *= np.sign(np.sum(before * outlines.h[indices], axis=1))
         has_plane = size != 0.0
         h[indices[has_plane]] = after[has_plane] / size[has_plane, None]
     return replace(outlines, h=h)
-
-
-def _plane_through(ends: Array) -> Array:
-    """Return normals (n, 3) of the planes through the camera and two points (n, 2, 2) each."""
-    rays = np.concatenate([ends, np.ones((*ends.shape[:2], 1))], axis=2)
-    return cross(rays[:, 0], rays[:, 1])
 
 
 def no_outlines() -> Outlines:
@@ -341,10 +333,9 @@ def read_observations(
     )
     # The end nearer to the base joint comes first. h is the moment u x P, and the ray to the
     # second end is that to the first plus a piece of u, so that (second x first) . h > 0.
-    xy = _rays(outlines, measurements)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
+    rays = _rays(outlines, measurements)
     swap = (np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0)[:, None, None]
-    _refuse_ends_off_line(table, outlines, measurements, xy)
+    _refuse_ends_off_line(table, outlines, measurements, rays)
     table.check()
     turned = outlines.covariance[:, ::-1, ::-1]
     return replace(
@@ -384,27 +375,27 @@ def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
 
 
 def _rays(outlines: Outlines, measurements: Measurements) -> Array:
-    """Return the ends of outlines on the sensor plane, (n, 2, 2)."""
-    xy = np.full(outlines.ends.shape, np.nan)
+    """Return the rays through the ends of outlines, (n, 2, 3); NaN without ends."""
+    rays = np.full((*outlines.ends.shape[:2], 3), np.nan)
     view = measurements.view[outlines.row]
     has_ends = np.all(np.isfinite(outlines.ends), axis=(1, 2))
     for v in np.unique(view):
         chosen = (view == v) & has_ends
         if np.any(chosen):
-            xy[chosen] = measurements.views[v].camera.undistort(outlines.ends[chosen])
-    return xy
+            rays[chosen] = measurements.views[v].camera.rays(outlines.ends[chosen])
+    return rays
 
 
 def _refuse_ends_off_line(
-    table: Table, outlines: Outlines, measurements: Measurements, xy: Array
+    table: Table, outlines: Outlines, measurements: Measurements, rays: Array
 ) -> None:
-    """Refuse used outlines whose ends (n, 2, 2) on the sensor plane do not lie on their line."""
+    """Refuse used outlines whose ends do not lie on their line."""
     view = measurements.view[outlines.row]
     offset = np.zeros(len(outlines))
     for v in np.unique(view):
         chosen = (view == v) & outlines.used
         camera, h = measurements.views[v].camera, outlines.h[chosen][:, None]
-        offset[chosen] = np.abs(camera.line_offset(h, xy[chosen])).max(axis=1)
+        offset[chosen] = np.abs(camera.line_offset(h, rays[chosen, :, :2])).max(axis=1)
     off = ~(offset <= LINE_TOLERANCE_PX)
     for i in np.flatnonzero(off).tolist():
         actual = f"ends {offset[i]:.3g} px from the line (a, b, c)"
@@ -575,9 +566,8 @@ def outline_derivative(
 
     Returns rays (..., 2, 3); derivative (..., 2, 3) [1/px].
     """
-    xy = camera.undistort(ends)
-    ones = np.ones((*xy.shape[:-1], 1))
-    rays = np.concatenate([xy, ones], axis=-1)
+    rays = camera.rays(ends)
+    xy = rays[..., :2]
     # The line follows an offset of an end: (h + dh) . ray = -dvalue keeps the point on it.
     J = camera.pixels_per_unit(xy)
     ab = np.broadcast_to(h[..., None, :2], xy.shape)

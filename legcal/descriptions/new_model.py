@@ -442,7 +442,6 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
         rods = [leg for leg in machine.legs if leg.actuator is actuator]
         motor, carried = motor_visuals(actuator, rods)
         on_base += motor
-        tree.link(actuator.link)
         tree.link(actuator.link, "".join(carried))
         kind = actuator.kind.value
         moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
@@ -486,14 +485,13 @@ class _Branch:
         """Add the leg to the tree."""
         leg = self._leg
         if self._from_base:
-            R_carrier = self._R_base_carrier.T
-            axis = R_carrier @ leg.base_axis
-            R = self._near("a", leg.type.base, R_carrier @ leg.u, axis, self._A)
-            R = self._R_base_carrier @ R
+            R_base_start, u, at = self._R_base_carrier, leg.u, self._A
+            side, joint, axis = "a", leg.type.base, leg.base_axis
         else:
-            inverse = self._R_base_platform.T
-            axis = inverse @ leg.platform_axis
-            R = self._near("b", leg.type.platform, -inverse @ leg.u, axis, leg.B_platform)
+            R_base_start, u, at = self._R_base_platform, -leg.u, leg.B_platform
+            side, joint, axis = "b", leg.type.platform, leg.platform_axis
+        R = self._near(side, joint, R_base_start.T @ u, R_base_start.T @ axis, at)
+        R = R_base_start @ R
         self._half(near=True)
         if leg.kind is LegKind.CONSTANT:
             self._along = np.array([0.0, 0.0, leg.q0])
