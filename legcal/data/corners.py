@@ -54,16 +54,13 @@ COLUMNS = tuple(column.name for column in _columns(0))
 class Corners(ImageTable):
     """Corners of the board in images, one row a corner."""
 
+    keys = "row", "corner"
     corner: IntArray  # (n,) index into Board.points, counted on from FixedBoard.first
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
     used: BoolArray
     reason: tuple[Rejection, ...]  # reasons of rejections; false for used corners
     source: tuple[str, ...]  # detected or edited
-
-    def row_keys(self) -> list[tuple[int, int]]:
-        """Return image row and number of each corner."""
-        return list(zip(self.row.tolist(), self.corner.tolist(), strict=True))
 
 
 def found_corners(row: IntArray, corner: IntArray, px: Array, sigma_px: Array) -> Corners:

@@ -17,12 +17,10 @@ from pydantic import (
     Strict,
     Tag,
     WithJsonSchema,
-    field_validator,
 )
 
-from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
-from legcal.errors import Code, DatasetError, Problem, UsageError
+from legcal.errors import BadValue, Code, DatasetError, Problem, UsageError
 from legcal.files.folder import with_schema
 from legcal.files.motions import MotionEntry
 from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
@@ -119,6 +117,14 @@ def _by_joint_or(of_all: str) -> Discriminator:
     return Discriminator(form)
 
 
+def _of_an_encoder(sigma: float) -> float:
+    least, most = ENCODER_SIGMAS
+    if not least <= sigma <= most:
+        needed = f"{least:g} to {most:g} m"
+        raise BadValue(f"{sigma:g} m", needed, "give one standard deviation of a reading in metres")
+    return sigma
+
+
 class DatasetEntry(BuiltEntry):
     """The whole of ``dataset.yaml``."""
 
@@ -127,10 +133,9 @@ class DatasetEntry(BuiltEntry):
     measurements: str
     encoder_sigma: Annotated[
         Annotated[
-            Annotated[
-                Number,
-                Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True))),
-            ],
+            Number,
+            Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True))),
+            AfterValidator(_of_an_encoder),
             Tag("[number]"),
         ]
         | Annotated[
@@ -150,21 +155,6 @@ class DatasetEntry(BuiltEntry):
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
     board: dict[str, Any] | list[Any] | None = None  # read by their kinds
-
-    @field_validator("encoder_sigma")
-    @classmethod
-    def _is_that_of_an_encoder(
-        cls, sigma: float | dict[str, float | str] | None
-    ) -> float | dict[str, float | str] | None:
-        least, most = ENCODER_SIGMAS
-        if sigma is None or isinstance(sigma, dict):
-            return sigma
-        if not least <= sigma <= most:
-            raise ValueError(
-                f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "
-                "of a reading in metres."
-            )
-        return sigma
 
 
 def find_dataset_file(location: Path) -> Path:
@@ -321,6 +311,5 @@ def dataset_texts(
     text = yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
-    joints = [column.name for column in reading_columns(machine.legs)]
-    table = format_table([*columns, *joints], rows)
+    table = format_table([*columns, *machine.motor_names], rows)
     return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -23,11 +23,13 @@ from legcal.geometry.types import BoolArray, IntArray
 class ImageTable(Table):
     """A table whose fields are arrays or tuples with one entry a row."""
 
+    keys: ClassVar[tuple[str, ...]]  # the fields that identify a row, in the order of sorting
     row: IntArray  # (n,) of the measurements
 
     def row_keys(self) -> list[tuple[Any, ...]]:
-        """Return the key that identifies each row and sorts tables."""
-        raise NotImplementedError
+        """Return the entries of ``keys`` in each row."""
+        columns = (getattr(self, name) for name in self.keys)
+        return list(zip(*(x if isinstance(x, tuple) else x.tolist() for x in columns), strict=True))
 
     def sort(self) -> Self:
         """Return the rows sorted by their keys."""

@@ -58,14 +58,11 @@ MAX_ANGLE, MAX_SHIFT = np.deg2rad(6.0), 0.06
 class Landmarks(ImageTable):
     """Joints clicked in images, one row a click."""
 
+    keys = "row", "leg", "end"
     leg: IntArray  # (n,)
     end: IntArray  # (n,) 0 at the base, 1 at the platform: index into ENDS
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
-
-    def row_keys(self) -> list[tuple[int, int, int]]:
-        """Return image row, leg and end of each click."""
-        return list(zip(self.row.tolist(), self.leg.tolist(), self.end.tolist(), strict=True))
 
 
 def joint_names(leg_names: Sequence[str]) -> dict[str, tuple[int, int]]:

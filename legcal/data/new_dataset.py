@@ -18,7 +18,7 @@ from typing import Any
 
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import MEASUREMENTS, dataset_texts
-from legcal.data.measurements import few_views, reading_columns
+from legcal.data.measurements import few_views
 from legcal.data.photograph_matching import (
     Matching,
     Photograph,
@@ -119,11 +119,6 @@ class NewDataset:
     # Contents of camera files to write, from the metadata of photographs
     made_cameras: Mapping[Path, str] = field(default_factory=dict)
 
-    @property
-    def joints(self) -> list[str]:
-        """The columns of the readings."""
-        return [column.name for column in reading_columns(self.machine.legs)]
-
     def document(self, written: Sequence[Path]) -> dict[str, Any]:
         """Return the document of ``legcal init --json``, with the files that were written."""
         return NewDatasetDocument(
@@ -142,7 +137,9 @@ class NewDataset:
                     view=view,
                     photograph=photograph.name,
                     image=self.place(photograph),
-                    readings=dict(zip(self.joints, self.readings.q[k].tolist(), strict=True)),
+                    readings=dict(
+                        zip(self.machine.motor_names, self.readings.q[k].tolist(), strict=True)
+                    ),
                 )
                 for (k, photograph), view in zip(self.matching.pairs, self.views, strict=True)
             ],
@@ -425,15 +422,15 @@ def _cameras(
             f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
             f"cannot show, needed {NAME_NEEDED}; rename it."
         )
-    for_all = [text for text in options if "=" not in text or os.path.isfile(text)]
+    for_all = [file for view, file in map(split_camera, options) if not view]
     of_one, problems = dict[str, str](), list[str]()
-    for name, _, file in (text.partition("=") for text in options if text not in for_all):
-        if name not in views:
+    for name, file in map(split_camera, options):
+        if name and name not in views:
             problems.append(
                 f"--camera {name}={file} could not be used: found no view of that name, needed one "
                 f"of {few(views)}; correct it."
             )
-        elif of_one.setdefault(name, file) != file:
+        elif name and of_one.setdefault(name, file) != file:
             problems.append(
                 f"The camera file of view {describe(name)} could not be decided: found "
                 f"--camera {name}={of_one[name]} and --camera {name}={file}, needed one; leave "
@@ -483,6 +480,12 @@ def _cameras(
     if unusable:
         raise DatasetError(unusable)
     return path_of_view, made
+
+
+def split_camera(option: str) -> tuple[str, str]:
+    """Return the view of ``VIEW=FILE``, "" for a file of all views, and the file."""
+    view, _, file = option.partition("=")
+    return (view, file) if file and not os.path.isfile(option) else ("", option)
 
 
 def _camera_by_exif(paths: Sequence[Path]) -> Camera | None:

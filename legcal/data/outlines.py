@@ -85,6 +85,7 @@ class Outlines(ImageTable):
     and for outlines that were given or edited (:func:`unmeasured`).
     """
 
+    keys = "row", "leg", "part", "edge"
     leg: IntArray  # (n,) of the mechanism
     part: tuple[str, ...]  # the URDF link of the cylinder
     edge: IntArray  # (n,) 1 where epsilon of eq (5) is +1, 2 where it is -1
@@ -100,11 +101,6 @@ class Outlines(ImageTable):
     gamma: Array  # (n,) gamma of the camera in the measurement
     by_gamma: Array  # (n,) shift inwards with log gamma [px]
     polish: Array  # (n,) log likelihood ratio of a polished surface over a matte one
-
-    def row_keys(self) -> list[tuple[int, int, str, int]]:
-        """Return image row, leg, part and edge of each outline."""
-        leg, edge = self.leg.tolist(), self.edge.tolist()
-        return list(zip(self.row.tolist(), leg, self.part, edge, strict=True))
 
     def used_keys(self) -> set[tuple[int, int, str, int]]:
         """Return image row, leg, part and edge of the used outlines."""
@@ -414,15 +410,12 @@ class LegAxes(ImageTable):
     The errors of an axis: ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
     """
 
+    keys = "row", "leg"
     leg: IntArray  # (n,)
     u: Array  # (n, 3) unit directions in the camera
     M: Array  # (n, 3) a point of each axis in the camera [m]
     basis: Array  # (n, 2, 3) unit vectors e1, e2 normal to u
     covariance: Array  # (n, 4, 4) of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m]
-
-    def row_keys(self) -> list[tuple[int, int]]:
-        """Return image row and leg of each axis."""
-        return list(zip(self.row.tolist(), self.leg.tolist(), strict=True))
 
 
 def axes_from_outlines(

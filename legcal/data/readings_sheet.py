@@ -7,7 +7,6 @@ of the legs.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data.measurements import reading_columns, readings_in
+from legcal.data.measurements import readings_in
 from legcal.data.reading_units import (
     NEEDED_UNIT,
     PULSES,
@@ -30,6 +29,7 @@ from legcal.data.reading_units import (
     unit_named,
 )
 from legcal.errors import DatasetError, UsageError
+from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import describe, few
 from legcal.files.table import (
     WORDS,
@@ -109,7 +109,7 @@ class ReadingsSheet:
         self.motors = [machine.legs[j] for j in machine.motors]
         self.taken: dict[str, str] = {}
         self.notes: list[str] = []
-        self._joints = [column.name for column in reading_columns(self.motors)]
+        self._joints = machine.motor_names
         self._heading_units: dict[str, str] = {}  # by joint
         columns = [Column(name, "text", required=False) for name in _COLUMNS]
         columns += [Column(joint, what="reading") for joint in self._joints]
@@ -364,18 +364,13 @@ def _foreign(key: str) -> str:
 
 def _needed(leg: Leg, *, has_pulses: bool) -> str:
     """Return the ranges for readings of a leg, in words."""
-    if leg.reads_angle:
-        low, high = (math.degrees(x) for x in leg.travel)
-        servo = "" if has_pulses else ", or pulses of servos that legcal.motors of it describes"
-        return (
-            f"readings in the travel of the model ({low:g} to {high:g} deg for motor "
-            f"'{leg.prismatic}'){servo}"
-        )
-    travel = f"{1e3 * leg.travel[0]:g} to {1e3 * leg.travel[1]:g} mm for leg '{leg.name}'"
-    if leg.actuator is not None:
-        return f"readings in the travel of the model ({travel})"
-    lengths = [1e3 * leg.length_at(q) for q in leg.travel]
-    return (
-        f"readings in the travel of the model ({travel}) or lengths ({min(lengths):g} to "
-        f"{max(lengths):g} mm, with --lengths)"
-    )
+    size, unit = SHOWN_IN[leg.reading_unit]
+    low, high = (size * x for x in leg.travel)
+    name = f"motor '{leg.prismatic}'" if leg.reads_angle else f"leg '{leg.name}'"
+    needed = f"readings in the travel of the model ({low:g} to {high:g} {unit} for {name})"
+    if leg.reads_angle and not has_pulses:
+        needed += ", or pulses of servos that legcal.motors of it describes"
+    if leg.actuator is None:
+        least, most = sorted(1e3 * leg.length_at(q) for q in leg.travel)
+        needed += f" or lengths ({least:g} to {most:g} mm, with --lengths)"
+    return needed

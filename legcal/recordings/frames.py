@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.data.image_choice import unix_seconds
-from legcal.data.measurements import reading_columns
 from legcal.data.photograph_matching import find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, OutOfResources, UsageError
@@ -396,7 +395,7 @@ def series_of_joints(
     source: str, times: Sequence[float], states: Sequence[Mapping[str, float]], machine: Machine
 ) -> Series:
     """Return the readings of joint states: positions [m or rad] by joint name."""
-    joints = [column.name for column in reading_columns(machine.legs)]
+    joints = machine.motor_names
     complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
     if not complete:
         names = sorted({name for state in states for name in state})

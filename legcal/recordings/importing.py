@@ -17,6 +17,7 @@ from legcal.data.new_dataset import (
     MIN_SIGMA,
     SheetOptions,
     plan_new_dataset,
+    split_camera,
     write_new_dataset,
 )
 from legcal.data.reading_units import usual_sigma
@@ -195,9 +196,7 @@ def plan_import(
             "clocks, needed a finite number; correct --offset."
         )
     for text in cameras:  # before minutes of reading frames
-        read_camera(
-            Path(text if "=" not in text or os.path.isfile(text) else text.split("=", 1)[1])
-        )
+        read_camera(Path(split_camera(text)[1]))
     tables = {path: read_series(path, machine, lengths=lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):

@@ -38,7 +38,7 @@ _LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 def matching_table(new: NewDataset) -> Report:
     """Return the interpretation of a folder and a table: columns, units, matched photographs."""
     pairs = list(zip(new.matching.pairs, new.views, strict=True))
-    joints = new.joints
+    joints = new.machine.motor_names
     size, unit = SHOWN_IN[new.machine.legs[new.machine.motors[0]].reading_unit]
     rows = [
         (

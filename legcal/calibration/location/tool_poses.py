@@ -106,7 +106,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
 
     Raises DatasetError with one sentence for each problem, naming row and column.
     """
-    joints = [column.name for column in reading_columns(machine.legs)]
+    joints = machine.motor_names
     sheet = read = None
     columns: dict[str, str] = {}  # meaning of the other headings
     header = _first_line(path)
