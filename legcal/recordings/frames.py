@@ -227,7 +227,13 @@ class Bag(Recording):
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of the bag; damaged images are skipped and counted."""
         self._bad, last, number = 0, -np.inf, -1
-        for time, kind, message in self._messages(_IMAGES, self._topic_of_images):
+        messages = self._messages(
+            "images",
+            _IMAGES,
+            self._image_topic,
+            lambda first: f"name it behind the bag, {self.path}:{first}, or give another bag",
+        )
+        for time, kind, message in messages:
             image = _image(message) if kind == _IMAGES[0] else _decoded(message)
             if image is None or time <= last:
                 self._bad += 1
@@ -249,48 +255,31 @@ class Bag(Recording):
     def readings(self) -> Series | None:
         """Return the joint states, None if the bag holds none."""
         with self._opened() as reader:
-            if not self._topics(reader, _JOINTS):
-                return None
+            topics = self._topics(reader, _JOINTS)
+        if not topics:
+            return None
         times, states = [], []
-        for time, _, message in self._messages(_JOINTS, self._topic_of_joints):
+        usual = _USUAL_JOINTS if _USUAL_JOINTS in topics else None
+        remedy = f"call it {_USUAL_JOINTS}, or give the readings as a table with --readings"
+        for time, _, message in self._messages("joint states", _JOINTS, usual, lambda _: remedy):
             times.append(time)
             states.append(dict(zip(message.name, map(float, message.position), strict=False)))
         return series_of_joints(f"{self.path}, joint states", times, states, self._machine)
 
-    def _topic_of_images(self, topics: Sequence[str]) -> str:
-        """Return the topic of the images: the stated one, or the only one."""
-        if self._image_topic is not None and self._image_topic not in topics:
-            raise UsageError(
-                f"{self.path}: the images could not be read: found no topic "
-                f"{describe(self._image_topic)} with them, needed "
-                f"{', '.join(map(describe, topics)) or 'one'}; correct the name."
-            )
-        if self._image_topic is None and len(topics) != 1:
-            stated = ", ".join(map(describe, topics)) or "no topic"
-            remedy = f"name it behind the bag, {self.path}:{topics[0]}" if topics else (
-                "give another bag")  # fmt: skip
-            raise DatasetError(
-                f"{self.path}: the images could not be read: found {stated} with them, needed one; "
-                f"{remedy}."
-            )
-        return self._image_topic or topics[0]
-
-    def _topic_of_joints(self, topics: Sequence[str]) -> str:
-        """Return the topic of the joint states: the only one, or the one with the usual name."""
-        if len(topics) > 1 and _USUAL_JOINTS not in topics:
-            raise DatasetError(
-                f"{self.path}: the joint states could not be read: found "
-                f"{', '.join(map(describe, topics))} with them, needed one or {_USUAL_JOINTS}; "
-                "give the readings as a table with --readings."
-            )
-        return topics[0] if len(topics) == 1 else _USUAL_JOINTS
-
     def _messages(
-        self, kinds: tuple[str, ...], choose: Callable[[Sequence[str]], str]
+        self, noun: str, kinds: tuple[str, ...], stated: str | None, remedy: Callable[[str], str]
     ) -> Iterator[tuple[float, str, Any]]:
-        """Yield time [s], type and content of the messages of one topic."""
+        """Yield time [s], type and content of the messages of the stated topic, or the only one."""
         with self._opened() as reader:
-            topic = choose(self._topics(reader, kinds))
+            topics = self._topics(reader, kinds)
+            topic = topics[0] if stated is None and len(topics) == 1 else stated
+            if topic not in topics:
+                found = ", ".join(map(describe, topics)) or "no topic"
+                missing = f"no topic {describe(stated)}, but " * (stated is not None)
+                raise DatasetError(
+                    f"{self.path}: the {noun} could not be read: found {missing}{found} with them, "
+                    f"needed one; {remedy(topics[0] if topics else '/TOPIC')}."
+                )
             chosen = [c for c in reader.connections if c.topic == topic]
             for connection, stamp, raw in reader.messages(connections=chosen):
                 message = reader.deserialize(raw, connection.msgtype)
