@@ -207,19 +207,13 @@ ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if
 
 def wrong_sizes(described: Description) -> list[str]:
     """Return the problems of radii, offsets and travels in themselves."""
-    problems = []
     for leg in described.legs:
-        if leg.offset is None:
-            continue
-        ends = leg.travel or (0.0, 0.0)
-        for length in (leg.offset + ends[0], leg.offset + ends[1]):
-            problems += _out_of_proportion(described, leg.name, length)[:1]
-            if problems:
-                return problems
-    for side, joints in (
-        ("base", [leg.A_base for leg in described.legs]),
-        ("platform", [leg.B_platform for leg in described.legs]),
-    ):
+        for end in leg.travel or (0.0,):
+            length = None if leg.offset is None else leg.offset + end
+            if length is not None and not MIN_LENGTH <= length <= MAX_LENGTH:
+                return [_out_of_proportion(described, leg.name, length)]
+    problems = []
+    for side, joints in zip(LINKS, _joints(described), strict=True):
         reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
         if reach > MAX_LENGTH:
             problems.append(
@@ -246,9 +240,8 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        disproportions = _out_of_proportion(described, leg.name, float(length))
-        if disproportions:
-            return disproportions
+        if not MIN_LENGTH <= length <= MAX_LENGTH:
+            return [_out_of_proportion(described, leg.name, float(length))]
         for radius in (leg.tube, leg.rod):
             if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [
@@ -274,15 +267,13 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     return problems
 
 
-def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
-    """Return the problem of an implausible leg length, if any."""
-    if MIN_LENGTH <= length <= MAX_LENGTH:
-        return []
+def _out_of_proportion(described: Description, leg: str, length: float) -> str:
+    """Return the problem of an implausible leg length."""
     where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
-    return [
+    return (
         f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
         f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
-    ]
+    )
 
 
 def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
