@@ -84,6 +84,7 @@ class Dataset:
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
     observations: Outlines | None  # the outlines in ``observations.csv`` if there is one
+    units: Mapping[str, ReadingUnit] = field(default_factory=dict)  # of its readings, by motor
     table_notes: tuple[str, ...] = ()  # oddities that are allowed in tables and the dataset file
     body_edges: Outlines | None = None  # the straight edges of bodies in ``observations.csv``
     overrides: tuple[Override, ...] = ()  # parameters by name, from the block ``parameters``
@@ -321,7 +322,7 @@ def load_dataset(
     table_path = folder / entry.measurements
     units = reading_units(yaml_path, machine.legs, entry.readings)
     sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
-    table, unread = measurement_table(table_path, machine.legs, units)
+    table, unread = measurement_table(table_path, units)
     if unread:
         # Without readings of what moves joints at A, their positions are unknown.
         moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
@@ -364,6 +365,7 @@ def load_dataset(
         ),
         measurements=measurements,
         observations=observations,
+        units=units,
         body_edges=body_edges,
         table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),
         overrides=entry.parameters.overrides(yaml_path),

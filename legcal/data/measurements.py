@@ -224,18 +224,9 @@ def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
     return f"{len(rows)} images of {of_views} ({few([names[row] for row in rows])})"
 
 
-def reading_columns(
-    legs: Sequence[Leg], units: Mapping[str, ReadingUnit] = MappingProxyType({})
-) -> list[Column]:
-    """Return the columns of readings of the motors, in the order of the legs."""
-    return [
-        Column(
-            str(leg.prismatic),
-            what="reading",
-            unit=units.get(str(leg.prismatic), default_unit(leg)).words,
-        )
-        for leg in legs_with_readings(legs)
-    ]
+def reading_columns(units: Mapping[str, ReadingUnit]) -> list[Column]:
+    """Return the columns of readings, in some units by motor."""
+    return [Column(name, what="reading", unit=unit.words) for name, unit in units.items()]
 
 
 def readings_in(
@@ -325,7 +316,7 @@ def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:
 
 
 def measurement_table(
-    path: Path, legs: Sequence[Leg], units: Mapping[str, ReadingUnit]
+    path: Path, units: Mapping[str, ReadingUnit]
 ) -> tuple[Table, tuple[str, ...]]:
     """Return the table ``measurements.csv``, and the motors whose column of readings is empty."""
     table = read_table(
@@ -335,7 +326,7 @@ def measurement_table(
         [
             *(Column(name, "text", required=name != "pose") for name in _TEXTS),
             Column("time", unit="seconds", required=False, blank=True),
-            *reading_columns(legs, units),
+            *reading_columns(units),
         ],
         needed="one row for each image; record measurements",
     )
@@ -426,8 +417,7 @@ def _shared_readings(
     table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: Array
 ) -> Array:
     """Replace the readings of each pose by their mean."""
-    joints = [column.name for column in reading_columns(legs)]
-    units = [leg.reading_unit for leg in legs_with_readings(legs)]
+    motors = legs_with_readings(legs)
     labels = table.text("pose")
     shared = readings.copy()
     for p in np.unique(pose):
@@ -437,12 +427,12 @@ def _shared_readings(
         first = int(members[0])
         spread = np.ptp(readings[members], axis=0)
         for j in np.flatnonzero(spread > MAX_READING_SPREAD * sigma_q).tolist():
-            most = MAX_READING_SPREAD
+            most, unit = MAX_READING_SPREAD, motors[j].reading_unit
             table.refuse(
                 first,
-                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} {units[j]}",
-                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {units[j]})",
-                joints[j],
+                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} {unit}",
+                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {unit})",
+                str(motors[j].prismatic),
                 remedy="give rows of different poses different labels",
                 what=f"pose {labels[first]}",
             )

@@ -120,6 +120,11 @@ def default_unit(leg: Leg) -> ReadingUnit:
     return ReadingUnit(leg.reading_unit)
 
 
+def default_units(legs: Sequence[Leg]) -> dict[str, ReadingUnit]:
+    """Return these units by motor, in the order of the legs."""
+    return {str(leg.prismatic): default_unit(leg) for leg in legs_with_readings(legs)}
+
+
 def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit:
     """Return a unit for the readings of a leg.
 
@@ -181,7 +186,7 @@ def reading_units(
         With one sentence for each motor whose readings cannot have their unit.
     """
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
-    units = {name: default_unit(leg) for name, leg in motors.items()}
+    units = default_units(legs)
     if stated is None:
         return units
     problems = []

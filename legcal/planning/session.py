@@ -25,7 +25,6 @@ from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.summary import mm_deg
 from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.dataset_file import dataset_texts
-from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.files.folder import (
     OutputKind,
@@ -163,8 +162,7 @@ def poses_to_take(plan: Plan) -> tuple[list[str], list[list[str]]]:
         rows.append([name, label, image, via, *(f"{x:z.4f}" for x in numbers),
                      *(f"{x:z.0f}" for x in where)])  # fmt: skip
     joints = [
-        f"{column.name} [{unit}]"
-        for column, (_, unit) in zip(reading_columns(plan.machine.legs), shown, strict=True)
+        f"{name} [{unit}]" for name, (_, unit) in zip(plan.machine.motor_names, shown, strict=True)
     ]
     pose = [*(f"{x} [mm]" for x in "xyz"), *(f"{x} [deg]" for x in ("roll", "pitch", "yaw"))]
     camera = [f"camera {x} [mm]" for x in "xyz"]
