@@ -28,7 +28,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     shifts_at_places,
 )
 from legcal.calibration.joint_fit.variables import fitted_legs
-from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_outlines
+from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_observed
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.estimation.variances import Effects, estimate_variances
@@ -65,10 +65,10 @@ def true_errors(folder: Path, result: Path) -> Array:
     """Return the standard deviations of all kinds of errors that outlines share [px]."""
     data = load_dataset(folder, check_images=False)
     measurements, legs = data.measurements, fitted_legs(data.machine)
-    measured = read_outlines(result, data.machine, measurements)
+    measured, _ = read_observed(result, data.machine, measurements)
     with TemporaryDirectory() as name:
         copyfile(folder / "truth" / "outlines.csv", Path(name) / OBSERVATIONS_NAME)
-        true = read_outlines(Path(name), data.machine, measurements)
+        true, _ = read_observed(Path(name), data.machine, measurements)
     if measured is None or true is None:
         raise SystemExit(f"{folder}: found no outlines, needed those of a result and the truth.")
     place = {key: i for i, key in enumerate(_keys(true))}

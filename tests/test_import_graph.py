@@ -16,7 +16,7 @@ LISTED = """
 geometry: covariances lines motions rotations tables types
 files: folder motions quantity reading schema table
 pages: document svg
-machine: actuator classification closing configurations equations files home inspection
+machine: actuator closing configurations equations files home inspection
     kinematics leg loader meshes model model_writer parameters picture redundancy rods shapes
     solver spanning_tree ties tolerance urdf
 descriptions: controllers firmware new_model

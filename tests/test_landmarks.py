@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
+from csv_rows import read_rows, write_rows
 from dataset_folder import dataset_of_readings
 from machines import ROOT
 from refusal_table import GONE, cell, keyed
@@ -94,6 +95,7 @@ def test_base_joints_place_the_camera_where_readings_give_no_pose(
         keyed("dataset.yaml", mechanism="by_hand.yaml", encoder_sigma=GONE)(folder)
     else:
         cell("measurements.csv", None, **dict.fromkeys(joints[3:], ""))(folder)
+        write_rows(table, [row | {"time": 1} for row in read_rows(table)])
     write_clicks(folder, {0: {j: px for j, px in seen.items() if j.endswith(".base")}})
     far, turned = off(folder, true)
     assert far < 1e-5

@@ -207,7 +207,7 @@ def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path
     given = Dimensions(type="RPR", min_length=230.0, max_length=370.0, leg_radius=12.0)
     made = assemble(description_of(path, given))
     assert made.planar
-    at_home = [made.home.motion().apply(leg.B_platform)[:2] for leg in made.legs]
+    at_home = [made.home.apply(leg.B_platform)[:2] for leg in made.legs]
     np.testing.assert_allclose(at_home, 1e-3 * np.array(joints["B"]), atol=1e-9)
     rows[3:] = ["B1;0;-140", "B2;121.2;70", "B3;-121.2;70"]  # in the platform link
     path.write_text("\n".join(["Gelenk;X (mm);Y (mm)", *rows]))
@@ -271,13 +271,13 @@ def test_the_column_of_photographs_is_the_one_that_says_so(
     lines += [[f"{9 - k}", f"p{k}.jpg", *(f"0,0{k}{j}" for j in range(6))] for k in range(1, 9)]
     path.write_text("\n".join(map(mark.join, lines)))
     sheet = ReadingsSheet(path, load_mechanism("hexapod"), "photograph")
-    assert sheet.text("image") == tuple(f"p{k}.jpg" for k in range(1, 9))
+    assert sheet.table.text("image") == tuple(f"p{k}.jpg" for k in range(1, 9))
 
 
 def test_a_running_number_is_no_photograph(tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
     path.write_text("ID,1,2,3,4,5,6\n1,0.01,0.02,0.03,0.04,0.05,0.06\n")
-    assert "image" not in ReadingsSheet(path, load_mechanism("hexapod"), "photograph")
+    assert "image" not in ReadingsSheet(path, load_mechanism("hexapod"), "photograph").table
 
 
 def test_poses_of_a_tracker_beside_whole_lengths_in_mm_are_read(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 from command_line import Outcome, run
 
 from legcal import load_dataset, load_mechanism
-from legcal.data.measurements import reading_columns
 from legcal.geometry.types import Array
 from legcal.recordings.frames import VIDEOS, stamp_in
 
@@ -78,7 +77,7 @@ def _camera_file(folder: Path) -> Path:
 
 
 def _table(motion: Motion, path: Path, times: Array) -> Path:
-    joints = [column.name for column in reading_columns(load_mechanism(MODEL).legs)]
+    joints = load_mechanism(MODEL).motor_names
     rows = [",".join([f"{t + 1.7e9:.4f}", *(f"{1e3 * x:.6f}" for x in q)])
             for t, q in zip(times, motion.readings(times), strict=True)]  # fmt: skip
     path.write_text("\n".join([",".join(["time", *joints]), *rows]))
@@ -125,7 +124,7 @@ def _bag(motion: Motion, folder: Path, **extra: str) -> Path:
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    joints = [column.name for column in reading_columns(load_mechanism(MODEL).legs)]
+    joints = load_mechanism(MODEL).motor_names
     types = store.types
     header, stamp = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
 

@@ -254,7 +254,7 @@ def test_settings_without_sense_for_a_machine_are_refused(
     ("there", "name", "named"),
     [
         ("dataset.yaml", "", "found a folder with files, needed a new or empty folder"),
-        (TRUTH_NAME, "", "found a simulated dataset, needed .* remove this one first"),
+        (TRUTH_NAME, "", "found an earlier dataset, needed .* remove that one"),
         ("file", "file", "found a file of that name"),
         ("file", "file/sub", "file is a file"),
         ("file", "n" * 300, "'File name too long'"),

@@ -52,7 +52,7 @@ from legcal.data.outlines import (
     reject_unused_legs,
     write_observations,
 )
-from legcal.data.reasons import WORDS_BY_CODE, Reason, Rejection, reason_in_words
+from legcal.data.reasons import Reason, Rejection, reason_in_words
 from legcal.errors import DatasetError, OutOfResources, UsageError, printable
 from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
 from legcal.files.quantity import SHOWN_IN
@@ -838,7 +838,7 @@ def _summary(detection: Detection, names: Sequence[str], row: int) -> tuple[str,
         rejection = outlines.reason[i]
         if not outlines.used[i] and rejection.reason is not Reason.OUTSIDE:
             name = legs[outlines.leg[i]]
-            legs_of_reason = rejected.setdefault(rejection.summary, [])
+            legs_of_reason = rejected.setdefault(rejection.reason.words, [])
             if name not in legs_of_reason:
                 legs_of_reason.append(name)
     reasons = "; ".join(f"{', '.join(legs)}: {rejection}" for rejection, legs in rejected.items())
@@ -863,7 +863,8 @@ def _outline_editor(detection: Detection) -> OutlineEditor | None:
         for view in measurements.views
     ]
     table = format_observations(detection.outlines, measurements, machine.leg_names)
-    editor = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND, WORDS_BY_CODE)
+    words = {str(reason): (reason.words, reason.words_of_detail) for reason in Reason}
+    editor = OutlineEditor(OBSERVATIONS_NAME, table, images, cameras, SIGMA_BY_HAND, words)
     size = len(editor.packed) + _OF_IMAGE * len(images)
     return editor if size <= MAX_BYTES else None
 

@@ -50,12 +50,13 @@ from legcal.causes import Cause, by_cause
 from legcal.data.cache import note_on_missing_photographs
 from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
 from legcal.data.image_choice import dataset_at
-from legcal.data.measurements import few, few_views, images_in_words, reading_columns, row_names
+from legcal.data.measurements import few_views, images_in_words, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
 from legcal.data.photograph_notes import compression_notes, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, Problem
 from legcal.files.folder import output_path
+from legcal.files.schema import few
 from legcal.geometry.types import Array, BoolArray
 from legcal.perception.diagnostics import defect_notes, is_out_of_sight
 from legcal.perception.image_quality import Exposure, measure_exposure
@@ -286,13 +287,13 @@ def _look_at_readings(checklist: _Checklist, notes: Sequence[str]) -> None:
 def _encoder_uses(dataset: Dataset) -> list[EncoderUse]:
     """Return the range of the readings of each encoder, and its share of the travel."""
     legs, q, uses = dataset.machine.legs, dataset.measurements.q, list[EncoderUse]()
-    for j, column in zip(dataset.machine.motors, reading_columns(legs), strict=True):
+    for j, name in zip(dataset.machine.motors, dataset.machine.motor_names, strict=True):
         lower, upper = map(float, legs[j].travel)
         has_travel = bool(np.isfinite(upper - lower)) and upper > lower
         smallest, largest = float(q[:, j].min()), float(q[:, j].max())
         uses.append(
             EncoderUse(
-                column=column.name,
+                column=name,
                 unit=legs[j].reading_unit,
                 least=smallest,
                 greatest=largest,

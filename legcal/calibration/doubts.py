@@ -50,10 +50,11 @@ from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.landmarks import Landmarks, joint_name
-from legcal.data.measurements import few, few_views, row_names
+from legcal.data.measurements import few_views, row_names
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import few
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import pose_differences

@@ -37,7 +37,7 @@ from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_BIAS_PX
 from legcal.causes import Cause
 from legcal.data.corners import Corners
-from legcal.data.measurements import Measurements, few, few_views, image_notes
+from legcal.data.measurements import Measurements, few_views, image_notes
 from legcal.data.outlines import (
     Outlines,
     along_legs,
@@ -52,6 +52,7 @@ from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.solver import minimise
 from legcal.estimation.uncertainty import restricted_log_likelihood
+from legcal.files.schema import few
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine

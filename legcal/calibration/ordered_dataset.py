@@ -28,9 +28,10 @@ from legcal.data.image_tables import (
     reorder_measurements,
 )
 from legcal.data.landmarks import platforms_by_landmarks
-from legcal.data.measurements import Measurements, few, images_in_words, row_names
+from legcal.data.measurements import Measurements, images_in_words, row_names
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
+from legcal.files.schema import few
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import solve_poses

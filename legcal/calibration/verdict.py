@@ -32,10 +32,11 @@ from legcal.calibration.summary import mm_deg
 from legcal.data.corners import Corners
 from legcal.data.dataset import POSES_NAME, Dataset
 from legcal.data.image_choice import sequences_of
-from legcal.data.measurements import few, few_views
+from legcal.data.measurements import few_views
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import DatasetError
 from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import few
 from legcal.files.table import Column, read_table
 from legcal.geometry.types import IntArray
 from legcal.machine.tolerance import Tolerance

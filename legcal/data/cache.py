@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
 from legcal.data.image_tables import canonical_order, reorder_measurements
-from legcal.data.measurements import few, places
+from legcal.data.measurements import places
 from legcal.data.outlines import (
     Outlines,
     is_edited,
@@ -27,7 +27,7 @@ from legcal.data.outlines import (
 )
 from legcal.files.folder import write_atomically
 from legcal.files.reading import MAX_DOCUMENT, MAX_IMAGE, read_bytes
-from legcal.files.schema import FileSchema
+from legcal.files.schema import FileSchema, few
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.version import __version__
 from legcal.vision.board import board_document

@@ -20,20 +20,33 @@ from legcal.data.outlines import DETAIL_COLUMN, SOURCES, UNLESS_REJECTED, VERDIC
 from legcal.data.reasons import USED, Rejection, read_rejection
 from legcal.errors import DatasetError
 from legcal.files.folder import write_atomically
-from legcal.files.schema import describe
 from legcal.files.table import Column, format_table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.board import FixedBoard
 
 NUMBERS = ("u", "v", "sigma")
-COLUMNS = (
-    "view",
-    "image",
-    "corner",
-    *NUMBERS,
-    *(column.name for column in (*VERDICT_COLUMNS, DETAIL_COLUMN)),
-)
 SIGMA_RANGE = (1e-6, 100.0)  # [px] plausible standard deviations of a corner
+_REMEDY = "correct it, or the board in the dataset file"
+
+
+def _columns(n_corners: int) -> tuple[Column, ...]:
+    least, most = SIGMA_RANGE
+    needed = f"a corner of the board, 0 to {n_corners - 1}"
+    of_sigma = f"a standard deviation from {least:g} to {most:g} px"
+    return (
+        Column("view", "text"),
+        Column("image", "text"),
+        Column("corner", "whole", least=0, most=n_corners - 1, needed=needed, remedy=_REMEDY),
+        *(Column(name, blank=True, remedy=UNLESS_REJECTED) for name in NUMBERS[:2]),
+        Column(
+            "sigma", least=least, most=most, needed=of_sigma, blank=True, remedy=UNLESS_REJECTED
+        ),
+        *VERDICT_COLUMNS,
+        DETAIL_COLUMN,
+    )
+
+
+COLUMNS = tuple(column.name for column in _columns(0))
 
 
 @brief
@@ -41,16 +54,13 @@ SIGMA_RANGE = (1e-6, 100.0)  # [px] plausible standard deviations of a corner
 class Corners(ImageTable):
     """Corners of the board in images, one row a corner."""
 
+    keys = "row", "corner"
     corner: IntArray  # (n,) index into Board.points, counted on from FixedBoard.first
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
     used: BoolArray
     reason: tuple[Rejection, ...]  # reasons of rejections; false for used corners
     source: tuple[str, ...]  # detected or edited
-
-    def row_keys(self) -> list[tuple[int, int]]:
-        """Return image row and number of each corner."""
-        return list(zip(self.row.tolist(), self.corner.tolist(), strict=True))
 
 
 def found_corners(row: IntArray, corner: IntArray, px: Array, sigma_px: Array) -> Corners:
@@ -72,11 +82,6 @@ def write_corners(path: Path, corners: Corners, measurements: Measurements) -> N
 
     Raises OSError if it cannot be written.
     """
-    write_atomically(path, format_corners(corners, measurements).encode())
-
-
-def format_corners(corners: Corners, measurements: Measurements) -> str:
-    """Return the text of ``corners.csv``."""
     names = places(measurements)
     rows = (
         [
@@ -91,7 +96,7 @@ def format_corners(corners: Corners, measurements: Measurements) -> str:
         ]
         for i, row in enumerate(corners.row.tolist())
     )
-    return format_table(COLUMNS, rows)
+    write_atomically(path, format_table(COLUMNS, rows).encode())
 
 
 def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measurements) -> Corners:
@@ -100,30 +105,12 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
     An edited row replaces the detected row of the same image and corner. Raises DatasetError with
     one sentence for each problem.
     """
-    least, most = SIGMA_RANGE
     n_corners = sum(fixed_board.board.n_corners for fixed_board in boards)
-    needed = f"a corner of the board, 0 to {n_corners - 1}"
-    remedy = "correct it, or the board in the dataset file"
     table = read_table(
         path,
         "table of corners",
         "corner",
-        [
-            Column("view", "text"),
-            Column("image", "text"),
-            Column("corner", "whole", least=0, needed=needed, remedy=remedy),
-            *(Column(name, blank=True, remedy=UNLESS_REJECTED) for name in NUMBERS[:2]),
-            Column(
-                "sigma",
-                least=least,
-                most=most,
-                needed=f"a standard deviation from {least:g} to {most:g} px",
-                blank=True,
-                remedy=UNLESS_REJECTED,
-            ),
-            *VERDICT_COLUMNS,
-            DETAIL_COLUMN,
-        ],
+        _columns(n_corners),
         needed="the corners of the board in the images; add them, or delete the file to have "
         "images searched",
     )
@@ -137,9 +124,6 @@ def read_corners(path: Path, boards: Sequence[FixedBoard], measurements: Measure
             "were found, whose corners are counted one board after the other; describe the other "
             "board in the dataset file again, or delete the table to have images searched."
         )
-    for i, text in enumerate(table.text("corner")):
-        if text.isdigit() and int(text) >= n_corners:
-            table.refuse(i, describe(text), needed, "corner", remedy=remedy)
     row = find_rows(table, measurements)
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
     table.need(NUMBERS, used)

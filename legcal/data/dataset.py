@@ -32,10 +32,9 @@ from legcal.data.landmarks import (
 from legcal.data.measurements import (
     Measurements,
     View,
-    few,
     few_views,
-    read_measurements,
-    unread_motors,
+    measurement_table,
+    measurements_in,
 )
 from legcal.data.outlines import Outlines, are_of_bodies, read_observations
 from legcal.data.photograph_notes import notes_on_photographs
@@ -51,7 +50,7 @@ from legcal.data.reading_units import (
 from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
 from legcal.files.motions import motion_from_xyz_quat
-from legcal.files.schema import closest, describe
+from legcal.files.schema import closest, describe, few
 from legcal.machine.files import shipped_folder, shipped_names
 from legcal.machine.leg import Link
 from legcal.machine.loader import load_mechanism
@@ -85,6 +84,7 @@ class Dataset:
     machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
     observations: Outlines | None  # the outlines in ``observations.csv`` if there is one
+    units: Mapping[str, ReadingUnit] = field(default_factory=dict)  # of its readings, by motor
     table_notes: tuple[str, ...] = ()  # oddities that are allowed in tables and the dataset file
     body_edges: Outlines | None = None  # the straight edges of bodies in ``observations.csv``
     overrides: tuple[Override, ...] = ()  # parameters by name, from the block ``parameters``
@@ -111,24 +111,14 @@ class Dataset:
 
     def image_reader(self, rows: Sequence[int]) -> ImageReader:
         """Return a reader of the images of these rows, in this order, for use in any process."""
+        m = self.measurements
         return ImageReader(
             tuple(None if path is None else path.absolute() for path in map(self.image_path, rows)),
-            tuple(self._camera(row) for row in rows),
-            tuple(self._where(row) for row in rows),
+            tuple(m.views[m.view[row]].camera for row in rows),
+            tuple(map(self.where, rows)),
         )
 
-    def inspect_image(self, row: int) -> tuple[ImageFacts, Problem | None]:
-        """Return the metadata of the image of a row, and the problem that prevents its use."""
-        path = self.image_path(row)
-        if path is None:
-            return ImageFacts(), None
-        return inspect_image(path, self._camera(row), self._where(row))
-
-    def _camera(self, row: int) -> Camera:
-        """Return the camera that took the image of a row."""
-        return self.measurements.views[int(self.measurements.view[row])].camera
-
-    def _where(self, row: int) -> Place:
+    def where(self, row: int) -> Place:
         """Return the place of a row in its table."""
         return Place(str(self.table_path), row + 1)
 
@@ -339,7 +329,7 @@ def load_dataset(
     table_path = folder / entry.measurements
     units = reading_units(yaml_path, machine.legs, entry.readings)
     sigma_q, by_joint = _encoder_sigmas(yaml_path, machine, entry.encoder_sigma, units)
-    unread = unread_motors(table_path, machine.legs)
+    table, unread = measurement_table(table_path, units)
     if unread:
         # Without readings of what moves joints at A, their positions are unknown.
         moving = [actuator.joint for actuator in machine.actuators if actuator.joint in unread]
@@ -352,9 +342,7 @@ def load_dataset(
             )
         machine = load_mechanism(mechanism, without=unread)
         by_joint = {name: sigma for name, sigma in by_joint.items() if name not in unread}
-    rows, notes = read_measurements(
-        table_path, folder, views, machine.legs, sigma_q, by_joint, units, unread
-    )
+    rows, notes = measurements_in(table, folder, views, machine.legs, sigma_q, by_joint, units)
     if unread:
         notes = (*notes, _without_readings(table_path, machine, unread))
     if in_mm:
@@ -371,7 +359,7 @@ def load_dataset(
         measurements, of_clicks = place_by_landmarks(
             path, machine, measurements, landmarks, may_be_wrong=not check_clicks
         )
-    observations, body_edges = _read_observed(folder, machine, measurements)
+    observations, body_edges = read_observed(folder, machine, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
@@ -384,6 +372,7 @@ def load_dataset(
         ),
         measurements=measurements,
         observations=observations,
+        units=units,
         body_edges=body_edges,
         table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),
         overrides=entry.parameters.overrides(yaml_path),
@@ -422,13 +411,6 @@ def _without_photographs(dataset: Dataset) -> str:
         f"that it names, the first of them {dataset.measurements.image[0]}, needed their files in "
         f"{dataset.folder}; take or copy them there under these names, or correct the column image."
     )
-
-
-def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
-    """Return a dataset with the metadata of its images, and the problems by row."""
-    facts, problems = inspect_rows(dataset)
-    notes = notes_on_photographs(dataset.measurements, dataset.camera_paths, facts)
-    return replace(dataset, facts=facts, file_notes=tuple(note.what for note in notes)), problems
 
 
 def _invisible(dataset: Dataset) -> list[str]:
@@ -480,12 +462,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera, unit: float) -> View:
     )
 
 
-def read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
-    """Return the outlines beside the dataset, if there are any."""
-    return _read_observed(folder, machine, measurements)[0]
-
-
-def _read_observed(
+def read_observed(
     folder: Path, machine: Machine, measurements: Measurements
 ) -> tuple[Outlines | None, Outlines | None]:
     """Return the outlines beside the dataset and the edges of bodies; None where there are none."""
@@ -521,8 +498,8 @@ def read_given_corners(
     return read_corners(path, boards, measurements)
 
 
-def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[int, Problem]]]:
-    """Return the metadata of images by their names, and the problems by row.
+def inspect_files(dataset: Dataset) -> tuple[Dataset, list[tuple[int, Problem]]]:
+    """Return a dataset with the metadata of its images, and the problems by row.
 
     There is one problem for each row that neither an image nor tables make usable.
     """
@@ -530,7 +507,7 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
     facts, problems = dict[str, ImageFacts](), list[tuple[int, Problem]]()
 
     def refuse(row: int, what: str, found: str, needed: str, remedy: str, *columns: str) -> None:
-        place = str(dataset.table_path), row + 1
+        place = dataset.where(row)
         problems.append((row, Problem(what, found, needed, remedy, *place, columns=columns)))
 
     by_board = dataset.board_on("base") is not None
@@ -564,9 +541,11 @@ def inspect_rows(dataset: Dataset) -> tuple[dict[str, ImageFacts], list[tuple[in
         if path is None and row not in in_tables:
             refuse(row, no_use, f"neither an image nor {tables}", "one of them", remedy, "image")
         elif path is not None and (os.path.exists(path) or row not in in_tables):
-            facts[measurements.image[row]], problem_of_image = dataset.inspect_image(row)
+            camera, place = measurements.views[measurements.view[row]].camera, dataset.where(row)
+            facts[measurements.image[row]], problem_of_image = inspect_image(path, camera, place)
             problems += [(row, problem_of_image)] if problem_of_image else []
-    return facts, problems
+    notes = notes_on_photographs(measurements, dataset.camera_paths, facts)
+    return replace(dataset, facts=facts, file_notes=tuple(note.what for note in notes)), problems
 
 
 def expand_hand_held(

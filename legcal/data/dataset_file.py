@@ -17,18 +17,16 @@ from pydantic import (
     Strict,
     Tag,
     WithJsonSchema,
-    field_validator,
 )
 
-from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import ReadingsEntry, ReadingUnitName
-from legcal.errors import Code, DatasetError, Problem, UsageError
+from legcal.errors import BadValue, Code, DatasetError, Problem, UsageError
 from legcal.files.folder import with_schema
 from legcal.files.motions import MotionEntry
 from legcal.files.quantity import EXAMPLE, PRIOR_SCHEMA, Quantity, read_prior, read_value
 from legcal.files.schema import FileSchema, Name, Number, Version, describe, read_yaml, validate
 from legcal.files.table import format_table
-from legcal.machine.files import DATASET_YAML
+from legcal.machine.files import DATASET_YAML, different_legs
 from legcal.machine.leg import Link
 from legcal.machine.model import Machine
 from legcal.machine.parameters import list_in_words
@@ -67,15 +65,8 @@ class ViewEntry(FileSchema):
     gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # None: unknown
     T_base_camera: MotionEntry | None = None
     hand_held: Annotated[bool, Strict()] = False
-    legs: list[str] | None = None  # none of them where a board on the platform is all that counts
-
-    @field_validator("legs")
-    @classmethod
-    def _names_each_leg_once(cls, legs: list[str] | None) -> list[str] | None:
-        twice = sorted({name for name in legs or () if (legs or []).count(name) > 1})
-        if twice:
-            raise ValueError(f"found {', '.join(twice)} twice, needed each leg once; remove one.")
-        return legs
+    # none of them where a board on the platform is all that counts
+    legs: Annotated[list[str], AfterValidator(different_legs)] | None = None
 
 
 def _can_be_fixed(text: str) -> str:
@@ -126,6 +117,14 @@ def _by_joint_or(of_all: str) -> Discriminator:
     return Discriminator(form)
 
 
+def _of_an_encoder(sigma: float) -> float:
+    least, most = ENCODER_SIGMAS
+    if not least <= sigma <= most:
+        needed = f"{least:g} to {most:g} m"
+        raise BadValue(f"{sigma:g} m", needed, "give one standard deviation of a reading in metres")
+    return sigma
+
+
 class DatasetEntry(BuiltEntry):
     """The whole of ``dataset.yaml``."""
 
@@ -134,10 +133,9 @@ class DatasetEntry(BuiltEntry):
     measurements: str
     encoder_sigma: Annotated[
         Annotated[
-            Annotated[
-                Number,
-                Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True))),
-            ],
+            Number,
+            Field(gt=0.0, json_schema_extra=dict(zip(_BOUNDS, ENCODER_SIGMAS, strict=True))),
+            AfterValidator(_of_an_encoder),
             Tag("[number]"),
         ]
         | Annotated[
@@ -157,21 +155,6 @@ class DatasetEntry(BuiltEntry):
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
     board: dict[str, Any] | list[Any] | None = None  # read by their kinds
-
-    @field_validator("encoder_sigma")
-    @classmethod
-    def _is_that_of_an_encoder(
-        cls, sigma: float | dict[str, float | str] | None
-    ) -> float | dict[str, float | str] | None:
-        least, most = ENCODER_SIGMAS
-        if sigma is None or isinstance(sigma, dict):
-            return sigma
-        if not least <= sigma <= most:
-            raise ValueError(
-                f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "
-                "of a reading in metres."
-            )
-        return sigma
 
 
 def find_dataset_file(location: Path) -> Path:
@@ -197,14 +180,7 @@ def find_dataset_file(location: Path) -> Path:
 
 def read_dataset_file(path: Path) -> DatasetEntry:
     """Return the checked content of dataset.yaml."""
-    document = read_yaml(path, "dataset file")
-    version = document.get("legcal_dataset", 1)
-    if version != 1 or isinstance(version, bool):
-        raise DatasetError(
-            f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
-            "needed version 1; use the legcal that wrote it, or write the file as version 1."
-        )
-    return validate(DatasetEntry, document, path)
+    return validate(DatasetEntry, read_yaml(path, "dataset file"), path)
 
 
 def entry_problem(path: Path, entry: str, found: str, needed: str, remedy: str) -> Problem:
@@ -335,6 +311,5 @@ def dataset_texts(
     text = yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
-    joints = [column.name for column in reading_columns(machine.legs)]
-    table = format_table([*columns, *joints], rows)
+    table = format_table([*columns, *machine.motor_names], rows)
     return {DATASET_YAML: with_schema("dataset", text), MEASUREMENTS: table}

@@ -12,8 +12,9 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from datetime import date, datetime, time
+from datetime import UTC, date, datetime, time
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -23,11 +24,14 @@ from legcal.data.image_tables import canonical_order, measurements_at
 from legcal.data.measurements import Measurements, OwnZero, row_names
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files.schema import closest, describe
+from legcal.files.table import is_number
 from legcal.geometry.types import Array, BoolArray, IntArray
 
 _NUMBER = re.compile(r"\d+")
 _EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
+_OF_DAY = re.compile(r"\d\d?:|(\d{4}|\d{6})$", re.ASCII)  # other numbers are no times of a day
 _SEED = 20020721
+DAY = 86400.0  # [s]
 
 
 def image_sequences(
@@ -58,25 +62,38 @@ def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | N
     if times is None or not np.isfinite(times).all():
         times = np.full(measurements.n_rows, np.nan)
         for row, image in enumerate(measurements.image):
-            moment = moment_of(taken_at.get(image, ""))
-            if moment is None:
+            seconds = seconds_in(taken_at.get(image, ""))
+            if seconds is None:
                 return None
-            times[row] = (moment - datetime(1970, 1, 1)).total_seconds()
+            times[row] = seconds
     n_moments = len(np.unique(times))
     return times if 2 * n_moments > measurements.n_poses else None
 
 
-def moment_of(text: str, day: date | None = None) -> datetime | None:
-    """Return the time in a text: ISO 8601, as EXIF writes it, or of the day alone."""
+def seconds_in(text: str, day: float | None = None) -> float | None:
+    """Return the time in a text [s] by the clock on the wall, None if there is none.
+
+    It is written as ISO 8601, as EXIF does, as the time of a *day* [s] alone, or as a Unix time.
+    """
     text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
-    try:
-        return datetime.fromisoformat(text).replace(tzinfo=None)
-    except ValueError:
-        pass
-    try:
-        return None if day is None else datetime.combine(day, time.fromisoformat(text))
-    except ValueError:
-        return None
+    with suppress(ValueError):
+        return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
+    with suppress(ValueError):
+        if day is not None and _OF_DAY.match(text):
+            at = datetime.combine(date(1970, 1, 1), time.fromisoformat(text)).replace(tzinfo=UTC)
+            return day // DAY * DAY + at.timestamp()
+    return unix_seconds(float(text)) if is_number(text) else None
+
+
+def unix_seconds(number: float) -> float | None:
+    """Return a Unix time [s] from s, ms, us or ns, distinguished by years 2001 to 2286.
+
+    Other numbers, such as 20261123101500, give None; numbers before 2001 are seconds.
+    """
+    for unit in (1e9, 1e6, 1e3, 1.0):
+        if number >= 1e9 * unit:
+            return number / unit if number < 1e10 * unit else None
+    return number
 
 
 def _numbers(names: Sequence[str]) -> IntArray | None:

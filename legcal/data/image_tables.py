@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -23,11 +23,13 @@ from legcal.geometry.types import BoolArray, IntArray
 class ImageTable(Table):
     """A table whose fields are arrays or tuples with one entry a row."""
 
+    keys: ClassVar[tuple[str, ...]]  # the fields that identify a row, in the order of sorting
     row: IntArray  # (n,) of the measurements
 
     def row_keys(self) -> list[tuple[Any, ...]]:
-        """Return the key that identifies each row and sorts tables."""
-        raise NotImplementedError
+        """Return the entries of ``keys`` in each row."""
+        columns = (getattr(self, name) for name in self.keys)
+        return list(zip(*(x if isinstance(x, tuple) else x.tolist() for x in columns), strict=True))
 
     def sort(self) -> Self:
         """Return the rows sorted by their keys."""
@@ -94,12 +96,6 @@ def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Ord
     legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
     view_names = np.array([view.name for view in measurements.views], dtype=object)
     views = np.argsort(view_names, kind="stable")
-    return Order(sort_rows(measurements, legs), views, legs)
-
-
-def sort_rows(measurements: Measurements, legs: IntArray | None = None) -> IntArray:
-    """Return the rows by view name, image, pose label and readings, the legs' in a given order."""
-    q = np.nan_to_num(measurements.q if legs is None else measurements.q[:, legs])
     labels = measurements.pose_labels or ("",) * measurements.n_poses
     keys = [
         (measurements.views[v].name, image, labels[p], readings)
@@ -107,11 +103,12 @@ def sort_rows(measurements: Measurements, legs: IntArray | None = None) -> IntAr
             measurements.view.tolist(),
             measurements.image,
             measurements.pose.tolist(),
-            q.tolist(),
+            np.nan_to_num(measurements.q[:, legs]).tolist(),
             strict=True,
         )
     ]
-    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+    rows = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+    return Order(rows, views, legs)
 
 
 def reorder_measurements(measurements: Measurements, order: Order) -> Measurements:

@@ -8,7 +8,7 @@ them place the camera of the view: roughly, like a ``T_base_camera`` in the data
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,13 +19,13 @@ from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
+    View,
     find_rows,
     places,
     refuse_outside,
     row_names,
 )
 from legcal.errors import DatasetError
-from legcal.files.schema import closest, describe
 from legcal.files.table import Column, format_table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.kinematics import followed_poses
@@ -58,14 +58,11 @@ MAX_ANGLE, MAX_SHIFT = np.deg2rad(6.0), 0.06
 class Landmarks(ImageTable):
     """Joints clicked in images, one row a click."""
 
+    keys = "row", "leg", "end"
     leg: IntArray  # (n,)
     end: IntArray  # (n,) 0 at the base, 1 at the platform: index into ENDS
     px: Array  # (n, 2) where it is seen [px]; (0, 0) is the centre of the top-left pixel
     sigma_px: Array  # (n,) of either coordinate
-
-    def row_keys(self) -> list[tuple[int, int, int]]:
-        """Return image row, leg and end of each click."""
-        return list(zip(self.row.tolist(), self.leg.tolist(), self.end.tolist(), strict=True))
 
 
 def joint_names(leg_names: Sequence[str]) -> dict[str, tuple[int, int]]:
@@ -117,22 +114,15 @@ def read_landmarks(path: Path, leg_names: Sequence[str], measurements: Measureme
     )
     row = find_rows(table, measurements)
     joints = joint_names(leg_names)
-    chosen = table.text("joint")
-    for i, name in enumerate(chosen):
-        if name not in joints:
-            remedy = f"a joint of the mechanism, as leg1.base; {closest(name, joints)}"
-            table.refuse(i, f"the unknown joint {describe(name)}", remedy, "joint")
+    joint = table.positions("joint", [*joints], "a joint of the mechanism, as leg1.base")
     px = table.numbers(("u", "v"))
     refuse_outside(table, row, COLUMNS[3:5], measurements)
     table.once(
-        [
-            (image, name) if image >= 0 and name in joints else None
-            for image, name in zip(row.tolist(), chosen, strict=True)
-        ],
+        [key if min(key) >= 0 else None for key in zip(row.tolist(), joint.tolist(), strict=True)],
         "the same image and joint",
     )
     table.check()
-    leg, end = np.array([joints[name] for name in chosen], dtype=np.intp).T
+    leg, end = np.array([*joints.values()], dtype=np.intp)[joint].T
     sigma = table.number("sigma") if "sigma" in table else np.full(len(table), np.nan)
     return Landmarks(row, leg, end, px, np.where(np.isfinite(sigma), sigma, SIGMA_PX))
 
@@ -195,12 +185,17 @@ def cameras_by_landmarks(
     joints, has_place = joints_at_readings(machine, measurements, landmarks.row)
     view_of, cameras = measurements.view[landmarks.row], dict[int, ClickedCamera]()
     for v in np.unique(view_of).tolist():
-        view_clicks = landmarks.choose(view_of == v)
-        clicks = _Clicks(path, machine, measurements, v, view_clicks, joints, has_place)
-        pose, problems, notes = clicks.camera()
-        T = None if pose is None else pose.T_camera_base.inv()
-        n_agreeing = 0 if pose is None else len(pose.off_px) - len(problems)
-        cameras[v] = ClickedCamera(T, problems, notes, n_agreeing)
+        of_view = view_of == v
+        clicks = _Clicks(
+            **vars(landmarks.choose(of_view)),
+            joints=joints[of_view],
+            has_place=has_place[of_view],
+            path=path,
+            machine=machine,
+            measurements=measurements,
+            view=measurements.views[v],
+        )
+        cameras[v] = clicks.camera()
     return cameras
 
 
@@ -234,75 +229,59 @@ def platforms_by_landmarks(
 
 def joints_at_readings(
     machine: Machine, measurements: Measurements, rows: IntArray
-) -> tuple[Mapping[int, Array], Mapping[int, BoolArray]]:
-    """Return by row the joints (n_legs, 2, 3) in the base link [m], and which have a place.
+) -> tuple[Array, BoolArray]:
+    """Return the joints in the base link at the readings of rows [m], and which have a place.
 
-    The mask (n_legs, 2) is true for the joints that the readings place: only the joints at the base
-    where the motors do not determine the pose of the platform, or the nominal model does not reach
-    it.
+    Joints (n, n_legs, 2, 3) have a place (n, n_legs, 2) if the readings give it: only those at the
+    base where the motors do not determine the pose of the platform, or the nominal model does not
+    reach it.
     """
-    joints, has_place = dict[int, Array](), dict[int, BoolArray]()
-    wanted = np.unique(measurements.pose[rows])
-    q = measurements.q_of_poses[wanted]
-    A = machine.A_at(np.nan_to_num(q))
-    stands = np.array([leg.actuator is None for leg in machine.legs]) | np.isfinite(q)
-    ends = np.zeros((len(wanted), machine.n_legs, 2, 3))
-    ends[:, :, 0] = A
-    placed = np.zeros((len(wanted), machine.n_legs, 2), dtype=np.bool_)
-    placed[:, :, 0] = stands
+    poses, of_row = np.unique(measurements.pose[rows], return_inverse=True)
+    q = measurements.q_of_poses[poses]
+    joints = np.zeros((len(poses), machine.n_legs, 2, 3))
+    joints[:, :, 0] = machine.A_at(np.nan_to_num(q))
+    has_place = np.zeros(joints.shape[:3], dtype=np.bool_)
+    has_place[:, :, 0] = np.isfinite(q) | [leg.actuator is None for leg in machine.legs]
     if machine.is_determined:
         for k, (T, failure) in enumerate(followed_poses(machine, q, on_the_chain=False)):
-            ends[k, :, 1] = B_at(machine, T.as_matrix()[None])[0]
-            placed[k, :, 1] = failure is None
-    for row in np.unique(rows).tolist():
-        k = int(np.searchsorted(wanted, measurements.pose[row]))
-        joints[row], has_place[row] = ends[k], placed[k]
-    return joints, has_place
+            joints[k, :, 1] = B_at(machine, T.as_matrix()[None])[0]
+            has_place[k, :, 1] = failure is None
+    return joints[of_row], has_place[of_row]
 
 
 @dataclass(frozen=True, eq=False)
-class _Clicks:
-    """The clicks of one view, and their joints according to the nominal model."""
+class _Clicks(Landmarks):
+    """The clicks of one view, and the joints of their images according to the nominal model."""
 
+    joints: Array  # (n, n_legs, 2, 3)
+    has_place: BoolArray  # (n, n_legs, 2)
     path: Path
     machine: Machine
     measurements: Measurements
-    view: int
-    landmarks: Landmarks
-    joints: Mapping[int, Array]  # by row
-    has_place: Mapping[int, BoolArray]
+    view: View
 
-    @property
-    def name(self) -> str:
-        """The view."""
-        return self.measurements.views[self.view].name
-
-    def camera(self) -> tuple[PointPose | None, list[str], list[str]]:
+    def camera(self) -> ClickedCamera:
         """Return the likeliest pose of the camera, problems of clicks, and notes."""
-        usable = np.array([self.has_place[r][j, e] for r, j, e in self.landmarks.row_keys()])
-        some = replace(self, landmarks=self.landmarks.choose(usable))
-        n, left_out = len(some.landmarks), len(usable) - int(usable.sum())
-        points = some.points
-        if n < MIN_POINTS or on_a_line(points):
-            return None, [self._too_few(n, left_out)], []
-        camera = self.measurements.views[self.view].camera
-        sigma = some.sigma(points)
-        poses = camera_poses_by_points(camera, points, some.landmarks.px, sigma)
+        some = self.choose(self.has_place[np.arange(len(self)), self.leg, self.end])
+        n, points = len(some), some.points
+        sigma, poses = np.zeros(0), list[PointPose]()
+        if n >= MIN_POINTS and not on_a_line(points):
+            sigma = some.sigma(points)
+            poses = camera_poses_by_points(self.view.camera, points, some.px, sigma)
         if not poses:
-            return None, [self._too_few(n, left_out)], []
+            return ClickedCamera(None, [self._too_few(n, len(self) - n)], [], 0)
         best = poses[0]
         wrong = np.flatnonzero(best.off_px > TRUNCATION * sigma)
         if 2 * len(wrong) > n or n - len(wrong) < MIN_POINTS:
-            return None, [some.disagreement(best)], []
-        if len(wrong):
-            return best, some.contradictions(best, wrong, sigma), []
-        return best, [], some.doubts(poses)
+            return ClickedCamera(None, [some.disagreement(best)], [], 0)
+        problems = some.contradictions(best, wrong, sigma)
+        notes = [] if problems else some.doubts(poses)
+        return ClickedCamera(best.T_camera_base.inv(), problems, notes, n - len(wrong))
 
     @property
     def points(self) -> Array:
         """The joints by the nominal model, (n, 3) in the base link [m]."""
-        joints = [self.joints[row][leg, end] for row, leg, end in self.landmarks.row_keys()]
-        return np.array(joints).reshape(-1, 3)
+        return self.joints[np.arange(len(self)), self.leg, self.end]
 
     def sigma(self, points: Array) -> Array:
         """Return the standard deviation of clicks from the joints of the model, (n,) [px].
@@ -310,13 +289,12 @@ class _Clicks:
         The scale in pixels a metre is the third quartile over pairs of clicks far apart, since some
         pairs are foreshortened.
         """
-        px = self.landmarks.px
         i, j = np.triu_indices(len(points), 1)
         apart = np.linalg.norm(points[i] - points[j], axis=1)
         far = apart > 0.3 * apart.max()
-        scale = np.linalg.norm(px[i] - px[j], axis=1)[far] / apart[far]
+        scale = np.linalg.norm(self.px[i] - self.px[j], axis=1)[far] / apart[far]
         of_model = MODEL_ERROR * self.machine.size * float(np.percentile(scale, 75.0))
-        return np.hypot(self.landmarks.sigma_px, of_model)
+        return np.hypot(self.sigma_px, of_model)
 
     def _too_few(self, n: int, left_out: int) -> str:
         """Return the problem of too few clicks to place the camera."""
@@ -324,7 +302,7 @@ class _Clicks:
         if left_out:
             actual += f" on joints that the readings place, and {left_out} on others"
         return (
-            f"{self.path}: view {self.name}: its camera could not be placed: found {actual}, "
+            f"{self.path}: view {self.view.name}: its camera could not be placed: found {actual}, "
             f"needed {MIN_POINTS} or more, better {GOOD_NUMBER}, that are not on one line; click "
             "more joints in its pictures, or remove those of this view."
         )
@@ -332,8 +310,8 @@ class _Clicks:
     def disagreement(self, pose: PointPose) -> str:
         """Return the problem of contradictory clicks, none of which is identified as wrong."""
         return (
-            f"{self.path}: view {self.name}: its camera could not be placed: found "
-            f"{len(self.landmarks)} clicks that no camera shows where they are (up to "
+            f"{self.path}: view {self.view.name}: its camera could not be placed: found "
+            f"{len(self)} clicks that no camera shows where they are (up to "
             f"{pose.off_px.max():.0f} px off), needed clicks on the joints that they name; check "
             "them, the readings of their images, the camera file and the model, or click more "
             "joints."
@@ -343,35 +321,32 @@ class _Clicks:
         """Return the problems of clicks that contradict the other clicks."""
         names, sentences = row_names(self.measurements), list[str]()
         for i in wrong.tolist():
-            row, leg, end = self.landmarks.row_keys()[i]
-            name = joint_name(self.machine.leg_names[leg], end)
+            name = joint_name(self.machine.leg_names[self.leg[i]], int(self.end[i]))
             other_joint = self._other_joint(pose, i, TRUNCATION * float(sigma[i]))
             perhaps = f"perhaps it shows {other_joint}; " if other_joint else ""
             sentences.append(
-                f"{self.path}: the click on {name} in {names[row]} (view {self.name}) is "
-                f"{pose.off_px[i]:.0f} px from where the other clicks have it, needed at most "
+                f"{self.path}: the click on {name} in {names[self.row[i]]} (view {self.view.name}) "
+                f"is {pose.off_px[i]:.0f} px from where the other clicks have it, needed at most "
                 f"{TRUNCATION * sigma[i]:.0f} px; {perhaps}correct or remove it."
             )
         return sentences
 
     def _other_joint(self, pose: PointPose, i: int, most: float) -> str:
         """Return the joint that a click fits according to the other clicks; "" for none."""
-        row = int(self.landmarks.row[i])
-        camera = self.measurements.views[self.view].camera
-        keys = [(j, e) for j, e in np.argwhere(self.has_place[row]).tolist()]
-        P = pose.T_camera_base.apply(np.array([self.joints[row][key] for key in keys]))
+        keys = np.argwhere(self.has_place[i])
+        P = pose.T_camera_base.apply(self.joints[i][self.has_place[i]])
         off = np.full(len(keys), np.inf)
         ahead = P[:, 2] > 0.0
-        off[ahead] = np.linalg.norm(camera.project(P[ahead]) - self.landmarks.px[i], axis=1)
+        off[ahead] = np.linalg.norm(self.view.camera.project(P[ahead]) - self.px[i], axis=1)
         k = int(np.argmin(off))
         if off[k] > min(most, 0.5 * float(pose.off_px[i])):
             return ""
-        return joint_name(self.machine.leg_names[keys[k][0]], keys[k][1])
+        return joint_name(self.machine.leg_names[keys[k, 0]], int(keys[k, 1]))
 
     def doubts(self, poses: Sequence[PointPose]) -> list[str]:
         """Return notes on an ambiguous or uncertain camera pose."""
         best = poses[0]
-        start = f"{self.path}: view {self.name}: its {len(self.landmarks)} clicks"
+        start = f"{self.path}: view {self.view.name}: its {len(self)} clicks"
         distance = float(np.linalg.norm(best.T_camera_base.translation))
         if len(poses) > 1 and poses[1].cost - best.cost < MIN_LEAD:
             difference = best.T_camera_base * poses[1].T_camera_base.inv()

@@ -9,7 +9,7 @@ name their rows by view and image, see :func:`row_names`.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -21,22 +21,23 @@ from legcal.brief import brief
 from legcal.causes import Cause, by_cause
 from legcal.data.reading_units import (
     ReadingUnit,
+    UnitPlace,
     default_unit,
     doubtful_units,
     joint_values,
     legs_with_readings,
     likely_cause,
+    readings_of_lengths,
     sigmas_of_legs,
 )
-from legcal.errors import DatasetError, Problem
+from legcal.errors import Problem
 from legcal.files.folder import path_problem
-from legcal.files.schema import closest, describe
+from legcal.files.schema import closest, describe, few
 from legcal.files.table import Column, Table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import TRAVEL_MARGIN, Leg
 from legcal.vision.camera import Camera
 
-MAX_NAMED = 5  # maximum number of names in one sentence
 # Fraction of the travel, and standard deviations: readings outside by less are within the travel
 # but for rounding and noise.
 ROUNDED, NOISY = 1e-3, 3.0
@@ -184,17 +185,6 @@ def find_rows(table: Table, measurements: Measurements, *, refuse: bool = True) 
     return rows
 
 
-def find_legs(table: Table, leg_names: Sequence[str], *, refuse: bool = True) -> IntArray:
-    """Return the leg that each row of a table names, -1 where unknown; these are refused."""
-    index = {name: j for j, name in enumerate(leg_names)}
-    names = table.text("leg")
-    legs = np.array([index.get(name, -1) for name in names], dtype=np.intp)
-    for i in np.flatnonzero(legs < 0).tolist() if refuse else ():
-        unknown, remedy = f"the unknown leg {describe(names[i])}", closest(names[i], leg_names)
-        table.refuse(i, unknown, "a leg of the mechanism", "leg", remedy=remedy)
-    return legs
-
-
 def refuse_outside(
     table: Table, rows: IntArray, columns: Sequence[str], measurements: Measurements
 ) -> None:
@@ -206,12 +196,6 @@ def refuse_outside(
     for i, k in np.argwhere(outside).tolist():
         needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"
         table.refuse(i, f"{px[i, k]:g} px", needed, columns[k], remedy="correct it")
-
-
-def few(names: Sequence[str]) -> str:
-    """Return a list of at most a few names: ``c1, c2 and 3 more``."""
-    more = len(names) - MAX_NAMED
-    return ", ".join(names[:MAX_NAMED]) + f" and {more} more" * (more > 0)
 
 
 def few_views(names: Sequence[str]) -> str:
@@ -240,54 +224,36 @@ def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
     return f"{len(rows)} images of {of_views} ({few([names[row] for row in rows])})"
 
 
-def reading_columns(
-    legs: Sequence[Leg], units: Mapping[str, ReadingUnit] = MappingProxyType({})
-) -> list[Column]:
-    """Return the columns of readings of the motors, in the order of the legs."""
-    return [
-        Column(
-            str(leg.prismatic),
-            what="reading",
-            unit=units.get(str(leg.prismatic), default_unit(leg)).words,
-        )
-        for leg in legs_with_readings(legs)
-    ]
-
-
-def unread_motors(path: Path, legs: Sequence[Leg]) -> tuple[str, ...]:
-    """Return the motors with empty readings in all rows of a table.
-
-    Other problems of the table are ignored here.
-    """
-    motors = [str(leg.prismatic) for leg in legs_with_readings(legs)]
-    others = [Column(name, "text", blank=True, required=False) for name in _TEXTS]
-    columns = [Column(name, "text", blank=True, required=False) for name in motors]
-    try:
-        table = read_table(path, "table of measurements", "row", [*others, *columns])
-    except DatasetError:
-        return ()
-    return tuple(
-        name for name in motors if name in table and len(table) and not any(table.text(name))
-    )
+def reading_columns(units: Mapping[str, ReadingUnit]) -> list[Column]:
+    """Return the columns of readings, in some units by motor."""
+    return [Column(name, what="reading", unit=unit.words) for name, unit in units.items()]
 
 
 def readings_in(
     table: Table,
     legs: Sequence[Leg],
-    units: Mapping[str, ReadingUnit] | None = None,
+    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
     sigma: Array | None = None,
+    *,
+    place: UnitPlace = "",
+    lengths: bool = False,
+    headings: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
     Readings outside their travel by more than 5 % of it are refused; smaller excesses are noted if
     they exceed rounding and noise. Many readings that hardly move in their unit and use the travel
-    in a larger one are refused as well. *units* and standard deviations *sigma* (n_motors,) come
-    from a dataset; without units, tables are in m and rad.
+    in a larger one are refused as well.
+
+    *units* are stated in a *place*, m and rad by default; *sigma* (n_motors,) are their standard
+    deviations. The numbers may be whole *lengths* of legs, under *headings* of the owner.
     """
     motors = legs_with_readings(legs)
     values = table.numbers(str(leg.prismatic) for leg in motors)
-    stated = [(units or {}).get(str(leg.prismatic), default_unit(leg)) for leg in motors]
+    names = [headings.get(str(leg.prismatic), str(leg.prismatic)) for leg in motors]
+    stated = [units.get(str(leg.prismatic), default_unit(leg)) for leg in motors]
     readings = joint_values(values, stated)
+    readings = readings_of_lengths(readings, motors) if lengths else readings
     noise = np.zeros(len(motors)) if sigma is None else NOISY * sigma
     notes, outside, often = [], dict[int, str](), dict[tuple[bool, str], list[int]]()
     for j, (leg, unit, column) in enumerate(zip(motors, stated, readings.T, strict=True)):
@@ -297,8 +263,9 @@ def readings_in(
         beyond = np.maximum(lower - column, column - upper)
         is_odd = beyond > max(ROUNDED * (upper - lower), float(noise[j]))
         is_far = (beyond > 0.0) & ~leg.in_travel(column)
-        ends = sorted(map(unit.reading, leg.travel))
-        travel = f"{ends[0]:g} to {ends[1]:g} {unit.name} (the joint limits of the model)"
+        ends = [leg.length_at(q) if lengths else q for q in leg.travel]
+        low, high = sorted(map(unit.reading, ends))
+        travel = f"{low:g} to {high:g} {unit.name} (the joint limits of the model)"
         if np.any(is_far):
             some, n = _some(table, values[:, j], is_far, unit.name), len(column)
             outside[j] = f"found {some}, needed {travel} with a margin of {TRAVEL_MARGIN:.0%}"
@@ -306,31 +273,30 @@ def readings_in(
                 often.setdefault((leg.reads_angle, unit.name), []).append(j)
         elif np.any(is_odd):
             notes.append(
-                f"{table.path}, column {leg.prismatic}: readings are a little outside the travel "
+                f"{table.path}, column {names[j]}: readings are a little outside the travel "
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
     notes += still_encoders(table.path, motors, readings)
     groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
-        if cause := likely_cause(values[:, alike], *of_alike, in_dataset=units is not None):
+        if not lengths and (cause := likely_cause(values[:, alike], *of_alike, place)):
             groups |= {j: ([], "") for j in alike} | {alike[0]: (alike, cause)}
     for j, actual in outside.items():
         columns, remedy = groups.get(j, ([j], "correct the readings or the limits"))
         if not columns:
             continue
-        where = f"in {motors[j].prismatic} " * (len(columns) > 1)
+        where = f"in {names[j]} " * (len(columns) > 1)
         table.refuse_file(
             Problem(
                 f"readings are outside the travel: {where}{actual}",
                 remedy=remedy,
                 file=str(table.path),
-                columns=tuple(str(motors[k].prismatic) for k in columns),
+                columns=tuple(names[k] for k in columns),
             )
         )
-    if not outside:
-        statement = "write readings: {} in the dataset file"
-        for problem in doubtful_units(table.path, values, motors, stated, statement):
+    if not outside and not lengths:
+        for problem in doubtful_units(table.path, values, motors, stated, place):
             table.refuse_file(problem)
     return readings, tuple(notes)
 
@@ -355,51 +321,53 @@ def _some(table: Table, column: Array, chosen: BoolArray, unit: str) -> str:
     return shown + (f" and {len(index) - _MAX_SHOWN} more" if len(index) > _MAX_SHOWN else "")
 
 
-def read_measurements(
-    path: Path,
-    folder: Path,
-    views: Sequence[View],
-    legs: Sequence[Leg],
-    sigma_q: float,
-    sigma_by_joint: Mapping[str, float] = MappingProxyType({}),
-    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
-    unread: Collection[str] = (),
-) -> tuple[Measurements, tuple[str, ...]]:
-    """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
-
-    Images are relative to ``folder``; their existence is not checked. Columns of *unread* motors
-    are empty: *legs* have no readings of these. Raises DatasetError with one sentence for each
-    problem.
-    """
-    texts = [
-        *(Column(name, "text", required=name != "pose") for name in _TEXTS),
-        *(Column(name, "text", blank=True) for name in unread),
-        Column("time", unit="seconds", required=False, blank=True),
-    ]
+def measurement_table(
+    path: Path, units: Mapping[str, ReadingUnit]
+) -> tuple[Table, tuple[str, ...]]:
+    """Return the table ``measurements.csv``, and the motors whose column of readings is empty."""
     table = read_table(
         path,
         "table of measurements",
         "row",
-        [*texts, *reading_columns(legs, units)],
+        [
+            *(Column(name, "text", required=name != "pose") for name in _TEXTS),
+            Column("time", unit="seconds", required=False, blank=True),
+            *reading_columns(units),
+        ],
         needed="one row for each image; record measurements",
     )
-    view_index = {view.name: i for i, view in enumerate(views)}
-    view_names, images = table.text("view"), table.text("image")
-    for row, name in enumerate(view_names):
-        if name not in view_index:
-            unknown, remedy = f"the unknown view {describe(name)}", closest(name, view_index)
-            table.refuse(row, unknown, "a view of the dataset file", "view", remedy=remedy)
+    unread = tuple(name for name in units if len(table) and not any(table.text(name)))
+    table.forgive(unread)
+    return table, unread
+
+
+def measurements_in(
+    table: Table,
+    folder: Path,
+    views: Sequence[View],
+    legs: Sequence[Leg],
+    sigma_q: float,
+    sigma_by_joint: Mapping[str, float],
+    units: Mapping[str, ReadingUnit],
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Return the rows of the table ``measurements.csv`` in its order, and notes on odd readings.
+
+    Images are relative to ``folder``; their existence is not checked. *legs* have no readings of
+    motors whose column is empty. Raises DatasetError with one sentence for each problem.
+    """
+    view_names, images = [view.name for view in views], table.text("image")
+    view = table.positions("view", view_names, "a view of the dataset file")
     _refuse_images(table, images, folder)
     motors = legs_with_readings(legs)
     sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
-    readings, notes = readings_in(table, legs, units, sigma)
+    readings, notes = readings_in(table, legs, units, sigma, place="dataset file")
     pose, labels = _poses(table.text("pose"))
     q = np.full((len(table), len(legs)), math.nan)
     q[:, [not leg.has_value for leg in legs]] = 0.0
     measurements = Measurements(
         views=tuple(views),
         image=images,
-        view=np.array([view_index.get(name, 0) for name in view_names], dtype=np.intp),
+        view=np.maximum(view, 0),
         pose=pose,
         q=q,
         sigma_q=sigma_q,
@@ -455,8 +423,7 @@ def _shared_readings(
     table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: Array
 ) -> Array:
     """Replace the readings of each pose by their mean."""
-    joints = [column.name for column in reading_columns(legs)]
-    units = [leg.reading_unit for leg in legs_with_readings(legs)]
+    motors = legs_with_readings(legs)
     labels = table.text("pose")
     shared = readings.copy()
     for p in np.unique(pose):
@@ -466,12 +433,12 @@ def _shared_readings(
         first = int(members[0])
         spread = np.ptp(readings[members], axis=0)
         for j in np.flatnonzero(spread > MAX_READING_SPREAD * sigma_q).tolist():
-            most = MAX_READING_SPREAD
+            most, unit = MAX_READING_SPREAD, motors[j].reading_unit
             table.refuse(
                 first,
-                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} {units[j]}",
-                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {units[j]})",
-                joints[j],
+                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} {unit}",
+                f"one reading within {most:g} sigma ({most * sigma_q[j]:.3g} {unit})",
+                str(motors[j].prismatic),
                 remedy="give rows of different poses different labels",
                 what=f"pose {labels[first]}",
             )

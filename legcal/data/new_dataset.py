@@ -18,7 +18,7 @@ from typing import Any
 
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import MEASUREMENTS, dataset_texts
-from legcal.data.measurements import few, few_views, reading_columns
+from legcal.data.measurements import few_views
 from legcal.data.photograph_matching import (
     Matching,
     Photograph,
@@ -28,12 +28,12 @@ from legcal.data.photograph_matching import (
     match,
     with_likely_views,
 )
-from legcal.data.reading_units import are_commands, default_unit, sigma_in, usual_sigma
+from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import OutputKind, check_path, holds_files, new_files, result_folder
+from legcal.files.folder import OutputKind, check_empty, check_path, new_files, result_folder
 from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
+from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
 from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
@@ -49,10 +49,10 @@ from legcal.vision.image_file import (
     read_facts,
 )
 
-DATASET_FOLDER = OutputKind("dataset", "", "legcal_dataset")  # may contain other files
+DATASET_FOLDER = OutputKind("dataset", "", "")  # may contain other files
 _WIDENED = 1.2  # uncertainty of a focal length, over the usual one, that is explained
 _EXAMPLE = "examples/hexapod"
-_EXAMPLE_KIND = OutputKind("example", "", "legcal_dataset")
+_EXAMPLE_KIND = OutputKind("example", "", "")
 # Without results of a calibration beside them
 _EXAMPLE_FILES = (
     "dataset.yaml", "measurements.csv", "camera_info.yaml", "images", "models", "urdf"
@@ -106,13 +106,11 @@ class NewDataset:
     destination: Path  # the folder of the dataset
     # Meaning of each heading of the table: a joint, view, image, pose or time
     columns: Mapping[str, str]
-    are_lengths: bool  # whether the table holds whole lengths of legs
     rows: tuple[Row, ...]  # the entries of each row of the table about its photograph
     poses: tuple[str, ...]  # the pose of each row; empty where the table does not name them
     matching: Matching  # pairs of row and photograph
     views: tuple[str, ...]  # the view of each pair
-    # Readings of the motors, in the order of their legs, and their unit in the table
-    readings: SheetReadings
+    readings: SheetReadings  # of the motors whose readings are known
     cameras: Mapping[str, Path]  # the camera file of each view
     # One standard deviation of a reading [m], by joint [m or rad] where a motor turns
     encoder_sigma: float | dict[str, float]
@@ -120,10 +118,9 @@ class NewDataset:
     # Contents of camera files to write, from the metadata of photographs
     made_cameras: Mapping[Path, str] = field(default_factory=dict)
 
-    @property
-    def joints(self) -> list[str]:
-        """The columns of the readings."""
-        return [column.name for column in reading_columns(self.machine.legs)]
+    def readings_of(self, k: int) -> dict[str, float]:
+        """Return the readings of a row of the table by joint [m or rad]."""
+        return dict(zip(self.readings.joints, self.readings.q[k].tolist(), strict=True))
 
     def document(self, written: Sequence[Path]) -> dict[str, Any]:
         """Return the document of ``legcal init --json``, with the files that were written."""
@@ -133,7 +130,7 @@ class NewDataset:
             columns=dict(self.columns),
             unit=self.readings.unit,
             unit_from=self.readings.unit_from,
-            lengths=self.are_lengths,
+            lengths=self.readings.are_lengths,
             matched=self.matching.how,
             encoder_sigma=self.encoder_sigma,
             views={view: ViewToWrite(camera=str(path)) for view, path in self.cameras.items()},
@@ -143,7 +140,7 @@ class NewDataset:
                     view=view,
                     photograph=photograph.name,
                     image=self.place(photograph),
-                    readings=dict(zip(self.joints, self.readings.q[k].tolist(), strict=True)),
+                    readings=self.readings_of(k),
                 )
                 for (k, photograph), view in zip(self.matching.pairs, self.views, strict=True)
             ],
@@ -240,15 +237,16 @@ def plan_new_dataset(
         )
     photographs = find_photographs(folder)
     by_names, pattern = with_likely_views(photographs)
-    sheet = ReadingsSheet(path, machine, "photograph")
-    named = {view.casefold() for view in sheet.text("view") if view}
+    sheet = ReadingsSheet(path, machine, "photograph", may_be_unknown=True)
+    table = sheet.table
+    named = {view.casefold() for view in table.text("view") if view}
     if named <= {photograph.folder.casefold() for photograph in by_names}:
         photographs = by_names
     else:
         pattern = None  # the table names other views
     sheet_readings = sheet.readings(options.unit, lengths=options.lengths)
-    texts = (sheet.text(name) for name in ("image", "view", "time"))
-    rows = tuple(itertools.starmap(Row, zip(sheet.where, *texts, strict=True)))
+    texts = map(table.text, ("image", "view", "time"))
+    rows = tuple(itertools.starmap(Row, zip(table.where, *texts, strict=True)))
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
     cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
@@ -263,9 +261,8 @@ def plan_new_dataset(
         table=path,
         destination=destination,
         columns=sheet.taken,
-        are_lengths=sheet_readings.are_lengths,
         rows=rows,
-        poses=sheet.text("pose") if "pose" in sheet else (),
+        poses=table.text("pose") if "pose" in table else (),
         matching=matching,
         views=view_of,
         readings=sheet_readings,
@@ -273,6 +270,8 @@ def plan_new_dataset(
         encoder_sigma=sigma,
         notes=(
             *sheet.notes,
+            *_unknown_notes(sheet.unknown),
+            *sheet_readings.notes,
             *matching.notes,
             *sigma_notes,
             *_made_notes(cameras, made),
@@ -280,6 +279,16 @@ def plan_new_dataset(
         ),
         made_cameras={path: text for path, (_, text) in made.items()},
     )
+
+
+def _unknown_notes(joints: Sequence[str]) -> Iterator[str]:
+    """Yield a note on readings that are not known."""
+    if joints:
+        yield (
+            f"The readings of {few(joints)} are not known (empty cells): these legs count as "
+            "passive. Where the others do not determine the pose, click joints with legcal detect "
+            "DATASET -o OUT --edit: at the base in a picture of each view, at the platform in all."
+        )
 
 
 def _made_notes(
@@ -344,8 +353,9 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         else camera.read_bytes()
         for camera in cameras
     }
+    joints = new.machine.motor_names
     rows = [
-        [view, new.place(photograph), *(new.poses[k : k + 1]), *new.readings.q[k].tolist()]
+        [view, new.place(photograph), *(new.poses[k : k + 1]), *map(new.readings_of(k).get, joints)]
         for (k, photograph), view in zip(new.matching.pairs, new.views, strict=True)
     ]
     views = {view: {"camera": names[camera]} for view, camera in new.cameras.items()}
@@ -377,27 +387,22 @@ def _sigmas(
     least: float,  # minimum default [m]
 ) -> tuple[float | dict[str, float], list[str]]:
     """Return the standard deviation of readings [m], by joint [m or rad] where a motor turns."""
-    sigmas = dict[str, float]()
-    for leg, unit, digit in zip(motors, readings.units, readings.digits.tolist(), strict=True):
-        name = str(leg.prismatic)
-        sigma = stated.get(name) if isinstance(stated, Mapping) else stated
-        if sigma is None:
-            sigmas[name] = max(digit, usual_sigma(leg, least, unit))
-            continue
-        try:
-            of_number = unit if isinstance(sigma, str) else default_unit(leg)
-            sigmas[name] = sigma_in(sigma, of_number, leg)
-        except ValueError as error:
-            raise UsageError(f"--encoder-sigma could not be used: {error}") from None
+    if not motors:
+        return least, []
+    units = dict(zip((str(leg.prismatic) for leg in motors), readings.units, strict=True))
+    sigmas = {
+        name: max(digit, usual_sigma(leg, least, units[name]))
+        for name, leg, digit in zip(units, motors, readings.digits.tolist(), strict=True)
+    }
+    sigmas |= {} if stated is None else sigmas_of(stated, motors, units)
     slides = not any(leg.reads_angle for leg in motors)
     smallest = min(sigmas.values())
     notes = []
     if stated is None:
-        shown = f"{1e6 * smallest:.3g} um"
+        shown = f"{1e6 * smallest:.3g} um" if smallest < 1e-3 else f"{1e3 * smallest:.3g} mm"
         if not slides:
-            units = [leg.reading_unit for leg in motors]
-            of_motor = zip(sigmas.items(), units, strict=True)
-            shown = few([f"{name} {sigma:.2g} {unit}" for (name, sigma), unit in of_motor])
+            of_motor = zip(motors, sigmas.items(), strict=True)
+            shown = few([f"{name} {x:.2g} {leg.reading_unit}" for leg, (name, x) in of_motor])
         why = "the last digit of the table, at least that of a good encoder"
         if any(map(are_commands, motors, readings.units)):
             why = "half a degree of what a hobby servo makes of its command"
@@ -432,15 +437,15 @@ def _cameras(
             f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
             f"cannot show, needed {NAME_NEEDED}; rename it."
         )
-    for_all = [text for text in options if "=" not in text or os.path.isfile(text)]
+    for_all = [file for view, file in map(split_camera, options) if not view]
     of_one, problems = dict[str, str](), list[str]()
-    for name, _, file in (text.partition("=") for text in options if text not in for_all):
-        if name not in views:
+    for name, file in map(split_camera, options):
+        if name and name not in views:
             problems.append(
                 f"--camera {name}={file} could not be used: found no view of that name, needed one "
                 f"of {few(views)}; correct it."
             )
-        elif of_one.setdefault(name, file) != file:
+        elif name and of_one.setdefault(name, file) != file:
             problems.append(
                 f"The camera file of view {describe(name)} could not be decided: found "
                 f"--camera {name}={of_one[name]} and --camera {name}={file}, needed one; leave "
@@ -492,6 +497,12 @@ def _cameras(
     return path_of_view, made
 
 
+def split_camera(option: str) -> tuple[str, str]:
+    """Return the view of ``VIEW=FILE``, "" for a file of all views, and the file."""
+    view, _, file = option.partition("=")
+    return (view, file) if file and not os.path.isfile(option) else ("", option)
+
+
 def _camera_by_exif(paths: Sequence[Path]) -> Camera | None:
     """Return the camera from the metadata of photographs; None if these are insufficient."""
     contents = [read_bytes(path, MAX_IMAGE) for path in paths]
@@ -521,12 +532,7 @@ def copy_example(destination: Path) -> None:
     OutOfResources
         If it does not take the files, or legcal was installed without them.
     """
-    check_path(destination, _EXAMPLE_KIND)
-    if destination.is_dir() and holds_files(destination):
-        raise UsageError(
-            f"{destination}: the example could not be written: found a folder with files, needed "
-            "a new or empty one; give another folder with -o."
-        )
+    check_empty(destination, _EXAMPLE_KIND)
     source = shipped_folder(_EXAMPLE)
     if not (source / DATASET_YAML).is_file():
         raise OutOfResources(

@@ -20,7 +20,6 @@ from legcal.brief import brief
 from legcal.data.image_tables import ImageTable
 from legcal.data.measurements import (
     Measurements,
-    find_legs,
     find_rows,
     places,
 )
@@ -86,6 +85,7 @@ class Outlines(ImageTable):
     and for outlines that were given or edited (:func:`unmeasured`).
     """
 
+    keys = "row", "leg", "part", "edge"
     leg: IntArray  # (n,) of the mechanism
     part: tuple[str, ...]  # the URDF link of the cylinder
     edge: IntArray  # (n,) 1 where epsilon of eq (5) is +1, 2 where it is -1
@@ -101,11 +101,6 @@ class Outlines(ImageTable):
     gamma: Array  # (n,) gamma of the camera in the measurement
     by_gamma: Array  # (n,) shift inwards with log gamma [px]
     polish: Array  # (n,) log likelihood ratio of a polished surface over a matte one
-
-    def row_keys(self) -> list[tuple[int, int, str, int]]:
-        """Return image row, leg, part and edge of each outline."""
-        leg, edge = self.leg.tolist(), self.edge.tolist()
-        return list(zip(self.row.tolist(), leg, self.part, edge, strict=True))
 
     def used_keys(self) -> set[tuple[int, int, str, int]]:
         """Return image row, leg, part and edge of the used outlines."""
@@ -147,21 +142,13 @@ def through_cameras(
         old_lens, new_lens = ((camera[v].K, camera[v].distortion) for camera in (measured, wanted))
         if len(indices) == 0 or all(map(np.array_equal, old_lens, new_lens)):
             continue
-        before, after = (
-            _plane_through(camera[v].undistort(outlines.ends[indices]))
-            for camera in (measured, wanted)
-        )
+        ends = (camera[v].rays(outlines.ends[indices]) for camera in (measured, wanted))
+        before, after = (cross(rays[:, 0], rays[:, 1]) for rays in ends)
         size = np.linalg.norm(after, axis=1)
         size *= np.sign(np.sum(before * outlines.h[indices], axis=1))
         has_plane = size != 0.0
         h[indices[has_plane]] = after[has_plane] / size[has_plane, None]
     return replace(outlines, h=h)
-
-
-def _plane_through(ends: Array) -> Array:
-    """Return normals (n, 3) of the planes through the camera and two points (n, 2, 2) each."""
-    rays = np.concatenate([ends, np.ones((*ends.shape[:2], 1))], axis=2)
-    return cross(rays[:, 0], rays[:, 1])
 
 
 def no_outlines() -> Outlines:
@@ -294,12 +281,12 @@ def read_observations(
     Raises DatasetError with one sentence for each problem.
     """
     leg_names = [leg.name for leg in legs]
-    parts = [list(leg.radius_of_part) for leg in legs]
+    parts, needed = [list(leg.radius_of_part) for leg in legs], "a leg of the mechanism"
     remedy = "delete the file to have it written again"
     table = read_table(path, "table of observations", "outline", OUTLINE_COLUMNS, remedy=remedy)
     if skip_stale:
         row = find_rows(table, measurements, refuse=False)
-        leg = find_legs(table, leg_names, refuse=False)
+        leg = table.positions("leg", leg_names, needed, refuse=False)
         exists = np.array(
             [j >= 0 and part in parts[j] for j, part in zip(leg, table.text("part"), strict=True)],
             dtype=np.bool_,
@@ -307,13 +294,13 @@ def read_observations(
         exists |= (leg >= 0) & (table.number("edge") >= FIRST_EDGE)
         detected = np.array([source == "detected" for source in table.text("source")], dtype=bool)
         table.keep((exists & (row >= 0)) | ~detected)
-    row, leg = find_rows(table, measurements), find_legs(table, leg_names)
+    row, leg = find_rows(table, measurements), table.positions("leg", leg_names, needed)
     part, of_body = table.text("part"), table.number("edge") >= FIRST_EDGE
     for i in np.flatnonzero(leg >= 0).tolist():
         if part[i] not in parts[leg[i]] and not of_body[i]:
             unknown_part = f"the unknown part {describe(part[i])}"
-            needed = f"a link with a cylinder of {leg_names[leg[i]]}"
-            table.refuse(i, unknown_part, needed, "part", remedy=closest(part[i], parts[leg[i]]))
+            cylinder = f"a link with a cylinder of {leg_names[leg[i]]}"
+            table.refuse(i, unknown_part, cylinder, "part", remedy=closest(part[i], parts[leg[i]]))
     used = np.array([verdict == "used" for verdict in table.text("verdict")], dtype=np.bool_)
     edited = np.array([source == "edited" for source in table.text("source")], dtype=np.bool_)
     table.need(NUMBERS, used)
@@ -342,16 +329,16 @@ def read_observations(
     )
     # The end nearer to the base joint comes first. h is the moment u x P, and the ray to the
     # second end is that to the first plus a piece of u, so that (second x first) . h > 0.
-    xy = _rays(outlines, measurements)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
-    swap = np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0
-    ends = np.where(swap[:, None, None], outlines.ends[:, ::-1], outlines.ends)
-    turned = outlines.covariance[:, ::-1, ::-1]
-    covariance = np.where(swap[:, None, None], turned, outlines.covariance)
-    outlines = replace(outlines, ends=ends, covariance=covariance)
-    _refuse_ends_off_line(table, outlines, measurements)
+    rays = _rays(outlines, measurements)
+    swap = (np.sum(cross(rays[:, 1], rays[:, 0]) * outlines.h, axis=-1) < 0.0)[:, None, None]
+    _refuse_ends_off_line(table, outlines, measurements, rays)
     table.check()
-    return outlines
+    turned = outlines.covariance[:, ::-1, ::-1]
+    return replace(
+        outlines,
+        ends=np.where(swap, outlines.ends[:, ::-1], outlines.ends),
+        covariance=np.where(swap, turned, outlines.covariance),
+    )
 
 
 def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
@@ -384,26 +371,27 @@ def _refuse_numbers(table: Table, numbers: Array, used: BoolArray) -> None:
 
 
 def _rays(outlines: Outlines, measurements: Measurements) -> Array:
-    """Return the ends of outlines on the sensor plane, (n, 2, 2)."""
-    xy = np.full(outlines.ends.shape, np.nan)
+    """Return the rays through the ends of outlines, (n, 2, 3); NaN without ends."""
+    rays = np.full((*outlines.ends.shape[:2], 3), np.nan)
     view = measurements.view[outlines.row]
     has_ends = np.all(np.isfinite(outlines.ends), axis=(1, 2))
     for v in np.unique(view):
         chosen = (view == v) & has_ends
         if np.any(chosen):
-            xy[chosen] = measurements.views[v].camera.undistort(outlines.ends[chosen])
-    return xy
+            rays[chosen] = measurements.views[v].camera.rays(outlines.ends[chosen])
+    return rays
 
 
-def _refuse_ends_off_line(table: Table, outlines: Outlines, measurements: Measurements) -> None:
+def _refuse_ends_off_line(
+    table: Table, outlines: Outlines, measurements: Measurements, rays: Array
+) -> None:
     """Refuse used outlines whose ends do not lie on their line."""
-    xy = _rays(outlines, measurements)
     view = measurements.view[outlines.row]
     offset = np.zeros(len(outlines))
     for v in np.unique(view):
         chosen = (view == v) & outlines.used
         camera, h = measurements.views[v].camera, outlines.h[chosen][:, None]
-        offset[chosen] = np.abs(camera.line_offset(h, xy[chosen])).max(axis=1)
+        offset[chosen] = np.abs(camera.line_offset(h, rays[chosen, :, :2])).max(axis=1)
     off = ~(offset <= LINE_TOLERANCE_PX)
     for i in np.flatnonzero(off).tolist():
         actual = f"ends {offset[i]:.3g} px from the line (a, b, c)"
@@ -422,15 +410,12 @@ class LegAxes(ImageTable):
     The errors of an axis: ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
     """
 
+    keys = "row", "leg"
     leg: IntArray  # (n,)
     u: Array  # (n, 3) unit directions in the camera
     M: Array  # (n, 3) a point of each axis in the camera [m]
     basis: Array  # (n, 2, 3) unit vectors e1, e2 normal to u
     covariance: Array  # (n, 4, 4) of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m]
-
-    def row_keys(self) -> list[tuple[int, int]]:
-        """Return image row and leg of each axis."""
-        return list(zip(self.row.tolist(), self.leg.tolist(), strict=True))
 
 
 def axes_from_outlines(
@@ -574,9 +559,8 @@ def outline_derivative(
 
     Returns rays (..., 2, 3); derivative (..., 2, 3) [1/px].
     """
-    xy = camera.undistort(ends)
-    ones = np.ones((*xy.shape[:-1], 1))
-    rays = np.concatenate([xy, ones], axis=-1)
+    rays = camera.rays(ends)
+    xy = rays[..., :2]
     # The line follows an offset of an end: (h + dh) . ray = -dvalue keeps the point on it.
     J = camera.pixels_per_unit(xy)
     ab = np.broadcast_to(h[..., None, :2], xy.shape)

@@ -12,15 +12,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from legcal.data.image_choice import moment_of
-from legcal.data.measurements import few
+from legcal.data.image_choice import DAY, seconds_in
 from legcal.errors import Code, DatasetError, Place, Problem
 from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import NAME_NEEDED, closest, describe, is_name
+from legcal.files.schema import NAME_NEEDED, closest, describe, few, is_name
 from legcal.vision.image_file import (
     CONVERT,
     CONVERT_HEIC,
@@ -62,6 +60,11 @@ class Row:
     image: str
     view: str
     time: str
+
+    def problem(self, done: str, found: str, needed: str, remedy: str, code: Code) -> Problem:
+        """Return the problem of a photograph that could not be found or decided by its name."""
+        what, columns = f"the photograph could not be {done}", ("image",)
+        return Problem(what, found, needed, remedy, *self.where, columns=columns, code=code)
 
 
 @dataclass(frozen=True)
@@ -289,17 +292,11 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
     for k in named:
         if k not in best:
             near = closest(rows[k].image, [p.name for p in photographs if p.name not in taken])
-            problems.append(
-                Problem(
-                    "the photograph could not be found",
-                    f"no {describe(rows[k].image)}",
-                    f"one of the {len(photographs)} photographs",
-                    near,
-                    *rows[k].where,
-                    columns=("image",),
-                    code=Code.MISSING_FILE,
-                )
+            found, needed = (
+                f"no {describe(rows[k].image)}",
+                f"one of the {len(photographs)} photographs",
             )
+            problems.append(rows[k].problem("found", found, needed, near, Code.MISSING_FILE))
     if len(best) == 0 and len(problems) > 1:
         problems = [
             Problem(
@@ -319,33 +316,22 @@ def _named_once(
 ) -> Matching:
     """Return the pairs if each photograph has one row, and each row one photograph a view."""
     row_of: dict[str, int] = {}
-    problems, undecided = [], "the photograph could not be decided"
+    problems = []
     for k, photographs in matches.items():
         folders = [photograph.folder for photograph in photographs]
         if len(set(folders)) < len(folders) or (rows[k].view and len(photographs) > 1):
-            problems.append(
-                Problem(
-                    undecided,
-                    f"{describe(rows[k].image)} for {few([p.name for p in photographs])}",
-                    "one",
-                    "write the name with its folder and extension",
-                    *rows[k].where,
-                    columns=("image",),
-                    code=Code.BAD_CELL,
-                )
-            )
+            found = f"{describe(rows[k].image)} for {few([p.name for p in photographs])}"
+            remedy = "write the name with its folder and extension"
+            problems.append(rows[k].problem("decided", found, "one", remedy, Code.BAD_CELL))
         for photograph in photographs:
             if (other_row := row_of.setdefault(photograph.name, k)) != k:
+                found = f"{describe(photograph.name)} also for {rows[other_row].where}"
+                needed, remedy = (
+                    "one row a photograph",
+                    "add a column view, or write names with folders",
+                )
                 problems.append(
-                    Problem(
-                        undecided,
-                        f"{describe(photograph.name)} also for {rows[other_row].where}",
-                        "one row a photograph",
-                        "add a column view, or write names with folders",
-                        *rows[k].where,
-                        columns=("image",),
-                        code=Code.REPEATED_ROW,
-                    )
+                    rows[k].problem("decided", found, needed, remedy, Code.REPEATED_ROW)
                 )
     if problems:
         raise DatasetError(problems)
@@ -416,10 +402,10 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
     return Matching(tuple(pairs), method, tuple(notes))
 
 
-def photograph_time(photograph: Photograph) -> datetime | None:
-    """Return the time of a photograph in its metadata, None if there is none."""
+def photograph_time(photograph: Photograph) -> float | None:
+    """Return the time of a photograph in its metadata [s], None if there is none."""
     try:
-        return moment_of(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
+        return seconds_in(read_facts(read_bytes(photograph.path, MAX_IMAGE)).taken_at)
     except OSError:
         return None
 
@@ -438,8 +424,7 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
             "more; copy the files from the camera as they are, add a column image, or remove the "
             "column time to match rows and photographs in order."
         )
-    day = taken[dated[0].name].date()
-    times = [moment_of(row.time, day) for row in rows]
+    times = [seconds_in(row.time, taken[dated[0].name]) for row in rows]
     bad = [
         f"{row.where}, column time: the time could not be read: found {describe(row.time)}, needed "
         "one such as 2026-11-23 10:15:00; correct the cell."
@@ -451,8 +436,7 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
     moments = [when for when in times if when is not None]
     order = sorted(range(len(rows)), key=lambda k: moments[k])
     gaps = [moments[b] - moments[a] for a, b in pairwise(order)]
-    least = min(gaps, default=timedelta(days=1))
-    shift = timedelta()
+    least, shift = min(gaps, default=DAY), 0.0
     if len(dated) == len(rows):
         apart = [taken[p.name] - moments[k] for k, p in zip(order, dated, strict=True)]
         shift = sorted(apart)[len(apart) // 2]
@@ -463,10 +447,10 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
     if len({p.name for p in pairs.values()}) < len(rows) or 2 * worst >= least:
         raise DatasetError(
             f"{table}: the photographs could not be matched by time: found times up to "
-            f"{worst.total_seconds():.0f} s apart and rows {least.total_seconds():.0f} s apart, "
+            f"{worst:.0f} s apart and rows {least:.0f} s apart, "
             "needed less than half of that; leave out photographs without a row, so that a "
             "difference of the clocks shows, or add a column image."
         )
-    about = f", clocks {shift.total_seconds():+.0f} s apart" if shift else ""
+    about = f", clocks {shift:+.0f} s apart" if shift else ""
     matches = [(k, [p]) for k, p in sorted(pairs.items())]
-    return Matching(_sorted(rows, matches), f"by time, within {worst.total_seconds():.0f} s{about}")
+    return Matching(_sorted(rows, matches), f"by time, within {worst:.0f} s{about}")

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from legcal.data.measurements import Measurements, few, few_views
+from legcal.data.measurements import Measurements, few_views
+from legcal.files.schema import few
 from legcal.vision.image_file import ImageFacts, size_change
 
 GOOD_QUALITY = 95  # JPEG quality from which the loss is far below the noise of a camera

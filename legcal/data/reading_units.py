@@ -9,11 +9,11 @@ travel of the motors (:func:`meanings`).
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -36,8 +36,8 @@ SERVO_SIGMA = math.radians(0.5)  # [rad], positioning error of a hobby servo
 SIGMA_ANGLE = 1e-4  # [rad], default for a reading of a motor that turns
 LEAST_SIGMA = 1e-6  # fraction of the travel: exact beside outlines, and not lost in rounding
 MOST_SIGMA = 0.2  # maximum fraction of the travel: a worse encoder is most likely a wrong unit
-READING_UNITS = (*LENGTH, *ANGLE, PULSES)
-# Units that tables are usually in, of motors that slide and that turn
+# Units of motors that slide and that turn: all of them, and those that tables are usually in
+UNITS = {False: (*LENGTH,), True: (*ANGLE, PULSES)}
 USUAL_UNITS = {False: ("m", "mm", "cm", "in"), True: ("rad", "deg", PULSES)}
 USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 # Fractions of the travel in use: in the stated unit, and in another that is certainly meant
@@ -45,18 +45,33 @@ HARDLY_MOVES, SURELY_MOVES = 0.04, 0.5  # inches taken for mm use a 25th
 MIN_POSES = 5  # different poses: fewer are a check, perhaps close together
 
 
+NEEDED_UNIT = (
+    f"one of {', '.join((*UNITS[False], *UNITS[True]))}, or counts with their scale (80 counts/mm)"
+)
+
+
+def is_known(name: object) -> bool:
+    """Return whether readings may have a unit."""
+    return isinstance(name, str) and any(takes_unit(name, turns=turns) for turns in UNITS)
+
+
+def takes_unit(name: str, *, turns: bool) -> bool:
+    """Return whether the readings of a motor that slides or turns may have a unit."""
+    return name in UNITS[turns] or unit_size(name, ANGLE if turns else LENGTH) is not None
+
+
 def _unit_name(name: object) -> object:
-    if name not in READING_UNITS and not (isinstance(name, str) and re.fullmatch(COUNTS, name)):
-        units = ", ".join(READING_UNITS)
-        needed = f"one of {units}, or counts with their scale (80 counts/mm)"
-        raise BadValue(describe(name), needed, "correct it")
+    if not is_known(name):
+        raise BadValue(describe(name), NEEDED_UNIT, "correct it")
     return name
 
 
 ReadingUnitName = Annotated[
     str,
     BeforeValidator(_unit_name),
-    WithJsonSchema({"anyOf": [{"enum": [*READING_UNITS]}, {"pattern": f"^{COUNTS}$"}]}),
+    WithJsonSchema(
+        {"anyOf": [{"enum": [*UNITS[False], *UNITS[True]]}, {"pattern": f"^{COUNTS}$"}]}
+    ),
 ]
 _PLURALS = {
     "mm": "millimetres", "cm": "centimetres", "in": "inches", PULSES: "pulses of servos"
@@ -100,19 +115,14 @@ def legs_with_readings(legs: Sequence[Leg]) -> list[Leg]:
     return list(first_legs.values())
 
 
-def is_length(name: str) -> bool:
-    """Return whether a unit is one of length."""
-    return unit_size(name, LENGTH) is not None
-
-
 def default_unit(leg: Leg) -> ReadingUnit:
     """Return the unit of readings of a leg where none is stated."""
     return ReadingUnit(leg.reading_unit)
 
 
-def unit_of_pulses(pulses: Pulses) -> ReadingUnit:
-    """Return pulses of a servo as a unit."""
-    return ReadingUnit(PULSES, math.radians(1.0) / pulses.per_degree, pulses.centre)
+def default_units(legs: Sequence[Leg]) -> dict[str, ReadingUnit]:
+    """Return these units by motor, in the order of the legs."""
+    return {str(leg.prismatic): default_unit(leg) for leg in legs_with_readings(legs)}
 
 
 def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit:
@@ -124,25 +134,23 @@ def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit
         If the leg cannot have readings in this unit. The text continues a sentence that names the
         entry.
     """
-    motor = leg.prismatic
-    of_kind = ANGLE if leg.reads_angle else LENGTH
-    if size := unit_size(name, of_kind):
-        return ReadingUnit(name, size)
-    if name != PULSES or not leg.reads_angle:
-        does = "turns" if leg.reads_angle else "slides"
-        unit_names = [*of_kind, PULSES] if leg.reads_angle else [*of_kind]
+    motor, turns = leg.prismatic, leg.reads_angle
+    if not takes_unit(name, turns=turns):
         raise ValueError(
-            f"found {name} for '{motor}', which {does}, needed one of {', '.join(unit_names)}; "
-            "correct it."
+            f"found {name} of '{motor}', which {'turns' if turns else 'slides'}, needed one of "
+            f"{', '.join(UNITS[turns])}; correct it."
         )
-    described = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
-    if described is None:
+    if name != PULSES:
+        return ReadingUnit(name, unit_size(name, ANGLE if turns else LENGTH) or 1.0)
+    pulses = pulses or (leg.actuator.pulses if leg.actuator is not None else None)
+    if pulses is None:
         raise ValueError(
-            f"found pulses of '{motor}' and neither centre nor us for one degree, needed both: "
-            f"{{{motor}: {{unit: us, centre_us: 1500, us_per_deg: 11.1}}}}, or centre_us and "
-            "us_per_deg of it in legcal.motors of the model; add them."
+            f"found pulses of servos, and of '{motor}' neither centre nor us for one degree, "
+            "needed both: centre_us and us_per_deg of it in legcal.motors of the model, or in the "
+            f"dataset file readings: {{{motor}: {{unit: us, centre_us: 1500, us_per_deg: 11.1}}}}; "
+            "add them."
         )
-    return unit_of_pulses(described)
+    return ReadingUnit(PULSES, math.radians(1.0) / pulses.per_degree, pulses.centre)
 
 
 class ReadingsEntry(FileSchema):
@@ -178,19 +186,19 @@ def reading_units(
         With one sentence for each motor whose readings cannot have their unit.
     """
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
-    units = {name: default_unit(leg) for name, leg in motors.items()}
+    units = default_units(legs)
     if stated is None:
         return units
     problems = []
     if isinstance(stated, str):
-        slides = is_length(stated)
-        alike = [name for name, leg in motors.items() if leg.reads_angle is not slides]
+        alike = [name for name, leg in motors.items() if takes_unit(stated, turns=leg.reads_angle)]
         entries = {name: ReadingsEntry(unit=stated) for name in alike}
         if not alike:
-            does = "slides" if slides else "turns"
+            slides = takes_unit(stated, turns=False)
             problems.append(
-                f"{path}: readings could not be used: found {stated} and no motor that {does}, "
-                f"needed {'an angle or us' if does == 'slides' else 'a length'}; correct it."
+                f"{path}: readings could not be used: found {stated} and no motor that "
+                f"{'slides' if slides else 'turns'}, needed "
+                f"{'an angle or us' if slides else 'a length'}; correct it."
             )
     else:
         entries = dict(stated)
@@ -241,25 +249,41 @@ def usual_sigma(leg: Leg, sigma_q: float, unit: ReadingUnit | None = None) -> fl
     return SERVO_SIGMA if are_commands(leg, unit) else SIGMA_ANGLE
 
 
-def sigmas_of(stated: float | str, legs: Sequence[Leg]) -> dict[str, float]:
-    """Return the standard deviations of readings [m or rad] from one statement, by motor.
+def sigmas_of(
+    stated: float | str | Mapping[str, float | str],
+    legs: Sequence[Leg],
+    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
+) -> dict[str, float]:
+    """Return the standard deviations of readings [m or rad] that are stated, by motor.
 
-    A number applies to every motor in its own unit [m or rad], a text with a unit to the motors
-    of that kind, sliding or turning.
+    A number applies to every motor in its own unit [m or rad], a text with a unit (of lengths,
+    angles, or pulses of *units*) to the motors of that kind, sliding or turning.
 
     Raises
     ------
     UsageError
         If no motor can have it.
     """
-    motors = legs_with_readings(legs)
-    unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
-    alike = [leg for leg in motors if unit in (ANGLE if leg.reads_angle else LENGTH)]
-    some = alike or motors
+    motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
+    if not isinstance(stated, Mapping):
+        unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
+        alike = [name for name, leg in motors.items() if takes_unit(unit, turns=leg.reads_angle)]
+        stated = dict.fromkeys(alike or motors, stated)
     try:
-        return {str(leg.prismatic): sigma_in(stated, default_unit(leg), leg) for leg in some}
+        return {
+            name: sigma_in(
+                sigma,
+                units.get(name, default_unit(motors[name]))
+                if isinstance(sigma, str)
+                else default_unit(motors[name]),
+                motors[name],
+            )
+            for name, sigma in stated.items()
+        }
     except ValueError as error:
-        raise UsageError(f"The encoder sigma could not be used: {error}") from error
+        raise UsageError(
+            f"The encoder sigma (--encoder-sigma) could not be used: {error}"
+        ) from error
 
 
 def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:
@@ -333,23 +357,31 @@ class Meaning:
         travel = np.ptp([leg.travel for leg in legs], axis=1)
         return np.asarray(np.ptp(self.q, axis=0) / travel)
 
-    def said(self, legs: Sequence[Leg], stated: str, *, in_dataset: bool) -> str:
+    def said(self, legs: Sequence[Leg], stated: str, place: UnitPlace) -> str:
         """Return what the numbers look like, and what to do if *stated* is another unit."""
         unit, remedies = self.units[0], list[str]()
         words = f"whole leg lengths{f' in {unit.plural}' * (unit.name != 'm')}"
         if not self.are_lengths:
             words = "readings with the opposite sign" if self.is_reversed else unit.plural
         if unit.name != stated:
-            other = f"convert them to {legs[0].reading_unit}"
-            remedies.append(
-                f"write readings: {unit.name} in the dataset file" if in_dataset else other
-            )
+            remedies.append(_stating(unit.name, place, legs[0]))
         if self.are_lengths:
             remedies.append("subtract the leg lengths at reading zero (legcal inspect tells them)")
         if self.is_reversed:
             other_sign = "give us_per_deg the other sign"
             remedies.append(other_sign if unit.name == PULSES else "reverse them")
         return f"these look like {words}: {' and '.join(remedies)}"
+
+
+# Where the unit of readings is stated; "" where it cannot be
+UnitPlace = Literal["", "headings", "dataset file"]
+
+
+def _stating(unit: str, place: UnitPlace, leg: Leg) -> str:
+    """Return what to do with readings of a leg in a unit."""
+    if place == "":
+        return f"convert them to {leg.reading_unit}"
+    return f"{f'state {unit}' if place == 'headings' else f'write readings: {unit}'} in the {place}"
 
 
 def joint_values(values: Array, units: Sequence[ReadingUnit]) -> Array:
@@ -389,8 +421,7 @@ def likely_cause(
     values: Array,  # (n_rows, n_motors) as in the table
     legs: Sequence[Leg],  # that all slide, or all turn
     units: Sequence[ReadingUnit],  # stated, of one name
-    *,
-    in_dataset: bool,
+    place: UnitPlace,
 ) -> str:
     """Return the likely mistake in readings outside the travel, and its remedy; "" if unclear.
 
@@ -406,7 +437,7 @@ def likely_cause(
         best = max(possible, key=lambda m: float(m.used(legs).mean()))
         as_stated = float(Meaning(tuple(units), joint_values(values, units)).used(legs).max())
         if best.used(legs).mean() >= HARDLY_MOVES or not HARDLY_MOVES <= as_stated <= 1.0:
-            return best.said(legs, name, in_dataset=in_dataset)
+            return best.said(legs, name, place)
         return (
             "they move no further than the travel, and so look like readings from another zero: "
             "shift them into it, or correct limits and offset of the model"
@@ -416,7 +447,7 @@ def likely_cause(
         return "these look like pulses of servos in us: " + (
             f"write readings: {{{legs[0].prismatic}: {{unit: us, centre_us: 1500, us_per_deg: "
             "11.1}, ...} in the dataset file, with the numbers of your servos"
-            if in_dataset
+            if place == "dataset file"
             else "convert them to radians"
         )
     return ""
@@ -427,7 +458,7 @@ def doubtful_units(
     values: Array,  # (n_rows, n_motors) as in the table
     legs: Sequence[Leg],
     units: Sequence[ReadingUnit],
-    statement: str,  # of another unit, for remedies: "write readings: {}"
+    place: UnitPlace,
 ) -> list[Problem]:
     """Return the problems of columns that hardly move in their unit, and would in a larger one.
 
@@ -458,7 +489,8 @@ def doubtful_units(
                 f"that they use {100.0 * used:.2g} % of the travel in {name}, which is stated, and "
                 f"{moved:.2g} % in {other.unit}",
                 "the unit in which they are",
-                f"{statement.format(other.unit)}, and convert them first if they are in {name}",
+                f"{_stating(other.unit, place, motors[0])}, and convert them first if they are in "
+                f"{name}",
                 str(path),
                 columns=tuple(str(leg.prismatic) for leg in motors),
             )

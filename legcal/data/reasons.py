@@ -18,117 +18,94 @@ from legcal.geometry.types import BoolArray
 
 
 class Reason(StrEnum):
-    """A reason for not using an outline, a corner or an image."""
+    """A reason for not using an outline, a corner or an image, by its code."""
 
-    NONE = ""
+    words: str
+    words_of_detail: str  # with a place for the detail; "" if none is shown
+
+    def __new__(cls, code: str, words: str = "", words_of_detail: str = "") -> Reason:
+        """Return a row of the table."""
+        member = str.__new__(cls, code)
+        member._value_ = code
+        member.words, member.words_of_detail = words, words_of_detail
+        return member
+
+    NONE = "", ""
     # Out of sight of the camera
-    OUTSIDE = "outside"
-    HIDDEN = "hidden"
-    NARROW = "narrow"
-    SHORT = "short"
-    NOT_PLACED = "not_placed"
-    UNUSED_LEG = "unused_leg"
+    OUTSIDE = "outside", "outside the image"
+    HIDDEN = "hidden", "hidden by another part", "hidden by {}"
+    NARROW = "narrow", "too narrow", "too narrow, {} px wide"
+    SHORT = "short", "too short", "too short, {}"
+    NOT_PLACED = "not_placed", "the camera of its view could not be placed"
+    UNUSED_LEG = "unused_leg", "its view does not use this leg", "view {} does not use this leg"
     # Not measured well enough
-    NO_PAIR = "no_pair"
-    NO_EDGE = "no_edge"
-    FAINT = "faint"
-    OVEREXPOSED = "overexposed"
-    NOT_STRAIGHT = "not_straight"
-    CONTRAST = "contrast"
-    ROUGH = "rough"
-    UNCERTAIN = "uncertain"
-    WIDTH = "width"
-    PARTNER = "partner"
-    # Contradicting other measurements
-    VIEW_DISAGREES = "view_disagrees"
-    DISAGREES = "disagrees"
-    ARM_LEFT_OUT = "arm_left_out"
-    FEW_LEGS = "few_legs"
-    NO_BOARD_POSE = "no_board_pose"
-    CORNER_OFF = "corner_off"
-    NOT_BEFORE = "not_before"
-    LITTLE_GAIN = "little_gain"
-    # Problems of a whole image
-    BLACK = "black"
-    OVEREXPOSED_IMAGE = "overexposed_image"
-    EMPTY = "empty"
-    BLURRED = "blurred"
-    MIRRORED = "mirrored"
-    UPSIDE_DOWN = "upside_down"
-    ZOOMED = "zoomed"
-    OTHER_READING = "other_reading"
-    OTHER_VIEW = "other_view"
-    OTHER_SCENE = "other_scene"
-    # Decisions of people
-    BY_HAND = "by_hand"
-    OTHER = "other"
-
-
-# In words: without a detail, and with a detail.
-WORDS_BY_CODE: dict[str, tuple[str, str]] = {
-    Reason.NONE: ("", ""),
-    Reason.OUTSIDE: ("outside the image", ""),
-    Reason.HIDDEN: ("hidden by another part", "hidden by {}"),
-    Reason.NARROW: ("too narrow", "too narrow, {} px wide"),
-    Reason.SHORT: ("too short", "too short, {}"),
-    Reason.NOT_PLACED: ("the camera of its view could not be placed", ""),
-    Reason.UNUSED_LEG: ("its view does not use this leg", "view {} does not use this leg"),
-    Reason.NO_PAIR: ("no convincing pair of edges", ""),
-    Reason.NO_EDGE: ("no convincing edge", ""),
-    Reason.FAINT: ("edge barely visible", "edge barely visible, detected on {} % of it"),
-    Reason.OVEREXPOSED: (
+    NO_PAIR = "no_pair", "no convincing pair of edges"
+    NO_EDGE = "no_edge", "no convincing edge"
+    FAINT = "faint", "edge barely visible", "edge barely visible, detected on {} % of it"
+    OVEREXPOSED = (
+        "overexposed",
         "the background is overexposed",
         "the background is overexposed, {} px of the step are left",
-    ),
-    Reason.NOT_STRAIGHT: ("edge not straight", "edge not straight, {} % of it on one line"),
-    Reason.CONTRAST: ("low contrast", "low contrast, {} grey levels"),
-    Reason.ROUGH: ("edge too rough", "edge too rough, scatter {} px"),
-    Reason.UNCERTAIN: ("edge too uncertain", "edge too uncertain, sigma {} px"),
-    Reason.WIDTH: (
+    )
+    NOT_STRAIGHT = "not_straight", "edge not straight", "edge not straight, {} % of it on one line"
+    CONTRAST = "contrast", "low contrast", "low contrast, {} grey levels"
+    ROUGH = "rough", "edge too rough", "edge too rough, scatter {} px"
+    UNCERTAIN = "uncertain", "edge too uncertain", "edge too uncertain, sigma {} px"
+    WIDTH = (
+        "width",
         "width inconsistent with the radius",
         "width inconsistent with the radius, {}",
-    ),
-    Reason.PARTNER: ("partner outline rejected", "its other outline: {}"),
-    Reason.VIEW_DISAGREES: ("disagrees with the other legs of its view", ""),
-    Reason.DISAGREES: ("disagrees with the fit", "disagrees with the fit by {}"),
-    Reason.ARM_LEFT_OUT: ("the arm is left out as a whole", ""),
-    Reason.FEW_LEGS: (
+    )
+    PARTNER = "partner", "partner outline rejected", "its other outline: {}"
+    # Contradicting other measurements
+    VIEW_DISAGREES = "view_disagrees", "disagrees with the other legs of its view"
+    DISAGREES = "disagrees", "disagrees with the fit", "disagrees with the fit by {}"
+    ARM_LEFT_OUT = "arm_left_out", "the arm is left out as a whole"
+    FEW_LEGS = (
+        "few_legs",
         "shows too few legs to place the platform",
         "shows too few legs to place the platform, {}",
-    ),
-    Reason.NO_BOARD_POSE: ("no pose of the board explains it", ""),
-    Reason.CORNER_OFF: (
+    )
+    NO_BOARD_POSE = "no_board_pose", "no pose of the board explains it"
+    CORNER_OFF = (
+        "corner_off",
         "far from where the other corners put it",
         "{} px from where the other corners put it",
-    ),
-    Reason.NOT_BEFORE: ("not used in the previous measurement", ""),
-    Reason.LITTLE_GAIN: (
+    )
+    NOT_BEFORE = "not_before", "not used in the previous measurement"
+    LITTLE_GAIN = (
+        "little_gain",
         "edges of bodies add too little to what the rods tell",
         "edges of bodies lower the predicted error of the platform by {} only",
-    ),
-    Reason.BLACK: ("the image is black", "the image is black, at most {} of 255 grey levels"),
-    Reason.OVEREXPOSED_IMAGE: (
+    )
+    # Problems of a whole image
+    BLACK = "black", "the image is black", "the image is black, at most {} of 255 grey levels"
+    OVEREXPOSED_IMAGE = (
+        "overexposed_image",
         "the image is overexposed",
         "the image is overexposed, at least {} of 255 grey levels",
-    ),
-    Reason.EMPTY: (
+    )
+    EMPTY = (
+        "empty",
         "the image shows nothing",
         "the image shows nothing, all of it within {} of 255 grey levels",
-    ),
-    Reason.BLURRED: ("the image is blurred", "the image is blurred by {}"),
-    Reason.MIRRORED: ("the image is mirrored", ""),
-    Reason.UPSIDE_DOWN: ("the image is upside down", ""),
-    Reason.ZOOMED: (
+    )
+    BLURRED = "blurred", "the image is blurred", "the image is blurred by {}"
+    MIRRORED = "mirrored", "the image is mirrored"
+    UPSIDE_DOWN = "upside_down", "the image is upside down"
+    ZOOMED = (
+        "zoomed",
         "it shows the legs in another size: zoomed, or cropped and rescaled",
         "it shows the legs about {} times as large as the others: zoomed, or cropped and rescaled",
-    ),
-    Reason.OTHER_READING: ("it shows another reading", "{}"),
-    Reason.OTHER_VIEW: ("it was taken by another camera", "{}"),
-    Reason.OTHER_SCENE: ("its legs are not where its readings predict them", ""),
-    Reason.BY_HAND: ("rejected by hand", ""),
-    Reason.OTHER: ("no reason given", "{}"),
-}
-_PARTNER = "its other outline: "
+    )
+    OTHER_READING = "other_reading", "it shows another reading", "{}"
+    OTHER_VIEW = "other_view", "it was taken by another camera", "{}"
+    OTHER_SCENE = "other_scene", "its legs are not where its readings predict them"
+    # Decisions of people
+    BY_HAND = "by_hand", "rejected by hand"
+    OTHER = "other", "no reason given", "{}"
+
+
 # Sentences of earlier versions with other words
 _EARLIER_WORDS = {
     "edge hardly visible, found on {} % of it": Reason.FAINT,
@@ -154,19 +131,14 @@ class Rejection:
         return self.reason is not Reason.NONE
 
     @property
-    def summary(self) -> str:
-        """The reason in words, without figures and names."""
-        return WORDS_BY_CODE[self.reason][0]
-
-    @property
     def cause(self) -> Cause:
         """The reason in words, with figures and names."""
-        plain, detailed = WORDS_BY_CODE[self.reason]
-        if not self.detail or not detailed:
-            return Cause(plain)
+        words = self.reason.words_of_detail
+        if not self.detail or not words:
+            return Cause(self.reason.words)
         if self.reason is Reason.PARTNER:
-            return Cause(detailed, (read_rejection(str(self.detail), "").cause,))
-        return Cause(detailed, (self.detail,))
+            return Cause(words, (read_rejection(str(self.detail), "").cause,))
+        return Cause(words, (self.detail,))
 
     @property
     def as_stored(self) -> Rejection:
@@ -187,18 +159,17 @@ def have_reason(rejections: Sequence[Rejection], *reasons: Reason) -> BoolArray:
 
 def reason_in_words(code: str) -> str:
     """Return a code of a document (``result.json``) in words, without figures and names."""
-    return read_rejection(code, "").summary
+    return read_rejection(code, "").reason.words
 
 
 _CODES = frozenset(map(str, Reason))
-_WORDS = [
-    (forms[k], Reason(code))
-    for k in (1, 0)  # first the sentences with a detail
-    for code, forms in WORDS_BY_CODE.items()
-]
-_SENTENCES = [  # patterns of tables with sentences in place of codes
+_SENTENCES = [  # patterns of tables with sentences in place of codes, those with a detail first
     (re.compile(re.escape(words).replace(r"\{\}", "(.+)")), reason)
-    for words, reason in (*_WORDS, *_EARLIER_WORDS.items())
+    for words, reason in (
+        *((reason.words_of_detail, reason) for reason in Reason),
+        *((reason.words, reason) for reason in Reason),
+        *_EARLIER_WORDS.items(),
+    )
     if words not in ("", "{}")
 ]
 
@@ -211,10 +182,10 @@ def read_rejection(code: str, detail: str) -> Rejection:
     """
     if code in _CODES:
         return Rejection(Reason(code), detail)
-    if code.startswith(_PARTNER):
-        partner = read_rejection(code.removeprefix(_PARTNER), "")
-        return Rejection(Reason.PARTNER, str(partner.reason))
     for pattern, reason in _SENTENCES:
         if match := pattern.fullmatch(code):
-            return Rejection(reason, match[1] if match.groups() else "")
+            detail = match[1] if match.groups() else ""
+            if detail and reason is Reason.PARTNER:
+                detail = str(read_rejection(detail, "").reason)
+            return Rejection(reason, detail)
     return Rejection(Reason.OTHER, code)

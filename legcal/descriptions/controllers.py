@@ -138,18 +138,14 @@ def _with_named_files(path: Path, text: str, outer: tuple[Path, ...] = ()) -> st
 
 def _klipper(path: Path, text: str) -> Configuration | None:
     """Return the numbers of a printer.cfg; those of its SAVE_CONFIG block count."""
-    section, values, words = "", dict[str, float](), dict[str, str]()
+    section, words = "", dict[str, str]()
     for line in text.splitlines():
         line = re.split(r"[#;]", line.removeprefix("#*#"), maxsplit=1)[0].strip()
         if match := re.fullmatch(r"\[(.+)\]", line):
             section = match[1].strip()
         elif match := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", line):
-            key = f"{section}.{match[1].lower()}"
-            words[key] = match[2]
-            if re.fullmatch(NUMBER, match[2]):
-                values[key] = float(match[2])
-            else:
-                values.pop(key, None)
+            words[f"{section}.{match[1].lower()}"] = match[2]
+    values = {key: float(word) for key, word in words.items() if re.fullmatch(NUMBER, word)}
     if not any(key.startswith(("printer.", "stepper_a.")) for key in words):
         return None
     kinematics = words.get("printer.kinematics")

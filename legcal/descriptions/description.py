@@ -13,16 +13,15 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, Problems
-from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross, distance_to_line
 from legcal.geometry.motions import frame_on_points, motion_of, pose_distance
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.equations import posture_constraints
 from legcal.machine.leg import (
+    LINKS,
     MAX_LENGTH,
     MAX_RADIUS,
     MIN_LENGTH,
@@ -109,27 +108,10 @@ class Description:
     source: str  # origin of the description, for messages: a path, or --family
     unit: str  # unit of the description, for messages
     legs: tuple[LegEntry, ...]  # the legs in order
-    home: "Home | None"  # T_base_platform of a pose in which it closes
+    home: RigidTransform | None  # T_base_platform of a pose in which it closes
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
     notes: tuple[str, ...] = ()  # assumptions
     home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
-
-
-@dataclass(frozen=True, eq=False)
-class Home:
-    """A pose with its numbers as written."""
-
-    xyz: tuple[float, ...]  # position [m]
-    quat_xyzw: tuple[float, ...]  # unit quaternion, to its digits
-
-    @classmethod
-    def of(cls, xyz: tuple[float, ...], turn: Rotation) -> "Home":
-        """Return a home with the quaternion of a rotation, rounded as in files."""
-        return cls(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
-
-    def motion(self) -> RigidTransform:
-        """Return T_base_platform."""
-        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
 
 
 def legs_in_words(names: Sequence[str]) -> str:
@@ -152,7 +134,7 @@ def home_at_height(described: Description, height: float, turn: Rotation | None)
         turn = Rotation.from_euler("z", angle, degrees=True)
     middle = A.mean(axis=0) - turn.apply(B.mean(axis=0))
     x, y = (round(float(value), 3) + 0.0 for value in middle[:2])
-    return replace(described, home=Home.of((x, y, height), turn))
+    return replace(described, home=motion_of(turn.as_matrix(), np.array([x, y, height])))
 
 
 def joints_from_base(described: Description) -> Description:
@@ -165,12 +147,12 @@ def joints_from_base(described: Description) -> Description:
         replace(leg, B_platform=np.round(leg.B_platform - origin, 12) + 0.0)
         for leg in described.legs
     )
-    home = Home.of(tuple(origin.tolist()), Rotation.identity())
     note = (
         "Platform joints are in coordinates of the base at home: the platform link stands in their "
         f"middle, ({', '.join(f'{1e3 * x:.6g}' for x in origin)}) mm in the base link."
     )
-    return replace(described, legs=legs, home=home, notes=(*described.notes, note))
+    home, notes = motion_of(np.eye(3), origin), (*described.notes, note)
+    return replace(described, legs=legs, home=home, notes=notes)
 
 
 def check_links(described: Description, problems: Problems) -> None:
@@ -185,7 +167,7 @@ def check_links(described: Description, problems: Problems) -> None:
     A, B = _joints(described)
     apart = float(np.linalg.norm(B.mean(axis=0) - A.mean(axis=0)))
     if 2.0 * apart < np.linalg.norm(B - A, axis=1).mean() or not _closes(
-        described, Home.of((0.0, 0.0, 0.0), Rotation.identity())
+        described, RigidTransform.identity()
     ):
         return
     middle = ", ".join(f"{x:g}" for x in np.round(1e3 * B.mean(axis=0), 2) + 0.0)
@@ -205,10 +187,10 @@ def _joints(described: Description) -> tuple[Array, Array]:
     return A, np.array([leg.B_platform for leg in described.legs])
 
 
-def _closes(described: Description, home: Home) -> bool:
+def _closes(described: Description, home: RigidTransform) -> bool:
     """Return whether all motors are inside their travel at a pose."""
     A, B = _joints(described)
-    lengths = np.linalg.norm(np.asarray(home.motion().apply(B)) - A, axis=1)
+    lengths = np.linalg.norm(np.asarray(home.apply(B)) - A, axis=1)
     return all(
         leg.offset + leg.travel[0] - _SLACK * length
         <= length
@@ -225,19 +207,13 @@ ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if
 
 def wrong_sizes(described: Description) -> list[str]:
     """Return the problems of radii, offsets and travels in themselves."""
-    problems = []
     for leg in described.legs:
-        if leg.offset is None:
-            continue
-        ends = leg.travel or (0.0, 0.0)
-        for length in (leg.offset + ends[0], leg.offset + ends[1]):
-            problems += _out_of_proportion(described, leg.name, length)[:1]
-            if problems:
-                return problems
-    for side, joints in (
-        ("base", [leg.A_base for leg in described.legs]),
-        ("platform", [leg.B_platform for leg in described.legs]),
-    ):
+        for end in leg.travel or (0.0,):
+            length = None if leg.offset is None else leg.offset + end
+            if length is not None and not MIN_LENGTH <= length <= MAX_LENGTH:
+                return [_out_of_proportion(described, leg.name, length)]
+    problems = []
+    for side, joints in zip(LINKS, _joints(described), strict=True):
         reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
         if reach > MAX_LENGTH:
             problems.append(
@@ -264,9 +240,8 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        disproportions = _out_of_proportion(described, leg.name, float(length))
-        if disproportions:
-            return disproportions
+        if not MIN_LENGTH <= length <= MAX_LENGTH:
+            return [_out_of_proportion(described, leg.name, float(length))]
         for radius in (leg.tube, leg.rod):
             if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [
@@ -292,15 +267,13 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     return problems
 
 
-def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
-    """Return the problem of an implausible leg length, if any."""
-    if MIN_LENGTH <= length <= MAX_LENGTH:
-        return []
+def _out_of_proportion(described: Description, leg: str, length: float) -> str:
+    """Return the problem of an implausible leg length."""
     where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
-    return [
+    return (
         f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
         f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
-    ]
+    )
 
 
 def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
@@ -317,20 +290,11 @@ def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
 def wrong_axes(
     described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
 ) -> list[str]:
-    """Return the problems of axes that do not fit their leg at home."""
+    """Return the problems of outer axes of U joints along their leg at home."""
     problems = []
-    for side, joint, axis in (
-        ("base", entry.type.base, axes[0]),
-        ("platform", entry.type.platform, axes[1]),
-    ):
+    for side, axis in zip(LINKS, axes, strict=True):
         angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
-        if joint is JointType.REVOLUTE and 90.0 - angle > np.degrees(PERPENDICULAR):
-            problems.append(
-                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
-                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
-                f"correct {side}_axes or home."
-            )
-        if joint is JointType.UNIVERSAL and angle < ALONG:
+        if getattr(entry.type, side) is JointType.UNIVERSAL and angle < ALONG:
             problems.append(
                 f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
                 f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
@@ -371,21 +335,15 @@ class Assembled(Description):
     """A machine with all its numbers; home is a pose in which it closes, as in the file."""
 
     legs: tuple[AssembledLeg, ...]
-    home: Home
+    home: RigidTransform
     base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
     planar: bool  # motion in the xy plane of base and platform
-
-    @property
-    def T_base_platform(self) -> RigidTransform:
-        """The home pose."""
-        return self.home.motion()
 
 
 def assemble(described: Description) -> Assembled:
     """Return a described machine with its home, lengths and axes."""
     _refuse(wrong_sizes(described))
-    home, notes = home_of_description(described)
-    T = home.motion()
+    T, notes = home_of_description(described)
     readings = _readings_at_home(described, T)
     A = np.array([_at(leg, readings) for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
@@ -407,7 +365,7 @@ def assemble(described: Description) -> Assembled:
     planar = all_revolute(described) and is_planar(legs, T)
     frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
     at_home = {name: readings[name] for name in described.home_readings}
-    numbers = {"legs": tuple(legs), "home": home, "base_frame": frame, "home_readings": at_home}
+    numbers = {"legs": tuple(legs), "home": T, "base_frame": frame, "home_readings": at_home}
     numbers["notes"] = (*described.notes, *notes)
     return Assembled(**(vars(described) | numbers), planar=planar)
 
@@ -438,13 +396,14 @@ def is_planar(legs: Sequence[AssembledLeg], T: RigidTransform) -> bool:
 
 def across_leg(u: Array, outward: Array) -> Array:
     """Return the horizontal direction across a leg; across the way outward for upright legs."""
-    z = np.array([0.0, 0.0, 1.0])
-    for other in (u, outward, np.array([1.0, 0.0, 0.0])):
-        across = cross(z, other)
-        if np.linalg.norm(across) > 1e-6 * max(1.0, float(np.linalg.norm(other))):
-            across = across - (across @ u) * u
-            return np.asarray(across / np.linalg.norm(across))
-    return np.array([0.0, 1.0, 0.0])
+    x, _, z = np.eye(3)
+    across = next(
+        across
+        for other in (u, outward, x)
+        if np.linalg.norm(across := cross(z, other)) > 1e-6 * max(1.0, float(np.linalg.norm(other)))
+    )
+    across = across - (across @ u) * u
+    return np.asarray(across / np.linalg.norm(across))
 
 
 def _axes(entry: LegEntry, tangent: Array, T: RigidTransform, q: float) -> tuple[Array, Array]:
@@ -511,7 +470,7 @@ def _refuse(problems: list[str]) -> None:
         raise ModelError(problems)
 
 
-def home_of_description(described: Description) -> tuple[Home, list[str]]:
+def home_of_description(described: Description) -> tuple[RigidTransform, list[str]]:
     """Return a pose in which a machine closes, projected onto what its legs keep constant.
 
     If no home is given, all motors are at the middle of their travel; among such poses the one with
@@ -528,11 +487,10 @@ def home_of_description(described: Description) -> tuple[Home, list[str]]:
             "their travel with their axes in place, needed a pose in which the machine closes; "
             "write home, or correct the joints, offsets or travel."
         )
-    poses = [home.motion() for home in homes[:2]]
     where = [
         f"({', '.join(f'{round(1e3 * x) + 0:d}' for x in T.translation)}) mm, turned by "
         f"{round(T.rotation.as_euler('ZYX', degrees=True)[0]) + 0:d} deg about z"
-        for T in poses
+        for T in homes[:2]
     ]
     note = (
         f"Two poses have all motors at mid-travel: home is {' and not '.join(where)}. If yours is "
@@ -723,25 +681,23 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
     return readings
 
 
-def _project(described: Description, home: Home) -> Home:
+def _project(described: Description, home: RigidTransform) -> RigidTransform:
     """Return the closed pose nearest to home."""
-    closure, T = _ClosingEquations(described, mid_travel=False), home.motion()
-    if closure.residual(T) < ROUNDING:
-        return home
-    if closure.residual(T) < MAX_HOME_RESIDUAL:
+    closure, T = _ClosingEquations(described, mid_travel=False), home
+    if ROUNDING <= closure.residual(T) < MAX_HOME_RESIDUAL:
         T = closure.nearest(T)
     if closure.residual(T) < CLOSED:
-        return _written(T)
+        return T
     raise ModelError(
         [
             f"{described.source}: home could not be used: found {residual} there, needed a pose in "
             "which the machine closes; correct home, lengths or axes."
-            for residual in closure.describe(home.motion())
+            for residual in closure.describe(home)
         ]
     )
 
 
-def _search(closure: _ClosingEquations, *, turning: bool) -> list[Home]:
+def _search(closure: _ClosingEquations, *, turning: bool) -> list[RigidTransform]:
     """Return the best pose that seeded starts lead to, and others that are as likely as home."""
     rng = np.random.default_rng(1965)
     centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
@@ -773,11 +729,4 @@ def _search(closure: _ClosingEquations, *, turning: bool) -> list[Home]:
         apart = [max(np.divide(pose_distance(T, other), (closure.size, 1.0))) for _, other in best]
         if not best or (min(apart) > APART and upright < LIKELY * best[0][0] + APART):
             best.append((rank, T))
-    return [_written(closure.nearest(T)) for _, T in best]
-
-
-def _written(T: RigidTransform) -> Home:
-    """Return a computed pose for a file, without the rounding noise of its zeros."""
-    entry = motion_to_xyz_quat(T)
-    clean = {key: [x if abs(x) > 1e-13 else 0.0 for x in value] for key, value in entry.items()}
-    return Home(tuple(clean["xyz"]), tuple(clean["quat_xyzw"]))
+    return [closure.nearest(T) for _, T in best]

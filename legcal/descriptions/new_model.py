@@ -18,10 +18,18 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from legcal.arguments import check_arguments
-from legcal.descriptions.description import Assembled, AssembledLeg, Description, assemble, leg_type
+from legcal.descriptions.description import (
+    ROUNDING,
+    Assembled,
+    AssembledLeg,
+    Description,
+    assemble,
+    leg_type,
+)
 from legcal.descriptions.table import BESIDE, described_machine, read_description
 from legcal.errors import LegcalError, Problem, UsageError
 from legcal.files.folder import new_files, with_schema
+from legcal.files.motions import motion_to_xyz_quat
 from legcal.files.quantity import LENGTH
 from legcal.files.schema import plain_name
 from legcal.geometry.lines import cross, normal_basis
@@ -384,7 +392,7 @@ def urdf_text(machine: Assembled) -> str:
     tree.link("base")
     tree.link("platform")
     if machine.planar:
-        height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
+        height = np.array([0.0, 0.0, machine.home.translation[2]])
         tree.connect("platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
     else:
         tree.connect("platform_free", "floating", ("base", "platform"))
@@ -409,7 +417,10 @@ def yaml_text(machine: Assembled) -> str:
             "platform": "platform",
             "platform_joint": "platform_free",
             "base_frame": list(machine.base_frame),
-            "home": {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)},
+            "home": {
+                key: [x if abs(x) > ROUNDING else 0.0 for x in numbers]
+                for key, numbers in motion_to_xyz_quat(machine.home).items()
+            },
             **({"home_readings": dict(machine.home_readings)} if machine.home_readings else {}),
             **({"motors": stated} if stated else {}),
             "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
@@ -433,7 +444,6 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
         rods = [leg for leg in machine.legs if leg.actuator is actuator]
         motor, carried = motor_visuals(actuator, rods)
         on_base += motor
-        tree.link(actuator.link)
         tree.link(actuator.link, "".join(carried))
         kind = actuator.kind.value
         moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
@@ -464,8 +474,7 @@ class _Branch:
     def __init__(self, tree: UrdfBuilder, machine: Assembled, leg: AssembledLeg) -> None:
         self._tree, self._leg = tree, leg
         self._from_base = _hangs_from_base(leg)
-        self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
-        self._T = machine.T_base_platform
+        self._R_base_platform = machine.home.rotation.as_matrix()
         self._carrier, self._A = "base", leg.A_base  # the link at the start, and A in it
         self._R_base_carrier = np.eye(3)  # at home
         if leg.actuator is not None:
@@ -478,14 +487,13 @@ class _Branch:
         """Add the leg to the tree."""
         leg = self._leg
         if self._from_base:
-            R_carrier = self._R_base_carrier.T
-            axis = R_carrier @ leg.base_axis
-            R = self._near("a", leg.type.base, R_carrier @ leg.u, axis, self._A)
-            R = self._R_base_carrier @ R
+            R_base_start, u, at = self._R_base_carrier, leg.u, self._A
+            side, joint, axis = "a", leg.type.base, leg.base_axis
         else:
-            inverse = self._R_base_platform.T
-            axis = inverse @ leg.platform_axis
-            R = self._near("b", leg.type.platform, -inverse @ leg.u, axis, leg.B_platform)
+            R_base_start, u, at = self._R_base_platform, -leg.u, leg.B_platform
+            side, joint, axis = "b", leg.type.platform, leg.platform_axis
+        R = self._near(side, joint, R_base_start.T @ u, R_base_start.T @ axis, at)
+        R = R_base_start @ R
         self._half(near=True)
         if leg.kind is LegKind.CONSTANT:
             self._along = np.array([0.0, 0.0, leg.q0])
@@ -609,27 +617,19 @@ def create_model(
         for name, text in zip(names, (yaml_text(machine), urdf_text(machine)), strict=True):
             (temporary / name).parent.mkdir()
             (temporary / name).write_bytes(text.encode())
-        before(_load(temporary / names[0], temporary, machine.source), machine.notes)
+        try:
+            loaded = load_mechanism(temporary / names[0])
+        except LegcalError as error:
+            raise error.told(lambda problem: _of_source(problem, temporary, machine)) from error
+        before(loaded, machine.notes)
     yaml_path, urdf_path = (output / name for name in names)
     return Created(load_mechanism(yaml_path), yaml_path, urdf_path, machine.notes)
 
 
-def _load(path: Path, temporary: Path, source: str) -> Machine:
-    """Load the files in the temporary folder; errors name the source instead."""
-    try:
-        return load_mechanism(path)
-    except LegcalError as error:
-        raise error.told(
-            lambda problem: _attributed_to_source(problem, temporary, source)
-        ) from error
-
-
-def _attributed_to_source(problem: Problem, temporary: Path, source: str) -> Problem:
-    """Return a problem of a file in the temporary folder as a problem of the source."""
-    file = Path(problem.file)
-    if not file.is_relative_to(temporary):
-        return problem
-    return replace(problem, file=f"{source}: {file.relative_to(temporary)}")
+def _of_source(problem: Problem, temporary: Path, machine: Assembled) -> Problem:
+    """Return a problem of a file in the temporary folder as one of what it is made of."""
+    moved = problem.moved(temporary, Path())
+    return problem if moved is problem else replace(moved, file=f"{machine.source}: {moved.file}")
 
 
 THICK, WIDE = 2.0, 3.0  # size of arms and rails, in radii of a rod

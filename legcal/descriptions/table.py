@@ -42,7 +42,6 @@ from legcal.descriptions.description import (
     MAX_NUMBER,
     NEEDED_TYPE,
     Description,
-    Home,
     LegEntry,
     LegType,
     check_links,
@@ -77,6 +76,7 @@ from legcal.files.table import (
     read_table,
     split_heading,
 )
+from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind, Pulses
 from legcal.machine.files import FrameLegs
@@ -676,15 +676,20 @@ def _description(file: TableFile, source: str) -> Description:
                 None if motor is None else actuators[motor],
             )
         )  # fmt: skip
+    home = turn = None
+    if file.home is not None and file.home.quat_xyzw is not None:
+        turn = Rotation.from_quat(file.home.quat_xyzw)
+    elif file.home is not None and file.home.rpy_deg is not None:
+        turn = Rotation.from_euler("xyz", file.home.rpy_deg, degrees=True)
+    if file.home is not None and file.home.xyz is not None and turn is not None:
+        home = motion_of(turn.as_matrix(), np.array(file.metres(file.home.xyz)))
     frame = None if file.base_frame is None else tuple(file.base_frame)
     described = Description(
-        file.name, source, file.unit, tuple(legs), _home(file), frame, tuple(notes),
+        file.name, source, file.unit, tuple(legs), home, frame, tuple(notes),
         {name: file.metres(q) for name, q in (file.home_readings or {}).items()}
         | {name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
     )  # fmt: skip
     if file.home is not None and file.home.height is not None:
-        has_turn = file.home.quat_xyzw is not None or file.home.rpy_deg is not None
-        turn = _turn(file.home) if has_turn else None
         return home_at_height(described, in_metres(file.home.height, file.unit), turn)
     if file.platform_in == "base":
         return joints_from_base(described)
@@ -697,21 +702,6 @@ def _unit_axis(axes: list[Any] | None, j: int) -> Array | None:
         return None
     axis = np.array(axes[j], dtype=float)
     return np.asarray(axis / np.linalg.norm(axis))
-
-
-def _home(file: TableFile) -> Home | None:
-    if file.home is None or file.home.xyz is None:
-        return None
-    xyz = tuple(file.metres(file.home.xyz))
-    if file.home.quat_xyzw is not None:
-        return Home(xyz, file.home.quat_xyzw)
-    return Home.of(xyz, _turn(file.home))
-
-
-def _turn(home: HomeEntry) -> Rotation:
-    if home.quat_xyzw is not None:
-        return Rotation.from_quat(home.quat_xyzw)
-    return Rotation.from_euler("xyz", home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
 
 
 def _check_legs(described: Description, problems: Problems) -> None:
@@ -815,11 +805,9 @@ _NUMBERS = (
     *_RADII,
     *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
 )
+_TEXTS = ("leg", "rail", "type", "kind", "unit", "platform_in")
 COLUMNS = (
-    *(
-        Column(name, "text", required=False)
-        for name in ("leg", "rail", "type", "kind", "unit", "platform_in")
-    ),
+    *(Column(name, "text", required=False) for name in _TEXTS),
     *(
         Column(
             name,
@@ -855,22 +843,25 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         conflict, remedy = "radius beside tube or rod", "empty the others"
         table.refuse(row, conflict, "one of them", *_RADII, remedy=remedy, what="radius")
     table.check()
-    cells = _Cells(table)
+    joints = (
+        [[x, y, z or 0.0] for x, y, z in _cells(table, *(f"{side}_{i}" for i in _XYZ))]
+        for side in ("base", "platform")
+    )
     document: dict[str, Any] = {
         "legcal_table": 1,
         "name": path.stem,
         "unit": _unit(table, unit),
         "platform_in": _shared(table, "platform_in"),
-        "types": cells.texts("type") if "type" in table else None,
-        "base_joints": cells.points("base"),
-        "platform_joints": cells.points("platform"),
-        "travel": cells.pairs("travel"),
+        "types": _cells(table, "type") if "type" in table else None,
+        "base_joints": next(joints),
+        "platform_joints": next(joints),
+        "travel": _cells(table, "travel_low", "travel_high"),
         "radius": [
             {k: x for k, x in (("tube", tube), ("rod", rod)) if x is not None} or radius
-            for radius, tube, rod in zip(*map(cells.numbers, _RADII), strict=True)
+            for radius, tube, rod in zip(*(_cells(table, name) for name in _RADII), strict=True)
         ],
     }
-    rails = cells.texts("rail")
+    rails = _cells(table, "rail")
     if any(rails):  # upright
         ends = dict(zip(reversed(rails), reversed(document["travel"]), strict=True))
         document["actuators"] = {
@@ -880,42 +871,31 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
         pairs = zip(document["travel"], rails, strict=True)
         document["travel"] = [travel if rail is None else None for travel, rail in pairs]
     optional: dict[str, Any] = {
-        "legs": cells.texts("leg"),
+        "legs": _cells(table, "leg"),
         "hangs_on": rails,
-        "kinds": cells.texts("kind"),
-        "offsets": cells.numbers("offset"),
-        "lengths": cells.numbers("length"),
-        "min_length": cells.numbers("min_length"),
-        "max_length": cells.numbers("max_length"),
-        "base_axes": cells.vectors("base_axis"),
-        "platform_axes": cells.vectors("platform_axis"),
+        "kinds": _cells(table, "kind"),
+        "offsets": _cells(table, "offset"),
+        "lengths": _cells(table, "length"),
+        "min_length": _cells(table, "min_length"),
+        "max_length": _cells(table, "max_length"),
+        "base_axes": _cells(table, *(f"base_axis_{i}" for i in _XYZ)),
+        "platform_axes": _cells(table, *(f"platform_axis_{i}" for i in _XYZ)),
     }
     return document | {key: of_legs for key, of_legs in optional.items() if _is_given(of_legs)}
 
 
-class _Cells:
-    """The cells of a table by row; None if empty."""
-
-    def __init__(self, table: Table) -> None:
-        self._table = table
-
-    def texts(self, name: str) -> list[Any]:
-        return [text or None for text in self._table.text(name)]
-
-    def numbers(self, name: str) -> list[Any]:
-        return [None if math.isnan(x) else x for x in self._table.number(name).tolist()]
-
-    def points(self, side: str) -> list[Any]:
-        x, y, z = (self._table.number(f"{side}_{i}") for i in _XYZ)
-        return np.column_stack([x, y, np.nan_to_num(z)]).tolist()  # type: ignore[no-any-return]
-
-    def vectors(self, name: str) -> list[Any]:
-        vectors = zip(*(self.numbers(f"{name}_{i}") for i in _XYZ), strict=True)
-        return [None if vector == (None,) * 3 else list(vector) for vector in vectors]
-
-    def pairs(self, name: str) -> list[Any]:
-        pairs = zip(self.numbers(f"{name}_low"), self.numbers(f"{name}_high"), strict=True)
-        return [None if pair == (None, None) else list(pair) for pair in pairs]
+def _cells(table: Table, *names: str) -> list[Any]:
+    """Return the cells of a column by row, or those of several as lists; None where empty."""
+    columns: list[list[Any]] = [
+        [text or None for text in table.text(name)]
+        if name in _TEXTS
+        else [None if math.isnan(x) else x for x in table.number(name).tolist()]
+        for name in names
+    ]
+    if len(columns) == 1:
+        return columns[0]
+    rows = map(list, zip(*columns, strict=True))
+    return [row if _is_given(row) else None for row in rows]
 
 
 def _shared(table: Table, name: str) -> str | None:

@@ -23,12 +23,11 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
 from legcal.files.reading import read_json
-from legcal.files.schema import read_yaml
+from legcal.files.schema import few, read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
 _HEAD = 1000  # bytes at the beginning of a file that contain its mark
-_SHOWN = 5  # names of files in a sentence
 _MOST_OF_NAME = 40  # maximum letters of a name, which leave room for an addition
 
 
@@ -112,14 +111,8 @@ class OutputFile:
     def write(self, path: Path, content: str | bytes, *, force: bool = False) -> None:
         """Write a file; an earlier file of its kind is replaced, any other only with *force*."""
         self.check_place(path, force=force)
-        try:
-            data = content.encode() if isinstance(content, str) else content
-            write_atomically(path, data)
-        except OSError as error:
-            raise OutOfResources(
-                f"{path}: {self.noun} could not be written: found '{error.strerror}', needed a "
-                "folder that takes it; free some space or give another file."
-            ) from error
+        with out_of_resources(path, self.noun, "file"):
+            write_atomically(path, content.encode() if isinstance(content, str) else content)
 
 
 @dataclass(frozen=True)
@@ -165,6 +158,19 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
         raise UsageError(
             f"{start} a folder with other files and {marker}, needed a new or empty folder or that "
             f"of an earlier {kind.noun}; {remedy}give another output folder."
+        )
+
+
+def check_empty(destination: Path, kind: OutputKind) -> None:
+    """Refuse an output folder that holds files."""
+    check_path(destination, kind)
+    if destination.is_dir() and holds_files(destination):
+        held, remedy = "a folder with files", ""
+        if kind.marker and kind.is_in(destination):
+            held, remedy = f"an earlier {kind.noun}", ", or remove that one"
+        raise UsageError(
+            f"{destination}: the {kind.noun} could not be written: found {held}, needed a new or "
+            f"empty folder; give another folder{remedy}."
         )
 
 
@@ -245,28 +251,39 @@ def result_folder(
     the moving is interrupted, the destination is unchanged.
     """
     check_destination(destination, kind)
+    with (
+        out_of_resources(destination, f"the {kind.noun}", "folder; nothing was written"),
+        temporary_folder(_workshop(destination), destination.name) as temporary,
+    ):
+        new = temporary / "new"
+        new.mkdir()
+        try:
+            yield new
+        except LegcalError as error:
+            raise error.told(lambda problem: problem.moved(new, destination)) from error
+        for path in sorted(new.rglob("*.yaml")):
+            write_schemas(path)
+        _check_places(new, destination, kind, replaceable)
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        raise_if_stopped()
+        if destination.exists():
+            _replace_files(new, destination, temporary / "old", stale)
+        else:
+            os.rename(new, destination)
+
+
+@contextmanager
+def out_of_resources(place: Path, noun: str, other: str) -> Iterator[None]:
+    """Make errors of the system in the block a refusal; *other* is what to give in its place."""
     try:
-        with temporary_folder(_workshop(destination), destination.name) as temporary:
-            new = temporary / "new"
-            new.mkdir()
-            with _named(destination, new):
-                yield new
-            for path in sorted(new.rglob("*.yaml")):
-                write_schemas(path)
-            _check_places(new, destination, kind, replaceable)
-            destination.parent.mkdir(parents=True, exist_ok=True)
-            raise_if_stopped()
-            if destination.exists():
-                _replace_files(new, destination, temporary / "old", stale)
-            else:
-                os.rename(new, destination)
+        yield
     except OSError as error:
         raise OutOfResources(
-            f"the {kind.noun} could not be written",
+            f"{noun} could not be written",
             f"'{error.strerror or error}'",
-            "a folder that takes its files",
-            "free some space or give another output folder; nothing was written",
-            destination,
+            "a folder that takes it",
+            f"free some space or give another {other}",
+            place,
         ) from error
 
 
@@ -281,24 +298,12 @@ def new_files(
     there = [name for name in names if os.path.lexists(folder / name)]
     if there and not force:
         replaced = "" if force is None else ", or --force to replace them"
-        found = ", ".join(there[:_SHOWN]) + f" and {len(there) - _SHOWN} more" * (
-            len(there) > _SHOWN
-        )
         raise UsageError(
-            f"{folder}: the {noun} could not be written: found {found} already there, needed "
+            f"{folder}: the {noun} could not be written: found {few(there)} already there, needed "
             f"new files; give another folder or name{replaced}."
         )
     with result_folder(folder, OutputKind(noun, "", "")) as temporary:
         yield temporary
-
-
-@contextmanager
-def _named(destination: Path, new: Path) -> Iterator[None]:
-    """Make errors of the block name the destination instead of the temporary folder."""
-    try:
-        yield
-    except LegcalError as error:
-        raise error.told(lambda problem: problem.moved(new, destination)) from error
 
 
 def _check_places(
@@ -367,8 +372,8 @@ def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path
 
 
 SCHEMAS = ".schemas"  # folder of schemas beside a YAML
-_HEADER = "# yaml-language-server: $schema={}/{}.json\n"
-_NAMED = re.compile(re.escape(_HEADER).replace(r"\{\}", r"([\w.-]+)").encode())
+_HEADER = f"# yaml-language-server: $schema={SCHEMAS}/%s.json\n"
+_NAMED = re.compile(re.escape(_HEADER).replace("%s", r"([\w.-]+)").encode())
 
 
 def schema_names() -> list[str]:
@@ -384,24 +389,16 @@ def schema_content(name: str) -> bytes:
 
 def with_schema(name: str, text: str) -> str:
     """Return the text of a YAML with a header that names its schema."""
-    return _HEADER.format(SCHEMAS, name) + text
-
-
-def schemas_beside(path: Path, content: bytes) -> dict[Path, bytes]:
-    """Return the schema that a YAML names, by its place beside *path*; none if it names none."""
-    named = _NAMED.match(content) if path.suffix == ".yaml" else None
-    if named is None or named[1].decode() != SCHEMAS or named[2].decode() not in schema_names():
-        return {}
-    name = named[2].decode()
-    return {path.parent / SCHEMAS / f"{name}.json": schema_content(name)}
+    return _HEADER % name + text
 
 
 def write_schemas(path: Path) -> None:
     """Write the schema that a YAML names beside it, or nothing where there is no place for it."""
     with suppress(OSError):  # it only helps editors
         with path.open("rb") as file:
-            named = schemas_beside(path, file.readline())
-        for place, content in named.items():
+            named = _NAMED.match(file.readline())
+        if named is not None and (name := named[1].decode()) in schema_names():
+            place = path.parent / SCHEMAS / f"{name}.json"
             if not place.is_symlink() and not place.parent.is_symlink():
                 place.parent.mkdir(exist_ok=True)
-                place.write_bytes(content)
+                place.write_bytes(schema_content(name))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files.schema import Document, FileSchema, Metres, Number, Triple
@@ -17,14 +17,14 @@ Vector = tuple[Metres, Metres, Metres]
 
 
 def _of_unit_norm(quat: tuple[float, ...]) -> tuple[float, ...]:
-    """Refuse a quaternion of a norm other than 1, up to its last digits."""
+    """Return a quaternion made exactly unit; refuse it if more than its last digits are wrong."""
     norm = math.hypot(*quat)
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise ValueError(
             f"found a quaternion of norm {norm:.6g}, needed 1 within {QUATERNION_TOLERANCE:g}; "
             "check its four numbers, x y z w."
         )
-    return quat
+    return tuple(c / norm for c in quat)
 
 
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_of_unit_norm)]
@@ -36,15 +36,8 @@ class MotionEntry(FileSchema):
     xyz: Vector
     quat_xyzw: Quaternion
 
-    @field_validator("quat_xyzw")
-    @classmethod
-    def _made_exact(cls, quat: Quaternion) -> Quaternion:
-        norm = math.hypot(*quat)
-        x, y, z, w = (c / norm for c in quat)
-        return x, y, z, w
-
     def motion(self) -> RigidTransform:
-        """Return the motion, its quaternion made exactly unit."""
+        """Return the motion."""
         return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
 
 

@@ -5,7 +5,7 @@ import os
 import re
 import reprlib
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from legcal.causes import Cause
 from legcal.errors import BadValue, Code, DatasetError, LegcalError, Problem
 from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
 
+MAX_NAMED = 5  # maximum number of names in one sentence
 _MOST_NAMES = 30  # maximum number of names in a hint that lists all
 _NEAREST_NAMES = 10  # in a hint that does not
 _LONGEST_WORD = 100  # maximum length of words for the search of a similar one
@@ -91,13 +92,16 @@ def plain_name(name: object) -> object:
     return name
 
 
+_THIS_VERSION = "version 1"
+
+
 def _version(value: object) -> object:
     """Refuse ``true``, which equals 1 in Python, and the formats of later versions."""
     if isinstance(value, bool):
         raise BadValue(str(value).lower(), "1", "correct the value")
     if isinstance(value, int) and value > 1:
         remedy = "use the legcal that wrote it, or write the file as version 1"
-        raise BadValue(describe(value), "version 1", remedy)
+        raise BadValue(describe(value), _THIS_VERSION, remedy)
     return value
 
 
@@ -277,8 +281,16 @@ def validate(
     try:
         return schema.model_validate(dict(document))
     except ValidationError as error:
-        details = error.errors(include_url=False)
-        raise kind([_problem(schema, e, path, prefix) for e in details]) from error
+        problems = [_problem(schema, e, path, prefix) for e in error.errors(include_url=False)]
+        if any(problem.needed == _THIS_VERSION for problem in problems):  # has keys of its own
+            problems = [p for p in problems if p.code is not Code.UNKNOWN_KEY]
+        raise kind(problems) from error
+
+
+def few(names: Sequence[str], most: int = MAX_NAMED) -> str:
+    """Return a list of at most a few names: ``c1, c2 and 3 more``."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + f" and {more} more" * (more > 0)
 
 
 class _Short(reprlib.Repr):

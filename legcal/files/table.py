@@ -15,7 +15,7 @@ import math
 import re
 import unicodedata
 import zipfile
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
@@ -33,10 +33,11 @@ from legcal.files.schema import (
     closest,
     content_of,
     describe,
+    few,
     is_name,
     nearest,
 )
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _MAX_NAMED = 10  # maximum number of columns named in a sentence
@@ -55,6 +56,7 @@ _GROUPED = re.compile(
 )
 _WITH_POINT = re.compile(r"[-+]?\d*(\.\d*)+", re.ASCII)
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
+_FILE = re.compile(r"\.[A-Za-z]\w{1,4}$")  # an extension
 _RULE = re.compile(r"[:-]*-{3}[:-]*")
 _MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–+-]?)([.,]?\d[^\"″']*)([\"″]?)")
 _BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
@@ -103,7 +105,6 @@ class Column:
 class Table:
     """The complete rows of a CSV file with stripped cells, and their problems.
 
-    ``places[i]`` is the place of row i in the file, ``where[i]`` the place with the file;
     ``name in table`` is true if there is such a column.
     """
 
@@ -111,14 +112,13 @@ class Table:
         self.path = path
         self.thing = thing  # noun for a row in messages
         self.columns = {column.name: column for column in columns}  # in the order of the header
-        self._rows: list[int] = []
-        self._lines: list[int] = []
+        self.where: list[Place] = []  # of each row, with its file
         self._cells: list[list[str]] = []
         self._numbers: dict[str, Array] = {}  # of the columns of numbers
         self._problems: list[Problem] = []
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._cells)
 
     def __contains__(self, name: str) -> bool:
         return name in self.columns
@@ -126,14 +126,7 @@ class Table:
     @property
     def places(self) -> list[str]:
         """The place of each row in the file."""
-        numbers = zip(self._rows, self._lines, strict=True)
-        return [f"row {row} (line {line})" for row, line in numbers]
-
-    @property
-    def where(self) -> list[Place]:
-        """The place of each row with its file."""
-        rows = zip(self._rows, self._lines, strict=True)
-        return [Place(str(self.path), row, line) for row, line in rows]
+        return [f"row {place.row} (line {place.line})" for place in self.where]
 
     def text(self, name: str) -> tuple[str, ...]:
         """Return the cells of a column; empty cells for an absent column."""
@@ -173,9 +166,7 @@ class Table:
                 found,
                 needed,
                 remedy,
-                str(self.path),
-                self._rows[row],
-                self._lines[row],
+                *self.where[row],
                 columns,
                 code=code or (Code.BAD_CELL if columns else Code.BAD_ROW),
             )
@@ -200,6 +191,24 @@ class Table:
                 if not texts[row]:
                     self.refuse_cell(row, name, "a finite number")
 
+    def positions(
+        self, column: str, names: Sequence[str], needed: str, *, refuse: bool = True
+    ) -> IntArray:
+        """Return for each row the position of its cell among names, -1 where it is not there.
+
+        Unknown names are refused, unless said otherwise.
+        """
+        index = {name: i for i, name in enumerate(names)}
+        texts = self.text(column)
+        found = np.array([index.get(text, -1) for text in texts], dtype=np.intp)
+        for row in np.flatnonzero(found < 0).tolist() if refuse else ():
+            unknown, remedy = (
+                f"the unknown {column} {describe(texts[row])}",
+                closest(texts[row], names),
+            )
+            self.refuse(row, unknown, needed, column, remedy=remedy)
+        return found
+
     def once(self, keys: Sequence[Hashable], repeated: str) -> None:
         """Refuse rows with the key of an earlier row; a key of None is ignored."""
         first: dict[Hashable, int] = {}
@@ -211,13 +220,16 @@ class Table:
 
     def keep(self, rows: BoolArray) -> None:
         """Keep some rows only, and discard the problems of the others."""
-        gone = {line for line, kept in zip(self._lines, rows, strict=True) if not kept}
+        gone = {place.line for place, kept in zip(self.where, rows, strict=True) if not kept}
         kept_rows = np.flatnonzero(rows).tolist()
-        self._rows = [self._rows[row] for row in kept_rows]
-        self._lines = [self._lines[row] for row in kept_rows]
+        self.where = [self.where[row] for row in kept_rows]
         self._cells = [self._cells[row] for row in kept_rows]
         self._numbers = {name: values[kept_rows] for name, values in self._numbers.items()}
         self._problems = [problem for problem in self._problems if problem.line not in gone]
+
+    def forgive(self, names: Container[str]) -> None:
+        """Discard the problems of cells of some columns."""
+        self._problems = [p for p in self._problems if not any(name in names for name in p.columns)]
 
     def check(self) -> None:
         """Raise DatasetError with everything that is wrong, by line."""
@@ -230,8 +242,7 @@ class Table:
         columns, n = list(self.columns.values()), len(header)
         order = [header.index(column.name) for column in columns]
         for row, (line, cells) in enumerate(lines, start=1):
-            self._rows.append(row)
-            self._lines.append(line)
+            self.where.append(Place(str(self.path), row, line))
             self._cells.append([cells[i] for i in order] if len(cells) == n else [])
             if len(cells) != n:
                 remedy = "complete or remove the row"
@@ -352,9 +363,7 @@ def _of_header(
 
 def _names(names: Iterable[str]) -> str:
     """Return names of columns in a sentence, a few of them."""
-    quoted = [describe(name) for name in names]
-    more = len(quoted) - _MAX_NAMED
-    return ", ".join(quoted[:_MAX_NAMED]) + f" and {more} more" * (more > 0)
+    return few(list(map(describe, names)), _MAX_NAMED)
 
 
 def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
@@ -616,7 +625,7 @@ def _without_title(lines: Lines) -> Lines:
         return lines
     start = next(k for k, n in enumerate(widths) if 2 * n > max(widths))
     end = len(lines)
-    while end > start + 1 and widths[end - 1] == 1 and not is_number("".join(lines[end - 1][1])):
+    while end > start + 1 and widths[end - 1] == 1 and _is_remark("".join(lines[end - 1][1])):
         end -= 1
     for k in (start + 1, start):
         if not 0 < k < end or widths[k - 1] < 2:
@@ -632,6 +641,11 @@ def _without_title(lines: Lines) -> Lines:
             joined.append(f"{group} {name}".strip())
         return [(number, joined), *lines[k + 1 : end]]
     return lines[start:end]
+
+
+def _is_remark(cell: str) -> bool:
+    """Return whether the only cell of a line is neither a number nor the name of a file."""
+    return not is_number(cell) and _FILE.search(cell) is None
 
 
 def _with_units(lines: Lines) -> Lines:

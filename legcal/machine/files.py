@@ -154,14 +154,15 @@ GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a
 MAX_GAIN_ERROR = 1e-12  # tolerance of a gain of 1
 
 
-def _different(names: list[str]) -> list[str]:
+def different_legs(names: list[str]) -> list[str]:
+    """Refuse a leg that is named more than once."""
     for name in names:
         if names.count(name) > 1:
             raise BadValue(f"the leg '{name}' more than once", "different legs", "name each once")
     return names
 
 
-FrameLegs = Annotated[list[str], Field(min_length=2, max_length=3), AfterValidator(_different)]
+FrameLegs = Annotated[list[str], Field(min_length=2, max_length=3), AfterValidator(different_legs)]
 
 
 class MotorEntry(FileSchema):

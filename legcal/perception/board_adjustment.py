@@ -22,7 +22,7 @@ from scipy.special import chdtri
 
 from legcal.data.corners import Corners
 from legcal.data.dataset import MIN_CORNERS
-from legcal.data.measurements import Measurements, few, row_names
+from legcal.data.measurements import Measurements, row_names
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DatasetError, NotVisible, Problem
 from legcal.estimation.clusters import Clusters, clustered
@@ -40,6 +40,7 @@ from legcal.estimation.problem import (
     linearize,
 )
 from legcal.estimation.solver import COST_TOLERANCE, minimise, normal_equations
+from legcal.files.schema import few
 from legcal.geometry.lines import cross
 from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray

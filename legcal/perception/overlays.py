@@ -138,7 +138,7 @@ def _reason(pair: Outlines) -> str:
 def _drawn(why: Rejection) -> str:
     """Return a reason as it is drawn: with names and notes, without figures."""
     named = Reason.HIDDEN, Reason.OTHER
-    return (str(why) if why.reason in named else why.summary) or "rejected"
+    return (str(why) if why.reason in named else why.reason.words) or "rejected"
 
 
 def _part_marks(

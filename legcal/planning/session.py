@@ -25,13 +25,10 @@ from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.summary import mm_deg
 from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.dataset_file import dataset_texts
-from legcal.data.measurements import reading_columns
 from legcal.data.reading_units import sigmas_of_legs
-from legcal.errors import UsageError
 from legcal.files.folder import (
     OutputKind,
-    check_destination,
-    holds_files,
+    check_empty,
     output_path,
     result_folder,
 )
@@ -60,12 +57,7 @@ PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 def check_session(output: str | Path) -> Path:
     """Return the folder of a session; refuse to replace other files."""
     destination = output_path(output, PLANNED)
-    check_destination(destination, PLANNED)
-    if destination.is_dir() and holds_files(destination):
-        raise UsageError(
-            f"{destination}: the session could not be written: found an earlier session, needed a "
-            "new or empty folder; give another folder, or remove that one."
-        )
+    check_empty(destination, PLANNED)
     return destination
 
 
@@ -178,8 +170,7 @@ def poses_to_take(plan: Plan) -> tuple[list[str], list[list[str]]]:
         rows.append([name, label, image, via, *(f"{x:z.4f}" for x in numbers),
                      *(f"{x:z.0f}" for x in where)])  # fmt: skip
     joints = [
-        f"{column.name} [{unit}]"
-        for column, (_, unit) in zip(reading_columns(plan.machine.legs), shown, strict=True)
+        f"{name} [{unit}]" for name, (_, unit) in zip(plan.machine.motor_names, shown, strict=True)
     ]
     pose = [*(f"{x} [mm]" for x in "xyz"), *(f"{x} [deg]" for x in ("roll", "pitch", "yaw"))]
     camera = [f"camera {x} [mm]" for x in "xyz"]

@@ -31,13 +31,11 @@ from legcal.calibration.joint_fit.predicted import (
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.causes import Cause
 from legcal.data.dataset import POSES_NAME, Dataset, inspect_files, load_dataset
-from legcal.data.dataset_file import read_dataset_file
 from legcal.data.image_choice import dataset_at
 from legcal.data.image_tables import measurements_at
-from legcal.data.measurements import read_measurements
+from legcal.data.measurements import measurement_table, measurements_in
 from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
-from legcal.data.reading_units import reading_units
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, OutOfResources, UsageError
 from legcal.files.folder import write_atomically
@@ -118,9 +116,6 @@ class GuidedSession:
         self.notes: list[str] = []  # on photographs that are there
         self.skipped: set[tuple[str, str]] = set()  # views and poses of the plan to leave out
         self._accepted: list[str] = []  # images of this run
-        yaml_path = self.dataset.yaml_path
-        stated = read_dataset_file(yaml_path).readings
-        self._units = reading_units(yaml_path, self.machine.legs, stated)
         self._read_tables()
         if not self._left and target is None:
             raise UsageError(
@@ -148,10 +143,11 @@ class GuidedSession:
         self._planned, planned = rows, m
         if path.is_file():
             self._planned = _cells(path)[1]
-            planned, _ = read_measurements(
-                path, self.folder, m.views, self.machine.legs, m.sigma_q, m.sigma_by_joint,
-                self._units,
-            )  # fmt: skip
+            units = self.dataset.units
+            whole, _ = measurement_table(path, units)
+            planned, _ = measurements_in(
+                whole, self.folder, m.views, self.machine.legs, m.sigma_q, m.sigma_by_joint, units
+            )
         done = {_label(cells) for cells in self._cells}
         self._left = [
             (cells, planned.q[k])
@@ -374,7 +370,9 @@ class GuidedSession:
         """Return the cells of readings, in the units of the table."""
         legs = self.machine.legs
         names = {str(legs[j].prismatic): float(q[j]) for j in self.machine.motors}
-        return {name: repr(self._units[name].reading(value)) for name, value in names.items()}
+        return {
+            name: repr(self.dataset.units[name].reading(value)) for name, value in names.items()
+        }
 
     def _look_at_taken(self) -> None:
         m = self.dataset.measurements

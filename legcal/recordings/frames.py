@@ -25,12 +25,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.data.measurements import reading_columns
-from legcal.data.photograph_matching import Photograph, find_photographs, photograph_time
+from legcal.data.image_choice import unix_seconds
+from legcal.data.photograph_matching import find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import describe
+from legcal.files.table import is_number
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.vision.image_file import (
@@ -159,7 +160,7 @@ class ImageFolder(Recording):
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of their times."""
         photographs = find_photographs(self.path)
-        times = {p.name: stamp_in(p.path.stem) or _taken(p) for p in photographs}
+        times = {p.name: stamp_in(p.path.stem) or photograph_time(p) for p in photographs}
         lost = [name for name, time in times.items() if time is None]
         if lost:
             raise DatasetError(
@@ -187,12 +188,6 @@ class ImageFolder(Recording):
                     "complete PNG, JPEG or TIFF; copy it again or remove it."
                 )
             yield Frame(times[photograph.name] or 0.0, np.asarray(image, dtype=np.uint8))
-
-
-def _taken(photograph: Photograph) -> float | None:
-    """Return the time of a photograph [s], from its EXIF data."""
-    moment = photograph_time(photograph)
-    return None if moment is None else moment.replace(tzinfo=UTC).timestamp()
 
 
 def stamp_in(text: str) -> float | None:
@@ -232,7 +227,13 @@ class Bag(Recording):
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of the bag; damaged images are skipped and counted."""
         self._bad, last, number = 0, -np.inf, -1
-        for time, kind, message in self._messages(_IMAGES, self._topic_of_images):
+        messages = self._messages(
+            "images",
+            _IMAGES,
+            self._image_topic,
+            lambda first: f"name it behind the bag, {self.path}:{first}, or give another bag",
+        )
+        for time, kind, message in messages:
             image = _image(message) if kind == _IMAGES[0] else _decoded(message)
             if image is None or time <= last:
                 self._bad += 1
@@ -254,48 +255,31 @@ class Bag(Recording):
     def readings(self) -> Series | None:
         """Return the joint states, None if the bag holds none."""
         with self._opened() as reader:
-            if not self._topics(reader, _JOINTS):
-                return None
+            topics = self._topics(reader, _JOINTS)
+        if not topics:
+            return None
         times, states = [], []
-        for time, _, message in self._messages(_JOINTS, self._topic_of_joints):
+        usual = _USUAL_JOINTS if _USUAL_JOINTS in topics else None
+        remedy = f"call it {_USUAL_JOINTS}, or give the readings as a table with --readings"
+        for time, _, message in self._messages("joint states", _JOINTS, usual, lambda _: remedy):
             times.append(time)
             states.append(dict(zip(message.name, map(float, message.position), strict=False)))
         return series_of_joints(f"{self.path}, joint states", times, states, self._machine)
 
-    def _topic_of_images(self, topics: Sequence[str]) -> str:
-        """Return the topic of the images: the stated one, or the only one."""
-        if self._image_topic is not None and self._image_topic not in topics:
-            raise UsageError(
-                f"{self.path}: the images could not be read: found no topic "
-                f"{describe(self._image_topic)} with them, needed "
-                f"{', '.join(map(describe, topics)) or 'one'}; correct the name."
-            )
-        if self._image_topic is None and len(topics) != 1:
-            stated = ", ".join(map(describe, topics)) or "no topic"
-            remedy = f"name it behind the bag, {self.path}:{topics[0]}" if topics else (
-                "give another bag")  # fmt: skip
-            raise DatasetError(
-                f"{self.path}: the images could not be read: found {stated} with them, needed one; "
-                f"{remedy}."
-            )
-        return self._image_topic or topics[0]
-
-    def _topic_of_joints(self, topics: Sequence[str]) -> str:
-        """Return the topic of the joint states: the only one, or the one with the usual name."""
-        if len(topics) > 1 and _USUAL_JOINTS not in topics:
-            raise DatasetError(
-                f"{self.path}: the joint states could not be read: found "
-                f"{', '.join(map(describe, topics))} with them, needed one or {_USUAL_JOINTS}; "
-                "give the readings as a table with --readings."
-            )
-        return topics[0] if len(topics) == 1 else _USUAL_JOINTS
-
     def _messages(
-        self, kinds: tuple[str, ...], choose: Callable[[Sequence[str]], str]
+        self, noun: str, kinds: tuple[str, ...], stated: str | None, remedy: Callable[[str], str]
     ) -> Iterator[tuple[float, str, Any]]:
-        """Yield time [s], type and content of the messages of one topic."""
+        """Yield time [s], type and content of the messages of the stated topic, or the only one."""
         with self._opened() as reader:
-            topic = choose(self._topics(reader, kinds))
+            topics = self._topics(reader, kinds)
+            topic = topics[0] if stated is None and len(topics) == 1 else stated
+            if topic not in topics:
+                found = ", ".join(map(describe, topics)) or "no topic"
+                missing = f"no topic {describe(stated)}, but " * (stated is not None)
+                raise DatasetError(
+                    f"{self.path}: the {noun} could not be read: found {missing}{found} with them, "
+                    f"needed one; {remedy(topics[0] if topics else '/TOPIC')}."
+                )
             chosen = [c for c in reader.connections if c.topic == topic]
             for connection, stamp, raw in reader.messages(connections=chosen):
                 message = reader.deserialize(raw, connection.msgtype)
@@ -367,20 +351,6 @@ def _decoded(message: Any) -> NDArray[np.uint8] | None:
 # Readings over time: a table with a column of times, or joint states
 
 
-_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-
-
-def unix_seconds(number: float) -> float | None:
-    """Return a Unix time [s] from s, ms, us or ns, distinguished by years 2001 to 2286.
-
-    Other numbers, such as 20261123101500, give None; numbers before 2001 are seconds.
-    """
-    for unit in (1e9, 1e6, 1e3, 1.0):
-        if number >= 1e9 * unit:
-            return number / unit if number < 1e10 * unit else None
-    return number
-
-
 @dataclass(frozen=True, eq=False)
 class Series:
     """Readings of all encoders at times."""
@@ -396,17 +366,17 @@ class Series:
 def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Series:
     """Return the readings of a CSV with a column of times, in the order of times."""
     sheet = ReadingsSheet(path, machine, "time")
-    if "time" not in sheet:
+    if "time" not in sheet.table:
         raise DatasetError(
             f"{path}: the readings could not be used: found no column 'time', needed one in "
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
             f"single poses. {' '.join(sheet.notes)}".rstrip()
         )
     readings = sheet.readings(lengths=lengths)
-    times = _seconds(sheet.text("time"), path)
+    times = _seconds(sheet.table.text("time"), path)
     in_words = f"{readings.unit}, {readings.unit_from}"
     return _in_order(
-        Series(str(path), times, readings.q, sheet.taken, in_words, tuple(sheet.notes))
+        Series(str(path), times, readings.q, sheet.taken, in_words, (*sheet.notes, *readings.notes))
     )
 
 
@@ -414,7 +384,7 @@ def series_of_joints(
     source: str, times: Sequence[float], states: Sequence[Mapping[str, float]], machine: Machine
 ) -> Series:
     """Return the readings of joint states: positions [m or rad] by joint name."""
-    joints = [column.name for column in reading_columns(machine.legs)]
+    joints = machine.motor_names
     complete = [k for k, state in enumerate(states) if all(name in state for name in joints)]
     if not complete:
         names = sorted({name for state in states for name in state})
@@ -447,16 +417,15 @@ def _in_order(series: Series) -> Series:
 
 def _seconds(texts: Sequence[str], path: Path) -> Array:
     """Return times [s] of numbers (Unix times in s, ms, us or ns, or seconds) or of dates."""
-    others = [text for text in texts if not _NUMBER.fullmatch(text)]
+    others = [text for text in texts if not is_number(text)]
     if 2 * len(others) < len(texts):
         if others:
             raise _no_time(others[0], path)
         numbers = np.array([float(text) for text in texts])
         size = float(np.median(np.abs(numbers)))
         seconds = unix_seconds(size)
-        wrong = np.flatnonzero(~np.isfinite(numbers) | (seconds is None))
-        if seconds is None or len(wrong):
-            raise _no_time(texts[wrong[0]], path)
+        if seconds is None:
+            raise _no_time(texts[0], path)
         return numbers * (seconds / size if size else 1.0)
     stamps = []
     for text in texts:

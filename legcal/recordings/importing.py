@@ -12,18 +12,18 @@ import cv2
 import numpy as np
 from scipy.signal import correlate
 
-from legcal.data.measurements import few
 from legcal.data.new_dataset import (
     DATASET_FOLDER,
     MIN_SIGMA,
     SheetOptions,
     plan_new_dataset,
+    split_camera,
     write_new_dataset,
 )
 from legcal.data.reading_units import usual_sigma
-from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import check_path, existing_parent, temporary_folder
-from legcal.files.schema import NAME_NEEDED, Document, Number, describe, is_name
+from legcal.errors import DatasetError, UsageError
+from legcal.files.folder import check_path, existing_parent, out_of_resources, temporary_folder
+from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.loader import load_mechanism
@@ -196,9 +196,7 @@ def plan_import(
             "clocks, needed a finite number; correct --offset."
         )
     for text in cameras:  # before minutes of reading frames
-        read_camera(
-            Path(text if "=" not in text or os.path.isfile(text) else text.split("=", 1)[1])
-        )
+        read_camera(Path(split_camera(text)[1]))
     tables = {path: read_series(path, machine, lengths=lengths) for path in dict.fromkeys(readings)}
     views = []
     for k, (name, recording) in enumerate(zip(names, recordings, strict=True)):
@@ -359,36 +357,30 @@ def import_recordings(
     check_path(plan.destination, DATASET_FOLDER)
     motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
-    try:
-        with temporary_folder(existing_parent(plan.destination), plan.destination.name) as folder:
-            rows: list[tuple[object, ...]] = []
-            for view in plan.views:
-                (folder / _SHOTS / view.name).mkdir(parents=True)
-                used = view.used
-                for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
-                    name = f"{view.name}_{k + 1:03d}.png"
-                    place = folder / _SHOTS / view.name / name
-                    done, content = cv2.imencode(".png", frame.image)
-                    assert done
-                    place.write_bytes(content.tobytes())
-                    q = view.readings[k]
-                    rows.append((view.name, f"{view.name}/{name}", *q.tolist()))
-                    progress(f"Writing {view.name}", k + 1, len(used))
-                    if k + 1 == len(used):
-                        break
-            table = folder / _TABLE
-            table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
-            new = plan_new_dataset(
-                folder / _SHOTS, table, plan.model, plan.destination,
-                SheetOptions(cameras=plan.cameras, encoder_sigma=plan.encoder_sigma),
-            )  # fmt: skip
-            return write_new_dataset(new, force=force)
-    except OSError as error:
-        raise OutOfResources(
-            f"{plan.destination}: the dataset could not be written: found "
-            f"'{error.strerror or error}', needed a folder that takes its files; free some space "
-            "or give another folder; nothing was written."
-        ) from error
+    with (
+        out_of_resources(plan.destination, "the dataset", "folder; nothing was written"),
+        temporary_folder(existing_parent(plan.destination), plan.destination.name) as folder,
+    ):
+        rows: list[tuple[object, ...]] = []
+        for view in plan.views:
+            (folder / _SHOTS / view.name).mkdir(parents=True)
+            used = view.used
+            for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
+                name = f"{view.name}/{view.name}_{k + 1:03d}.png"
+                done, content = cv2.imencode(".png", frame.image)
+                assert done
+                (folder / _SHOTS / name).write_bytes(content.tobytes())
+                rows.append((view.name, name, *view.readings[k].tolist()))
+                progress(f"Writing {view.name}", k + 1, len(used))
+                if k + 1 == len(used):
+                    break
+        table = folder / _TABLE
+        table.write_text(format_table(["view", "image", *joints], rows), encoding="utf-8")
+        new = plan_new_dataset(
+            folder / _SHOTS, table, plan.model, plan.destination,
+            SheetOptions(cameras=plan.cameras, encoder_sigma=plan.encoder_sigma),
+        )  # fmt: skip
+        return write_new_dataset(new, force=force)
 
 
 # Intervals of rest, and the offset between the clocks of camera and encoders

@@ -29,9 +29,9 @@ from legcal.calibration.summary import (
     sentences,
     tables,
 )
-from legcal.data.measurements import few
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import few
 from legcal.machine.leg import ParameterId
 from legcal.pages.document import Table, Verdict
 from legcal.report.render import Report, report, table

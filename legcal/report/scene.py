@@ -249,8 +249,7 @@ def _enlargement(axes: Mapping[str, Array], radius: float) -> float:
 def pyramid(camera: Camera, T_base_camera: RigidTransform, depth: float) -> Array:
     """Return the centre of a camera and the corners of its view at a depth [m], (5, 3)."""
     w, h = camera.width - 0.5, camera.height - 0.5
-    corners = camera.undistort(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
-    rays = depth * np.concatenate([corners, np.ones((4, 1))], axis=1)
+    rays = depth * camera.rays(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
     return np.asarray(T_base_camera.apply(np.concatenate([np.zeros((1, 3)), rays])))
 
 

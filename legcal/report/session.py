@@ -38,28 +38,31 @@ _LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 def matching_table(new: NewDataset) -> Report:
     """Return the interpretation of a folder and a table: columns, units, matched photographs."""
     pairs = list(zip(new.matching.pairs, new.views, strict=True))
-    joints = new.joints
-    size, unit = SHOWN_IN[new.machine.legs[new.machine.motors[0]].reading_unit]
+    shown = [
+        (joint, *SHOWN_IN[leg.reading_unit])
+        for leg in (new.machine.legs[j] for j in new.machine.motors)
+        if (joint := str(leg.prismatic)) in new.readings.joints
+    ][:1]
     rows = [
         (
             str(k + 1),
             new.rows[k].image or new.rows[k].time,
             photograph.name,
             view,
-            f"{size * new.readings.q[k, 0]:z.3f}",
+            *(f"{size * new.readings_of(k)[joint]:z.3f}" for joint, size, _ in shown),
         )
         for (k, photograph), view in pairs[:_MOST]
     ]
     if len(pairs) > _MOST:
-        rows.append(("...", "", f"{len(pairs) - _MOST} more", "", ""))
+        rows.append(("...", "", f"{len(pairs) - _MOST} more", "", *("" for _ in shown)))
     counts = {view: new.views.count(view) for view in new.cameras}
-    noun = "whole lengths of legs" if new.are_lengths else "readings"
-    unit_in_table = f"{new.readings.unit}, {new.readings.unit_from}"
+    noun = "whole lengths of legs" if new.readings.are_lengths else "readings"
+    unit_in_table = new.readings.unit and f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
         heading(
             printable(str(new.destination)),
             f": {len(pairs)} photographs, {len(counts)} view{'s' * (len(counts) != 1)}, "
-            f"{len(joints)} encoders",
+            f"{len(new.readings.joints)} encoders",
         ),
         [
             *understood(new.columns, noun, unit_in_table),
@@ -70,7 +73,7 @@ def matching_table(new: NewDataset) -> Report:
             "in the table",
             "photograph",
             "view",
-            f">{joints[0]} [{unit}]",
+            *(f">{joint} [{unit}]" for joint, _, unit in shown),
             rows=[tuple(map(printable, row)) for row in rows],
         ),
         [

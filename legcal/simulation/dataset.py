@@ -23,8 +23,7 @@ from legcal.data.reading_units import sigma_too_large
 from legcal.errors import UsageError
 from legcal.files.folder import (
     OutputKind,
-    check_path,
-    holds_files,
+    check_empty,
     output_path,
     result_folder,
 )
@@ -143,13 +142,7 @@ def simulate(
             f"The dataset could not be simulated: found {workers} workers, needed 1 or more; "
             "correct it."
         )
-    check_path(destination, SIMULATED)
-    if destination.is_dir() and holds_files(destination):
-        content = "a simulated dataset" if SIMULATED.is_in(destination) else "a folder with files"
-        raise UsageError(
-            f"{destination}: the dataset could not be written: found {content}, needed a new or "
-            "empty folder; give another folder, or remove this one first."
-        )
+    check_empty(destination, SIMULATED)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
     for leg in (nominal.legs[j] for j in nominal.motors):
         if too_large := sigma_too_large(settings.reading_errors(leg).sigma, leg):

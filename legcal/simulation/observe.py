@@ -311,8 +311,7 @@ def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> t
     normal = np.linalg.solve(np.swapaxes(J, -1, -2), ab[..., None])[..., 0]
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     moved = ends + offsets[..., None] * normal
-    xy = camera.undistort(moved)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    rays = camera.rays(moved)
     n = cross(rays[..., 0, :], rays[..., 1, :])
     n *= np.sign(np.sum(n * h, axis=-1, keepdims=True))
     return n / np.linalg.norm(n, axis=-1, keepdims=True), moved

@@ -22,6 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import PLAN_NAME, load_dataset
 from legcal.data.measurements import Measurements, View, reading_columns, readings_in
+from legcal.data.reading_units import default_units
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
 from legcal.files.schema import validate
@@ -430,7 +431,7 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
         path,
         "file of poses",
         "row",
-        reading_columns(machine.legs),
+        reading_columns(default_units(machine.legs)),
         needed="one row for each pose; write the readings of the motors",
     )
     readings, _ = readings_in(table, machine.legs)  # (n_poses, n_motors) [m]

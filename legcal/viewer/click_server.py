@@ -88,7 +88,7 @@ class ClickServer(PageServer):
         answer |= {"problems": camera.problems, "notes": camera.notes}
         if camera.T_base_camera is not None:
             rows = np.array([row], dtype=np.intp)
-            joints, has_place = (of_row[row] for of_row in joints_at_readings(machine, m, rows))
+            joints, has_place = (of_row[0] for of_row in joints_at_readings(machine, m, rows))
             ends = np.argwhere(has_place)
             P = camera.T_base_camera.inv().apply(joints[has_place])
             ahead = P[:, 2] > 0.0

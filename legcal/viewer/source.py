@@ -76,7 +76,7 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Subject
 
 def _session(machine: Machine, given: str | Path, result: EarlierResult | None) -> Dataset:
     """Return the session of a machine, with the outlines that its calibration used."""
-    from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_outlines
+    from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_observed
 
     dataset = load_dataset(given, check_images=False)
     names = dataset.machine.leg_names
@@ -88,7 +88,7 @@ def _session(machine: Machine, given: str | Path, result: EarlierResult | None) 
         )
     outlines = dataset.observations
     if result is not None and os.path.isfile(result.folder / OBSERVATIONS_NAME):
-        outlines = read_outlines(result.folder, dataset.machine, dataset.measurements)
+        outlines, _ = read_observed(result.folder, dataset.machine, dataset.measurements)
     order = [names.index(name) for name in machine.leg_names]
     measurements = replace(dataset.measurements, q=dataset.measurements.q[:, order])
     return replace(dataset, measurements=measurements, observations=outlines)

@@ -292,6 +292,11 @@ class Camera:
         xy = DISTORTION_MODELS[self.model].undistort(flat, self.K, self.distortion)
         return np.asarray(xy, dtype=np.float64).reshape(pixels.shape)
 
+    def rays(self, pixels: Array) -> Array:
+        """Return the rays (..., 3) through pixels (..., 2), as points of the plane z = 1."""
+        xy = self.undistort(pixels)
+        return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+
     def pixels_per_unit(
         self,
         xy: Array,  # (..., 2) points of the sensor plane

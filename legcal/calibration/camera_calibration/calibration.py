@@ -32,11 +32,10 @@ from legcal.calibration.camera_calibration.document import (
     write_picture,
 )
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
-from legcal.data.measurements import few
 from legcal.data.photograph_notes import differences, recorded
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
 from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import describe
+from legcal.files.schema import describe, few
 from legcal.perception.board_adjustment import SHEET, BoardImages
 from legcal.perception.board_corners import (
     NumberedCorners,

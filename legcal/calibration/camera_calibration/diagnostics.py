@@ -11,9 +11,8 @@ from scipy.spatial.distance import pdist, squareform
 
 from legcal.calibration.camera_calibration.consensus import RobustFit
 from legcal.calibration.camera_calibration.starts import part_of
-from legcal.data.measurements import few
 from legcal.errors import NotIdentifiable
-from legcal.files.schema import Document
+from legcal.files.schema import Document, few
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import SHEET, BoardImages, adjust_board
 from legcal.vision.camera import Camera, intrinsic_names

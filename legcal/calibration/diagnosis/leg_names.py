@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.measurements import Measurements, few, few_views
+from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, along_legs
+from legcal.files.schema import few
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg

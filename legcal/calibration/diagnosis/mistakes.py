@@ -12,8 +12,9 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.image_tables import inverse
-from legcal.data.measurements import few, row_names
+from legcal.data.measurements import row_names
 from legcal.errors import DidNotConverge, ModelError
+from legcal.files.schema import few
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.home import home_at_mid_travel
 from legcal.machine.kinematics import follow_poses

@@ -15,11 +15,11 @@ import numpy as np
 
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State
-from legcal.data.measurements import few
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import NormalEquations, information, normal_equations
 from legcal.estimation.uncertainty import leverage, score_test
 from legcal.files.quantity import SHOWN_IN
+from legcal.files.schema import few
 from legcal.geometry.types import BoolArray
 from legcal.machine.redundancy import AS_LIKELY, MIN_REDUNDANCY, ROUGH_READING, ReadingTests
 

@@ -46,12 +46,12 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
-from legcal.data.measurements import few
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, linearize
 from legcal.estimation.solver import Minimum, information, minimise, normal_equations, robust_cost
 from legcal.estimation.uncertainty import leverage, response, score_test, scores_of_block
+from legcal.files.schema import few
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.cylinder import EPSILON
 

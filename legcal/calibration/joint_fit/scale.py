@@ -23,11 +23,11 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.sensitivity import kinematic_steps
 from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.tuning import SCALE_BY_CHANCE
-from legcal.data.measurements import few
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Linearization, linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test, size_left
+from legcal.files.schema import few
 from legcal.geometry.types import Array
 from legcal.machine.leg import LINKS, LegColumns, ParameterId
 

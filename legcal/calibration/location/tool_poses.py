@@ -27,6 +27,7 @@ from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.calibration.location.frames import PosePairs
 from legcal.calibration.result_folder import RESULT_NAME, load_result
 from legcal.data.measurements import reading_columns, readings_in
+from legcal.data.reading_units import default_units
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import Code, DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
@@ -106,7 +107,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
 
     Raises DatasetError with one sentence for each problem, naming row and column.
     """
-    joints = [column.name for column in reading_columns(machine.legs)]
+    joints = machine.motor_names
     sheet = read = None
     columns: dict[str, str] = {}  # meaning of the other headings
     header = _first_line(path)
@@ -117,7 +118,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         path,
         "table of tool poses",
         "row",
-        [*reading_columns(machine.legs), *_COLUMNS],
+        [*reading_columns(default_units(machine.legs)), *_COLUMNS],
         needed="a row for each pose; measure some",
         unknown=lambda name: _about_angles(path, name),
         reshape=(
