@@ -43,6 +43,10 @@ def readings(k: int) -> list[float]:
     return [10.0 + 7.0 * k + j for j in range(6)]
 
 
+def by_leg(k: int) -> dict[str, float]:
+    return dict(zip(LEGS, readings(k), strict=True))
+
+
 def table(
     folder: Path,
     columns: Mapping[str, Sequence[str]] | None = None,
@@ -277,6 +281,29 @@ def test_what_cannot_become_a_dataset_is_refused_and_nothing_written(
     assert said.count("legcal: ") == 1
     assert all(word in said for word in named), said
     assert not (tmp_path / "dataset").exists()
+
+
+def test_readings_that_nobody_knows_stay_empty(tmp_path: Path) -> None:
+    """Some motors or all; a reading that is missing among others is refused."""
+    folder = own_folder(tmp_path, names := ["a.jpg", "b.jpg", "c.jpg"])
+    for unknown in ({"leg2"}, set(LEGS)):
+        rows = [
+            [name, *("" if leg in unknown else f"{q}" for leg, q in by_leg(k).items())]
+            for k, name in enumerate(names)
+        ]
+        text = "\n".join(",".join(row) for row in [["image", *LEGS], *rows])
+        (folder / "own.csv").write_text(text)
+        made = init(folder, "--force")
+        assert made.code == 0
+        assert "are not known (empty cells)" in made.said
+        machine = load_dataset(folder / "dataset").machine
+        assert len(machine.motors) == 6 - len(unknown)
+    rows[0][1] = "10"
+    (folder / "own.csv").write_text("\n".join(",".join(row) for row in [["image", *LEGS], *rows]))
+    refused = init(folder, output="other")
+    assert refused.code == 2
+    assert "row 2 (line 3), column leg1_prismatic: the reading could not be used" in refused.said
+    assert not (folder / "other").exists()
 
 
 def test_without_a_camera_file_photographs_that_state_a_focal_length_give_a_rough_camera(

@@ -211,7 +211,7 @@ def understood(columns: Mapping[str, str], noun: str, unit: str) -> list[str]:
     renamed = [f"{text} is {name}" for text, name in columns.items() if text != name]
     return [
         printable(f"Columns: {', '.join(renamed)}.") if renamed else "",
-        f"Unit of the {noun}: {unit}.",
+        f"Unit of the {noun}: {unit}." if unit else "",
     ]
 
 
