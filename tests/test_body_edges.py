@@ -14,6 +14,7 @@ from simulated import PLACES, settings, small_camera
 from legcal import Viewpoint, calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import nominal_poses
@@ -75,6 +76,21 @@ def test_edges_make_a_machine_more_certain_and_know_their_noise() -> None:
     names = rods.estimates.names
     assert names == with_edges.estimates.names
     assert np.all(with_edges.estimates.sigma < rods.estimates.sigma)
+
+
+def test_edges_in_photographs_keep_errors_in_a_view() -> None:
+    """A leg that has edges alone is known less well by photographs than by as many edges apart."""
+    session = machine_session("3-rps")
+    others, edges = without_leg(session, 0), body_edges(session, 0.1, seed=3)
+    sigmas = []
+    for of_photographs in (True, False):
+        choices = Choices(of_photographs=of_photographs)
+        estimates = refine(
+            session.legs, session.measurements, others, session.start, edges=edges, choices=choices
+        ).estimates
+        of_leg = [name.startswith("leg1.") for name in estimates.names]
+        sigmas.append(np.asarray(estimates.sigma)[of_leg])
+    assert np.all(sigmas[0] > 1.1 * sigmas[1])
 
 
 def test_edges_that_add_little_are_left_out() -> None:

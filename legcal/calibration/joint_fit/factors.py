@@ -448,6 +448,7 @@ class ObservedEdges:
     lens: Array  # (n, 2, 2) J^-T at the second end, J the derivative of pixels there [1/px]
     # (n,) standard deviation of the offset of the second end from a line through the first [px]
     sigma: Array
+    line: IntArray  # (n,) numbers of the lines of bodies that they are
     bodies: tuple[tuple[int, str], ...]  # leg index and link of each
     on_actuators: bool = False  # some joints at A move
 
@@ -477,6 +478,12 @@ class ObservedEdges:
             return kept, by_pose
 
         return Residuals(r[:, None], slope[:, None].T, chain)
+
+    def lines_in_views(self, used: BoolArray) -> Array:
+        """Return the columns (n, 1, c) of the lines of bodies in each view, of some edges (n,)."""
+        key = np.stack([self.view, self.body, self.line], axis=1)
+        _, line = np.unique(key, axis=0, return_inverse=True)
+        return np.array((line[:, None] == np.unique(line[used])) & used[:, None], float)[:, None]
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor."""
@@ -533,6 +540,7 @@ def observed_edges(
         pixels,
         lens,
         np.sqrt(variance),
+        edges.edge[index],
         bodies,
         legs.n_actuators > 0,
     )

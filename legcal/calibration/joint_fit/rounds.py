@@ -45,7 +45,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
-from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
+from legcal.calibration.tuning import EDGE_SHARE, FIRST_MINIMUM_SIGMA, REJECTION_TAPER
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, linearize
@@ -301,7 +301,8 @@ def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], 
     """Return errors that the fit absorbs, and their effect on the covariance; None without any.
 
     Errors at places are estimated where residuals show biases at all; those of polished parts are
-    there anyway. In photographs, biases of a leg in a view have a least size beside their estimate.
+    there anyway. In photographs, biases of a leg in a view have a least size beside their estimate,
+    and edges of bodies errors that they keep in all images of a view.
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     whitening, o = problem.factor("outlines").whitening, problem.outlines
@@ -326,10 +327,16 @@ def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], 
             shifts.append(beyond.shifts)
             sizes |= beyond.of_sizes(least).sizes
     moved = np.concatenate(shifts, axis=2)
-    if not moved.any():
+    columns = {"outlines": whitening @ moved} if moved.any() else {}
+    if problem.choices.of_photographs and len(problem.edges):
+        of_edges = np.asarray(problem.factor("edges").whitening)[:, 0, 0]
+        columns["edges"] = EDGE_SHARE * problem.edges.lines_in_views(of_edges > 0.0)
+    if not columns:
         return None
     normal = information(problem, state, linear, problem.loss)
-    moved = response(problem, linear, normal, {"outlines": whitening @ moved})
+    moved = np.concatenate(
+        [response(problem, linear, normal, {name: c}) for name, c in columns.items()], axis=1
+    )
     return sizes, moved @ moved.T
 
 
