@@ -31,6 +31,8 @@ def __getattr__(name: str) -> object:
 
     from legcal.arguments import with_arguments_in_words
 
+    if name == "ExportOptions":  # of version 0.1
+        raise AttributeError(f"No {__name__} attribute {name}: legcal.export takes nodes=")
     found = _loaded(name)
     if isinstance(found, FunctionType):
         found = globals()[name] = with_arguments_in_words(found, __name__)

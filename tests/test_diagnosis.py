@@ -16,6 +16,7 @@ from thinned import thinned
 from legcal import Dataset, calibrate, load_dataset, simulate
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
+from legcal.calibration.diagnosis.leg_names import _permuted
 from legcal.calibration.diagnosis.mistakes import Mistake, mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.image_choice import dataset_at
@@ -202,6 +203,19 @@ def test_outlines_under_the_names_of_other_legs_in_a_view_are_named(
     assert (mistake.images, mistake.before, mistake.after) == (6, 0, 6)
     with pytest.raises(DidNotConverge, match=re.escape(mistake.sentence)):
         calibrate(renamed)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+def test_exchanged_legs_are_found_beside_another_that_names_one_of_them(
+    order: tuple[int, ...],
+) -> None:
+    first, second, third = order
+    nearest = np.ones((4, 4))
+    for one, other in ((first, second), (second, third), (third, second), (3, 3)):
+        nearest[one, other] = 0.0
+    leg = np.repeat(np.arange(4), 6)
+    (cycle,) = _permuted(nearest[leg], leg)
+    assert sorted(cycle) == sorted([(second, third), (third, second)])
 
 
 def _misnamed(d: Dataset, names: dict[int, int]) -> Dataset:

@@ -341,6 +341,11 @@ def test_genhexkins_has_the_readings_of_the_model(
         assert (joints >= limits).all()
 
 
+def test_the_options_of_earlier_exports_name_what_stands_in_their_place() -> None:
+    with pytest.raises(AttributeError, match=r"ExportOptions: legcal\.export takes nodes="):
+        getattr(legcal, "ExportOptions")  # noqa: B009
+
+
 @pytest.mark.parametrize("name", ["3-rpr"])
 def test_corrected_commands_bring_the_machine_where_it_should_be(
     name: str, calibrated: Callable[[str], Subject], tmp_path: Path

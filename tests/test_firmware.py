@@ -131,6 +131,7 @@ def test_a_configuration_is_written_as_it_was_read(name: str, tmp_path: Path) ->
     machine = machine_of(text, tmp_path)
     path = tmp_path / "again.txt"
     exported = export(machine.yaml_path, name.split("-", maxsplit=1)[0], path)
+    assert etree.parse(exported.paths[1]).getroot().tag.endswith("svg")
     np.testing.assert_allclose(numbers_in(path.read_text()), numbers_in(text), atol=1e-6)
     assert exported.figures["remaining_mm"]["max"] < 1e-6
 

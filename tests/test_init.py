@@ -251,6 +251,8 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"add": 345.0}, ("--unit", "m"), ("lengths of legs in mm", "add --lengths")),
     (FLAT, {}, ("--lengths",), ("readings in mm", "leave out --lengths")),
     (FLAT, {}, ("--unit", "m"), ("readings in mm", "state the unit mm")),
+    (FLAT, {"add": 322.0}, ("--lengths", "--unit", "mm"),
+     ("lengths are outside", "correct the lengths")),
     (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),
     (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "headings")),
     (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),

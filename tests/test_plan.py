@@ -84,10 +84,11 @@ def drawn_once() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def planned(small_search: None) -> Plan:
     """A plan for outlines with white noise, its work done elsewhere."""
-    return legcal.plan(
-        "3-rpr", images=6, cameras=2, seed=3, noise=WHITE, setting=FEW,
-        bounds=parse_bounds(BOUNDS), workers=OtherProcess(1),
-    )  # fmt: skip
+    with OtherProcess(1) as executor:
+        return legcal.plan(
+            "3-rpr", images=6, cameras=2, seed=3, noise=WHITE, setting=FEW,
+            bounds=parse_bounds(BOUNDS), workers=executor,
+        )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

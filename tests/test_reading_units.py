@@ -52,6 +52,12 @@ def test_units_of_each_motor_give_joint_values_and_their_sigmas(tmp_path: Path) 
     np.testing.assert_allclose(got, wanted)
 
 
+def test_a_sigma_of_a_motor_that_there_is_not_is_refused_with_the_closest_name() -> None:
+    legs = load_mechanism("servo-hexapod").legs
+    with pytest.raises(UsageError, match=r"found one of 'servo7', .*did you mean 'servo"):
+        sigmas_of({"servo1": 1e-3, "servo7": 1e-3}, legs)
+
+
 def servo_table(folder: Path, **changes: Any) -> Path:
     """Write the table of the servo hexapod with pulses in place of angles."""
     table = yaml.safe_load((ROOT / "models/tables/servo-hexapod.yaml").read_text())

@@ -194,6 +194,17 @@ def test_encoders_that_were_homed_anew_accuse_no_joint_and_get_zeros_of_their_ow
     )
 
 
+def test_two_encoders_that_slipped_are_named_and_not_all(healthy: Dataset, start: Start) -> None:
+    by = np.array([1e-3, -1e-3, 0.0, 0.0, 0.0, 0.0])
+    slipped = _with_readings(lambda q: q + np.outer(_later(len(q)), by))(healthy)
+    (finding,) = _findings(slipped, start)
+    assert (finding.kind, finding.subject, finding.images) == ("encoder", "leg1, leg2", CHANGED_IN)
+    assert "the zeros of the encoders of leg1, leg2 changed" in finding.what
+    splits = [f"{leg}@{finding.images}" for leg in ("leg1", "leg2")]
+    assert " ".join(f"--split {split}" for split in splits) in finding.remedy
+    assert calibrate(slipped, split=splits).verdict.trustworthy
+
+
 @pytest.mark.parametrize("times", [1.0, 30.0])
 def test_an_encoder_sigma_far_above_what_readings_scatter_is_noted(
     healthy: Dataset, unordered: Calibration, times: float

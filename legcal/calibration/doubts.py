@@ -113,7 +113,8 @@ def doubts_of(
     scale = [] if course and not is_of_scale else of.scale()
     causes = [*scale, *(doubt for doubt in course if not (scale and doubt.code == "pitch"))]
     codes = {doubt.code for doubt in course}
-    motors = {one.subject for one in session.findings if one.kind in codes}
+    named = [one.subject for one in session.findings if one.kind in codes]
+    motors = {motor for subject in named for motor in subject.split(", ")}
     motors |= {subject.partition(".")[0] for subject in motors}  # legs of joints
     explained = {
         leg.name for leg in dataset.machine.legs if motors & {leg.motor_label, leg.name, ALL_MOTORS}

@@ -12,8 +12,8 @@ and residuals increase. The restricted likelihoods of the fits are compared, eac
 noise and common-mode biases, over the outlines that all fits use; otherwise a gamma that loses
 outlines would look right for the remaining ones. Linear photographs have a gamma of 1, sRGB ones
 about 2.2: trials begin at 1 and go on in steps of :data:`GAMMA_STEP` until the likelihood falls.
-There is none where the first fit, which estimates gamma as well, has it significantly below that of
-the next trial. The estimate is the vertex of a parabola through the best three. Where the
+No trial is made where the first fit, which estimates gamma as well, finds one that is significantly
+below the next trial. The estimate is the vertex of a parabola through the best three. Where the
 likelihood is flat, the first gamma stays.
 """
 
@@ -477,7 +477,7 @@ class GammaTrials:
     def begun(cls, first: Solution, given: Mapping[str, float]) -> GammaTrials:
         """Start with the first fit; gammas of views in *given* are fixed by earlier outlines.
 
-        A gamma stays where the fit itself has it significantly below that of the next trial.
+        A gamma stays where the fit itself estimates one significantly below the next trial.
         """
         unknown = [
             estimate

@@ -60,6 +60,7 @@ _GOOD_PART = 0.2  # of a turn, beyond which errors once a turn are looked for
 _LEADS = (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32, 40)  # of screws, belts [mm]
 _COARSE = 15  # groups of images whose scores say how much those of errors once a turn scatter
 _BETTER = 10.0  # squared sigmas a number, by which further explanations must be better
+_CHANGED = 3.0  # standard deviations from which on the zero of one of all motors changed
 _STEADY = {"focal_length": 1e-6, "camera": 1e-7}  # relative, [rad]: scatter from image to image
 _LESS = np.geomspace(1e-3, 0.2, 24)  # of the stated standard deviation of readings
 _SURELY_LESS = 10.0  # of the logarithm of the likelihood
@@ -97,7 +98,7 @@ class Finding:
     kind : str
         What changed, or how readings follow motors.
     subject : str
-        The motor, the view or the joint; "" where it is all motors.
+        The motor, the view or the joint; "" where it is all motors. Several motors have commas.
     unit : str
         ``m``, ``rad`` or ``1``.
     amount, sigma : float
@@ -152,12 +153,14 @@ class Finding:
     @property
     def remedy(self) -> str:
         """What to do, as a clause."""
-        return self._words[1].format(subject=self.subject, images=self.images)
+        splits = " ".join(f"--split {motor}@{self.images}" for motor in self.subject.split(", "))
+        return self._words[1].format(subject=self.subject, images=self.images, splits=splits)
 
     @property
     def _words(self) -> tuple[str, str]:
-        is_of_all = self.kind == "encoder" and self.subject == ALL_MOTORS
-        return _HOMED if is_of_all else _WORDS[self.kind]
+        if self.kind == "encoder" and self.subject == ALL_MOTORS:
+            return _HOMED
+        return _SEVERAL if self.kind == "encoder" and ", " in self.subject else _WORDS[self.kind]
 
 
 _WITHOUT_ORDER: tuple[str, ...] = ("gain", "pitch", "eccentricity", "camera_file")
@@ -173,6 +176,11 @@ _HOMED = (  # in place of the words for one encoder
     "{subject} were homed anew: the zeros of their encoders changed, one by {size}",
     "home the machine once before all photographs, and calibrate with zeros of their own before "
     "that (--split all@{images}), or without the images on one side of it (--leave-out)",
+)
+_SEVERAL = (
+    "the zeros of the encoders of {subject} changed, one by {size}",
+    "look for slipped couplings or lost homes there, and calibrate with zeros of their own before "
+    "that ({splits})",
 )
 _WORDS: Mapping[Kind, tuple[str, str]] = {
     "encoder": (
@@ -296,7 +304,7 @@ def session_tests(
     measurements : Measurements
         The rows that were fitted.
     sequences : sequence of (n,) array
-        Rows in the order of their images, as of
+        Rows in the order of their images, see
         :func:`legcal.data.image_choice.image_sequences`.
     """
     if not len(posterior.problem.outlines):
@@ -848,13 +856,25 @@ class _Fit:
         holds = test.holds.astype(np.float64)[:, None]
         return Finding(
             cast(Kind, hypothesis.kind),
-            hypothesis.subject,
+            self._changed(number),
             *_size(number),
             test.between,
             number.p_value * n_tests,
             self._effect(hypothesis, holds, number.amount[:, None]),
             _side(measurements, self.course, test),
         )
+
+    def _changed(self, number: _Solved) -> str:
+        """Return the subject of a finding: of all encoders those that changed, if they are few."""
+        hypothesis = number.test.of
+        if hypothesis.kind != "encoder" or hypothesis.subject != ALL_MOTORS:
+            return hypothesis.subject
+        sigmas = np.abs(number.amount) / np.sqrt(np.diagonal(number.covariance))
+        changed = sigmas >= min(_CHANGED, sigmas.max())
+        if 2 * np.sum(changed) > len(changed):
+            return ALL_MOTORS
+        motors = np.unique(self.problem.readings.leg)[changed].tolist()
+        return ", ".join(self.problem.legs.nominal[j].motor_label for j in motors)
 
     def scattering(self, noise: _Scatter, hypotheses: Sequence[_Hypothesis]) -> Finding:
         """Return how much readings or a camera scatter."""
@@ -1089,7 +1109,7 @@ class _Scatter:
 def _spectrum(
     group: Sequence[tuple[int, int]], hypotheses: Sequence[_Hypothesis], scores: _Scores
 ) -> tuple[Array, Array, list[Array], float]:
-    """Return the eigenvalues of K and the squares of z along its vectors, as of :class:`_Scatter`.
+    """Return the eigenvalues of K and the squares of z along its vectors, see :class:`_Scatter`.
 
     Also what is stated: of single blocks, and in the median of a reading or a camera.
     """

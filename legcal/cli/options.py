@@ -148,7 +148,7 @@ class PageOfResult:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Look for no garbage among what imported modules make, now or later: it lives to the end."""
+    """Keep the garbage collector off the objects of imported modules: they live to the end."""
     n_modules = len(sys.modules)
     gc.disable()
     try:

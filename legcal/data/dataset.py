@@ -297,6 +297,8 @@ def load_dataset(
         found = f"{describe(entry.mechanism)}, no file there"
         needed = "the model, relative to this file, or the name of a shipped one"
         remedy = f"copy it there with its URDF, or correct the path ({mechanism})"
+        if not Path(entry.mechanism).suffix and "/" not in entry.mechanism:
+            remedy += f"; of shipped models: {closest(entry.mechanism, shipped_names())}"
         raise DatasetError(
             [*problems, entry_problem(yaml_path, "mechanism", found, needed, remedy)]
         )

@@ -255,6 +255,7 @@ def readings_in(
     readings = joint_values(values, stated)
     readings = readings_of_lengths(readings, motors) if lengths else readings
     noise = np.zeros(len(motors)) if sigma is None else NOISY * sigma
+    what = "lengths" if lengths else "readings"
     notes, outside, often = [], dict[int, str](), dict[tuple[bool, str], list[int]]()
     for j, (leg, unit, column) in enumerate(zip(motors, stated, readings.T, strict=True)):
         lower, upper = leg.travel
@@ -273,7 +274,7 @@ def readings_in(
                 often.setdefault((leg.reads_angle, unit.name), []).append(j)
         elif np.any(is_odd):
             notes.append(
-                f"{table.path}, column {names[j]}: readings are a little outside the travel "
+                f"{table.path}, column {names[j]}: {what} are a little outside the travel "
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
     notes += still_encoders(table.path, motors, readings)
@@ -283,13 +284,13 @@ def readings_in(
         if not lengths and (cause := likely_cause(values[:, alike], *of_alike, place)):
             groups |= {j: ([], "") for j in alike} | {alike[0]: (alike, cause)}
     for j, actual in outside.items():
-        columns, remedy = groups.get(j, ([j], "correct the readings or the limits"))
+        columns, remedy = groups.get(j, ([j], f"correct the {what} or the limits"))
         if not columns:
             continue
         where = f"in {names[j]} " * (len(columns) > 1)
         table.refuse_file(
             Problem(
-                f"readings are outside the travel: {where}{actual}",
+                f"{what} are outside the travel: {where}{actual}",
                 remedy=remedy,
                 file=str(table.path),
                 columns=tuple(names[k] for k in columns),

@@ -262,13 +262,22 @@ def sigmas_of(
     Raises
     ------
     UsageError
-        If no motor can have it.
+        If no motor can have it, or one is named that has no readings.
     """
+    refused = "The encoder sigma (encoder_sigma, --encoder-sigma) could not be used"
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
     if not isinstance(stated, Mapping):
         unit = split_quantity(stated)[1] if isinstance(stated, str) else ""
         alike = [name for name, leg in motors.items() if takes_unit(unit, turns=leg.reads_angle)]
         stated = dict.fromkeys(alike or motors, stated)
+    if unknown := [name for name in stated if name not in motors]:
+        raise UsageError(
+            [
+                f"{refused}: found one of '{name}', needed motors that have readings; "
+                f"{closest(name, motors)}"
+                for name in unknown
+            ]
+        )
     try:
         return {
             name: sigma_in(
@@ -281,9 +290,7 @@ def sigmas_of(
             for name, sigma in stated.items()
         }
     except ValueError as error:
-        raise UsageError(
-            f"The encoder sigma (--encoder-sigma) could not be used: {error}"
-        ) from error
+        raise UsageError(f"{refused}: {error}") from error
 
 
 def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:

@@ -27,6 +27,7 @@ from legcal.files.schema import few, read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"
+ANOTHER_FOLDER = "give another folder; nothing was written"  # a remedy where there is no space
 _HEAD = 1000  # bytes at the beginning of a file that contain its mark
 _MOST_OF_NAME = 40  # maximum letters of a name, which leave room for an addition
 
@@ -111,7 +112,7 @@ class OutputFile:
     def write(self, path: Path, content: str | bytes, *, force: bool = False) -> None:
         """Write a file; an earlier file of its kind is replaced, any other only with *force*."""
         self.check_place(path, force=force)
-        with out_of_resources(path, self.noun, "file"):
+        with out_of_resources(path, self.noun, "give another file"):
             write_atomically(path, content.encode() if isinstance(content, str) else content)
 
 
@@ -252,7 +253,7 @@ def result_folder(
     """
     check_destination(destination, kind)
     with (
-        out_of_resources(destination, f"the {kind.noun}", "folder; nothing was written"),
+        out_of_resources(destination, f"the {kind.noun}", ANOTHER_FOLDER),
         temporary_folder(_workshop(destination), destination.name) as temporary,
     ):
         new = temporary / "new"
@@ -273,8 +274,8 @@ def result_folder(
 
 
 @contextmanager
-def out_of_resources(place: Path, noun: str, other: str) -> Iterator[None]:
-    """Make errors of the system in the block a refusal; *other* is what to give in its place."""
+def out_of_resources(place: Path, noun: str, remedy: str) -> Iterator[None]:
+    """Make errors of the system in the block a refusal; *remedy* is the other way out."""
     try:
         yield
     except OSError as error:
@@ -282,7 +283,7 @@ def out_of_resources(place: Path, noun: str, other: str) -> Iterator[None]:
             f"{noun} could not be written",
             f"'{error.strerror or error}'",
             "a folder that takes it",
-            f"free some space or give another {other}",
+            f"free some space or {remedy}",
             place,
         ) from error
 

@@ -96,10 +96,10 @@ _THIS_VERSION = "version 1"
 
 
 def _version(value: object) -> object:
-    """Refuse ``true``, which equals 1 in Python, and the formats of later versions."""
+    """Refuse ``true``, which equals 1 in Python, and the formats of other versions."""
     if isinstance(value, bool):
         raise BadValue(str(value).lower(), "1", "correct the value")
-    if isinstance(value, int) and value > 1:
+    if isinstance(value, int | str) and str(value) != "1":
         remedy = "use the legcal that wrote it, or write the file as version 1"
         raise BadValue(describe(value), _THIS_VERSION, remedy)
     return value

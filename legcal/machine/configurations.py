@@ -130,7 +130,7 @@ def random_configurations(
 def random_poses(
     machine: Machine, count: int, rng: np.random.Generator | int
 ) -> tuple[Array, list[RigidTransform]]:
-    """Return readings and poses as of :func:`random_configurations`, at a tenth of the time.
+    """Return readings and poses as :func:`random_configurations` does, at a tenth of the time.
 
     If the motors determine the pose the chain is not closed.
 

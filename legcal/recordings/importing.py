@@ -22,7 +22,13 @@ from legcal.data.new_dataset import (
 )
 from legcal.data.reading_units import usual_sigma
 from legcal.errors import DatasetError, UsageError
-from legcal.files.folder import check_path, existing_parent, out_of_resources, temporary_folder
+from legcal.files.folder import (
+    ANOTHER_FOLDER,
+    check_path,
+    existing_parent,
+    out_of_resources,
+    temporary_folder,
+)
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
@@ -358,7 +364,7 @@ def import_recordings(
     motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     with (
-        out_of_resources(plan.destination, "the dataset", "folder; nothing was written"),
+        out_of_resources(plan.destination, "the dataset", ANOTHER_FOLDER),
         temporary_folder(existing_parent(plan.destination), plan.destination.name) as folder,
     ):
         rows: list[tuple[object, ...]] = []

@@ -195,7 +195,7 @@ def wrong_names(
     ends: tuple[Array, Array],
     cameras: Sequence[RigidTransform | None],
 ) -> tuple[Diagnosis, ...]:
-    """Return given outlines that name other legs, as of :func:`exchanged_legs`."""
+    """Return given outlines that name other legs, see :func:`exchanged_legs`."""
     return tuple(
         Diagnosis(
             kind="legs exchanged",
@@ -291,7 +291,7 @@ class _Judge:
         self.symmetries = symmetries(data.machine)
 
     def exchanged_legs(self) -> tuple[Diagnosis, ...]:
-        """Return given outlines whose names contradict images that agree but for names."""
+        """Return given outlines with the names of other legs, where all else in images agrees."""
         m, machine = self.data.measurements, self.data.machine
         cameras: dict[int, RigidTransform | None] = {}
         for group, one in zip(self.groups, self.of_groups, strict=True):

@@ -15,7 +15,7 @@ from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, along_legs
 from legcal.files.schema import few
 from legcal.geometry.lines import cross
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Leg
 
 _NEARER = 0.2  # of the distance from the leg that they name: to the one that they belong to
@@ -25,7 +25,7 @@ _MIN_OUTLINES = 4  # of each leg
 class WrongNames(NamedTuple):
     """Legs of some views whose outlines lie at each other's place."""
 
-    what: str  # clauses, as of a Diagnosis
+    what: str  # this and the remedy are clauses, as in a Diagnosis
     remedy: str
     images: int  # that show them
     before: int  # with their outlines nearer to the legs that they name
@@ -88,7 +88,7 @@ def _distances(rays: Array, A: Array, B: Array, radius: Array) -> Array:
     return np.asarray(np.abs(passes - radius[:, None, None]).max(axis=1))
 
 
-def _permuted(off: Array, leg: Array) -> Iterator[tuple[tuple[int, int], ...]]:
+def _permuted(off: Array, leg: IntArray) -> Iterator[tuple[tuple[int, int], ...]]:
     """Yield legs of a view with those whose place their outlines take, a cycle at a time."""
     belongs = dict[int, int]()
     for j in np.unique(leg).tolist():
@@ -99,13 +99,15 @@ def _permuted(off: Array, leg: Array) -> Iterator[tuple[tuple[int, int], ...]]:
             if median[k] < _NEARER * median[j]:
                 belongs[j] = k
     while belongs:
-        first, cycle = next(iter(belongs)), list[tuple[int, int]]()
+        first, cycle = next(iter(belongs)), list[int]()
         j = first
-        while j in belongs:
-            cycle.append((j, belongs.pop(j)))
-            j = cycle[-1][1]
+        while j in belongs and j not in cycle:
+            cycle.append(j)
+            j = belongs[j]
         if j == first:
-            yield tuple(cycle)
+            yield tuple((j, belongs[j]) for j in cycle)
+        for done in cycle if j == first else [first]:
+            del belongs[done]
 
 
 def _in_words(

@@ -260,7 +260,7 @@ class Inliers:
     distance: Array
     angle: Array
     frames: Array  # frames estimated from the inliers
-    sigma: Array  # (2,): the scatter of the inliers, as of :class:`PoseNoise`
+    sigma: Array  # (2,): the scatter of the inliers, see :class:`PoseNoise`
 
 
 def find_inliers(measurements: ToolMeasurements, start: Array) -> Inliers:
