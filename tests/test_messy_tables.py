@@ -199,7 +199,7 @@ def test_points_beside_decimal_commas_are_what_makes_sizes_alike(tmp_path: Path)
 def test_numbers_are_joined_at_thousands_and_names_are_not(tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
     columns = [Column("image", "text"), Column("a [mm]"), Column("b"), Column("c")]
-    rows = ["001.002.003.jpg;1 234,5 mm;1'000;1", "192.168.100.200;1\u202f234 mm;-1.000.000;2"]
+    rows = ["001.002.003.jpg;1\u202f234,5 mm;1'000;1", "192.168.100.200;1\u202f234 mm;-1.000.000;2"]
     for name in ("1'234.jpg", "1 234", "+5.png", "7"):
         rows.append(f"{name};10 mm;5;3")
     remarks = ["Exported from readings.xlsx", "Measured by J.Smith", "see www.acme.com", "18 ok.x1"]

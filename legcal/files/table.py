@@ -45,7 +45,7 @@ _MAX_NAMED = 10  # maximum number of columns named in a sentence
 _TEXT = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")  # Windows-1252, without rare characters
 _COMMENTS = re.compile(r"\A(?:\s*#[^\n]*\n)+")  # above the headings
 _UNITS_BELOW = (*LENGTH, *ANGLE, "us", "s")  # units of a row below the headings
-_BLANK = " \u00a0\u2009\u202f"  # also that does not break a line, or is thin
+_BLANK = "\u00a0\u2009\u202f"  # that does not break a line, or is thin
 _WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)[\s{_BLANK}]*({'|'.join(_UNITS_BELOW)})", re.ASCII)
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
