@@ -12,21 +12,26 @@ import os
 import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from legcal.errors import LegcalError, UsageError
 
 _UNIONS = (Union, types.UnionType)
+_SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 _WORDS: dict[object, tuple[Any, str]] = {  # what may stand for a type, and what it is called
-    float: (numbers.Real, "a number"),
+    float: ((numbers.Real, Decimal), "a number"),
     int: (numbers.Integral, "a whole number"),
     bool: (bool, "True or False"),
     str: (str, "a text"),
     Path: (os.PathLike, "a path"),
     type(None): (type(None), "None"),
-    Sequence: (Sequence, "a list"),
+    Sequence: ((Sequence, np.ndarray), "a list"),
+    np.ndarray: ((Sequence, np.ndarray), "an array"),
     Mapping: (Mapping, "a mapping"),
     Callable: (Callable, "a function"),
 }
@@ -43,9 +48,11 @@ def with_arguments_in_words(function: Callable[..., Any], public: str) -> Callab
             raise
         except (TypeError, ValueError, AttributeError) as error:
             try:
-                given = inspect.signature(function).bind(*args, **kwargs).arguments
+                bound = inspect.signature(function).bind(*args, **kwargs)
             except TypeError:  # names the argument that is missing or not known
                 raise error from None
+            kinds = bound.signature.parameters
+            given = {k: v for k, v in bound.arguments.items() if kinds[k].kind not in _SEVERAL}
             check_arguments(f"{public}.{function.__name__}", _annotations(function, public), given)
             raise
 
@@ -81,6 +88,8 @@ def _annotations(function: Callable[..., Any], public: str) -> dict[str, Any]:
 def _fits(value: object, annotation: Any) -> bool:
     """Return whether a value may be of a type; whatever is not known fits."""
     origin, parts = get_origin(annotation), get_args(annotation)
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
     if origin in _UNIONS:
         return any(_fits(value, part) for part in parts)
     if origin is Literal:

@@ -153,6 +153,15 @@ MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
      [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
     (FLAT, {"Elapsed time [s]": ("121.5", "0", "60")}, 3,
      [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    # milliseconds, which are no date of the year 1796
+    (FLAT, {"time": ("1796011333345", "1796011212345", "1796011272345")}, 3,
+     [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    (FLAT, {"time": ("1000", "800", "900")}, 3,  # seconds, and no times of a day
+     [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    (FLAT, {"time": ("1002", "1000", "1001")}, 3,
+     [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
+    (("001.002.003.jpg", "1'234.jpg"), {"image": ("1'234.jpg", "001.002.003.jpg")}, 2,
+     [("1'234.jpg", 0), ("001.002.003.jpg", 1)]),
     (FLAT, {"time": ("10:02:00", "10:00")}, 2, [("IMG_11.JPG", 0), ("IMG_2.JPG", 1)]),
 ]  # fmt: skip
 

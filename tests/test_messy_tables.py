@@ -196,6 +196,24 @@ def test_points_beside_decimal_commas_are_what_makes_sizes_alike(tmp_path: Path)
     np.testing.assert_array_equal(table.numbers("abc"), expected)
 
 
+def test_numbers_are_joined_at_thousands_and_names_are_not(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    columns = [Column("image", "text"), Column("a [mm]"), Column("b"), Column("c")]
+    rows = ["001.002.003.jpg;1\u202f234,5 mm;1'000;1", "192.168.100.200;1\u202f234 mm;-1.000.000;2"]
+    for name in ("1'234.jpg", "1 234", "+5.png", "7"):
+        rows.append(f"{name};10 mm;5;3")
+    remarks = ["Exported from readings.xlsx", "Measured by J.Smith", "see www.acme.com", "18 ok.x1"]
+    path.write_text("\n".join(["image;a;b;c", *rows, *remarks]))
+    table = read_table(path, "table", "row", columns, reshape=lambda lines: lines)
+    assert table.text("image") == tuple(row.partition(";")[0] for row in rows)
+    expected = [[1234.5, 1000, 1], [1234, -1e6, 2], *[[10, 5, 3]] * 4]
+    np.testing.assert_array_equal(table.numbers(["a [mm]", "b", "c"]), expected)
+    path.write_text("note;a;b\n001.002.003.jpg;1;2\n1'234.jpg;1;2\n")
+    columns = [Column("note", "text"), Column("a"), Column("b")]
+    table = read_table(path, "table", "row", columns, reshape=lambda lines: lines)
+    assert table.text("note") == ("001.002.003.jpg", "1'234.jpg")
+
+
 def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
     joints: dict[str, list[tuple[float, float]]]

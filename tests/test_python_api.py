@@ -194,6 +194,13 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
         assert sentence in str(refused.value)
     with pytest.raises(TypeError, match="unexpected keyword argument 'hold_out'"):
         public.calibrate(folder, hold_out=0.2)
+    size = {"base_radius": 300, "platform_radius": 150, "min_length": 345, "max_length": 489}
+    made = public.new(family="hexapod", unit="mm", height=np.array(380.0), output=tmp_path, **size)
+    assert made.machine.n_legs == 6
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("legcal.descriptions.new_model.create_model", lambda *_, **__: 1 / "0")
+        with pytest.raises(TypeError, match="unsupported operand"):  # an error of our own
+            public.new(family="hexapod", unit="mm", height=380.0, output=tmp_path, **size)
     pose = np.asarray(machine.home.as_matrix(), dtype=np.float32).tolist()  # of no annotated type
     assert np.isfinite(legcal.inverse_kinematics(machine, pose)).all()
     assert pickle.loads(pickle.dumps(legcal.calibrate)) is legcal.calibrate

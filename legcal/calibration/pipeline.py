@@ -391,7 +391,7 @@ def _with_notes(
     """Return a refusal beside notes; encoders that stand still come first as its likely cause."""
     motors, q = legs_with_readings(dataset.machine.legs), dataset.measurements.q
     still = still_encoders(dataset.table_path, motors, q[:, list(dataset.machine.motors)])
-    causes = still if isinstance(error, NotIdentifiable) else []
+    causes = still if isinstance(error, NotIdentifiable | NotVisible | DidNotConverge) else []
     refusal = type(error)([*causes, *said])
     refusal.notes = tuple(note for note in notes if note not in causes)
     return refusal

@@ -30,6 +30,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 _NUMBER = re.compile(r"\d+")
 _EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
 _OF_DAY = re.compile(r"\d\d?:|(\d{4}|\d{6})$", re.ASCII)  # other numbers are no times of a day
+_DATE_DIGITS = 8  # of 20261123
 _SEED = 20020721
 DAY = 86400.0  # [s]
 
@@ -74,15 +75,34 @@ def seconds_in(text: str, day: float | None = None) -> float | None:
     """Return the time in a text [s] by the clock on the wall, None if there is none.
 
     It is written as ISO 8601, as EXIF does, as the time of a *day* [s] alone, or as a Unix time.
+    Of numbers, those of eight digits are dates if they can be.
     """
     text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
+    of_day = _seconds_of_day(text)
+    if day is not None and of_day is not None:
+        return day // DAY * DAY + of_day
     with suppress(ValueError):
-        return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
-    with suppress(ValueError):
-        if day is not None and _OF_DAY.match(text):
-            at = datetime.combine(date(1970, 1, 1), time.fromisoformat(text)).replace(tzinfo=UTC)
-            return day // DAY * DAY + at.timestamp()
+        if len(text) == _DATE_DIGITS or not is_number(text):
+            return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
     return unix_seconds(float(text)) if is_number(text) else None
+
+
+def seconds_of_column(texts: Sequence[str], day: float) -> list[float | None]:
+    """Return the times in the cells of a column, as :func:`seconds_in`.
+
+    Numbers are times of the *day* only where all of them can be: 0, 800, 1000 are seconds.
+    """
+    are_elapsed = any(is_number(text) and _seconds_of_day(text) is None for text in texts)
+    return [seconds_in(text, None if are_elapsed else day) for text in texts]
+
+
+def _seconds_of_day(text: str) -> float | None:
+    """Return the time in a text since midnight [s], None if it is no time of a day alone."""
+    with suppress(ValueError):
+        if _OF_DAY.match(text):
+            at = datetime.combine(date(1970, 1, 1), time.fromisoformat(text))
+            return at.replace(tzinfo=UTC).timestamp()
+    return None
 
 
 def unix_seconds(number: float) -> float | None:

@@ -15,15 +15,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from legcal.data.image_choice import DAY, seconds_in
+from legcal.data.image_choice import DAY, seconds_in, seconds_of_column
 from legcal.errors import Code, DatasetError, Place, Problem
-from legcal.files.reading import MAX_IMAGE, read_bytes
+from legcal.files.reading import FOREIGN_SUFFIXES, HEIC_SUFFIXES, MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, few, is_name
 from legcal.vision.image_file import (
     CONVERT,
     CONVERT_HEIC,
-    FOREIGN_SUFFIXES,
-    HEIC_SUFFIXES,
     image_suffixes,
     read_facts,
 )
@@ -424,7 +422,7 @@ def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
             "more; copy the files from the camera as they are, add a column image, or remove the "
             "column time to match rows and photographs in order."
         )
-    times = [seconds_in(row.time, taken[dated[0].name]) for row in rows]
+    times = seconds_of_column([row.time for row in rows], taken[dated[0].name])
     bad = [
         f"{row.where}, column time: the time could not be read: found {describe(row.time)}, needed "
         "one such as 2026-11-23 10:15:00; correct the cell."

@@ -133,7 +133,8 @@ class ReadingsSheet:
         self.unknown = [joint for joint in self._joints if not any(self.table.text(joint))]
         self._joints = tuple(x for x in self._joints if x not in self.unknown)
         self.motors = [leg for leg in self.motors if str(leg.prismatic) not in self.unknown]
-        self.table.need(self._joints, np.ones(len(self.table), dtype=np.bool_))
+        if may_be_unknown:
+            self.table.need(self._joints, np.ones(len(self.table), dtype=np.bool_))
         self.table.check()
 
     def readings(self, unit: str | None = None, *, lengths: bool = False) -> SheetReadings:

@@ -9,6 +9,11 @@ from typing import Any
 MAX_TEXT = 16_000_000  # bytes of a table, YAML or URDF: enough for the largest table of outlines
 MAX_DOCUMENT = 32_000_000  # bytes of a JSON document from legcal
 MAX_IMAGE = 256_000_000
+# Endings of photographs: read, read with pi-heif, and of other formats
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+FOREIGN_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".webp", ".gif", ".bmp", ".jp2", ".jxl",
+                    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")  # fmt: skip
 
 
 class TooLarge(OSError):

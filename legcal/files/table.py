@@ -28,6 +28,7 @@ import numpy as np
 
 from legcal.errors import HEADER, Code, DatasetError, Place, Problem
 from legcal.files.quantity import ANGLE, LENGTH
+from legcal.files.reading import FOREIGN_SUFFIXES, SUFFIXES
 from legcal.files.schema import (
     NAME_NEEDED,
     closest,
@@ -49,14 +50,14 @@ _WITH_UNIT = re.compile(rf"([-+]?\d*\.?\d+)[\s{_BLANK}]*({'|'.join(_UNITS_BELOW)
 _SEPARATOR = re.compile(r"\Asep=.\r?\n")
 _WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?(\s*[a-z]+)?", re.ASCII)
-# Thousands: beside blanks and apostrophes also commas before a point, and points before a comma
+# Thousands: beside blanks and apostrophes also commas before a point, and points before a comma;
+# only a unit may follow (001.002.003.jpg is a photograph)
 _GROUPED = re.compile(
-    rf"([-+−–]?\d{{1,3}})((?:[{_BLANK}'’]\d{{3}})+|(?:,\d{{3}})+(?=\.)|(?:\.\d{{3}})+(?=,)"
-    r"|(?:\.\d{3}){2,})([.,]\d+)?\D*"
+    rf"([-+−–]?[1-9]\d{{0,2}})((?:[{_BLANK}'’]\d{{3}})+|(?:,\d{{3}})+(?=\.)|(?:\.\d{{3}})+(?=,)"
+    rf"|(?:\.\d{{3}}){{2,}})([.,]\d+)?(?:\s*(?:{'|'.join(_UNITS_BELOW)}|[µμ]m|[\"″°]))?"
 )
 _WITH_POINT = re.compile(r"[-+]?\d*(\.\d*)+", re.ASCII)
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
-_FILE = re.compile(r"\.[A-Za-z]\w{1,4}$")  # an extension
 _RULE = re.compile(r"[:-]*-{3}[:-]*")
 _MARKED = re.compile(r"(?:[øØ⌀]\s*)?([−–+-]?)([.,]?\d[^\"″']*)([\"″]?)")
 _BAD_WORKBOOK = (zipfile.BadZipFile, KeyError, ValueError, OSError)
@@ -436,6 +437,7 @@ WORDS: dict[str, str] = {
     "": "of the at in der die das des von bei am de du la le au",
     **{letter: letter for letter in ("x", "y", "z", "a", "b", "p", "t")},
 }
+_NAMES = {"name", "number", "view", "image", "pose"}  # concepts of columns of names
 _CONCEPTS = {word: concept for concept, words in WORDS.items() for word in words.split()}
 _TOKEN = re.compile(r"\d+|[^\W\d_]+|#")
 _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]+)[\])]")
@@ -520,8 +522,7 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
     content = content_of(path, noun)
     workbook = _WORKBOOKS.get(content[:4])
     if loose and workbook:
-        sheet = _sheet(path, noun, content, workbook)
-        return [(number, list(map(_number_of_people, cells))) for number, cells in sheet]
+        return _with_numbers(_sheet(path, noun, content, workbook))
     try:
         text = _decoded(content, loose=loose)
         delimiter = _delimiter(text) if loose else ","
@@ -533,12 +534,9 @@ def _read_lines(path: Path, noun: str, *, loose: bool = False) -> Lines:
             skipinitialspace=delimiter == " ",
             strict=True,
         )
-        lines: Lines = []
-        for cells in reader:
-            cells = [cell.strip() for cell in cells]
-            if loose:
-                cells = [_number_of_people(cell) for cell in cells]
-            lines.append((reader.line_num, cells))
+        lines: Lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        if loose:
+            lines = _with_numbers(lines)
         if delimiter != ",":
             lines = _with_points(lines)
     except (UnicodeDecodeError, csv.Error) as error:
@@ -644,8 +642,8 @@ def _without_title(lines: Lines) -> Lines:
 
 
 def _is_remark(cell: str) -> bool:
-    """Return whether the only cell of a line is neither a number nor the name of a file."""
-    return not is_number(cell) and _FILE.search(cell) is None
+    """Return whether the only cell of a line is neither a number nor a photograph's name."""
+    return not is_number(cell) and not cell.lower().endswith(SUFFIXES + FOREIGN_SUFFIXES)
 
 
 def _with_units(lines: Lines) -> Lines:
@@ -710,6 +708,21 @@ def _has_decimal_commas(line: str) -> bool:
     return len(words) > 1 and bool(with_comma) and all(map(_COMMA.fullmatch, with_comma))
 
 
+def _with_numbers(lines: Lines) -> Lines:
+    """Return lines with numbers as computers write them, but for columns of names.
+
+    The headings are taken to be the first line of which more than half is filled.
+    """
+    widest = max((sum(map(bool, cells)) for _, cells in lines), default=0)
+    headings = next((cells for _, cells in lines if 2 * sum(map(bool, cells)) > widest), [])
+    found = [set(concepts(heading)) for heading in headings]
+    texts = {i for i, words in enumerate(found) if words and words <= _NAMES}
+    return [
+        (n, [x if i in texts else _number_of_people(x) for i, x in enumerate(cells)])
+        for n, cells in lines
+    ]
+
+
 def _number_of_people(cell: str) -> str:
     """Return a number as computers write it: minus, diameter and inch marks, without thousands.
 
@@ -741,7 +754,7 @@ def _with_points(lines: Lines) -> Lines:
     for cells_of in zip_longest(*(cells for _, cells in lines), fillvalue=""):
         column = list(cells_of)
         has_commas = any(map(_COMMA.fullmatch, column))
-        pointed = [cell for cell in column if _WITH_POINT.fullmatch(cell)]
+        pointed = {cell for cell in column if _WITH_POINT.fullmatch(cell)}
         if has_commas and all(map(_THOUSANDS.fullmatch, pointed)):
             joined = [cell.replace(".", "") if cell in pointed else cell for cell in column]
             column = min(joined, column, key=_range_of_sizes)

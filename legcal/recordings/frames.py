@@ -29,15 +29,13 @@ from legcal.data.image_choice import unix_seconds
 from legcal.data.photograph_matching import find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.reading import MAX_IMAGE, read_bytes
+from legcal.files.reading import HEIC_SUFFIXES, MAX_IMAGE, SUFFIXES, read_bytes
 from legcal.files.schema import describe
 from legcal.files.table import is_number
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.vision.image_file import (
     COPY_AGAIN,
-    HEIC_SUFFIXES,
-    SUFFIXES,
     BadImage,
     image_size,
     quiet_opencv,

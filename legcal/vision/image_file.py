@@ -32,7 +32,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from legcal.causes import Cause
 from legcal.errors import BadValue, Code, DatasetError, Place, Problem
-from legcal.files.reading import MAX_IMAGE, read_bytes
+from legcal.files.reading import HEIC_SUFFIXES, MAX_IMAGE, SUFFIXES, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names
 
@@ -48,7 +48,6 @@ _MOST_TEXT = 60  # maximum number of characters shown
 _STEPS_AT_50 = 3688.0
 
 
-HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"mif1", b"msf1")
 _REFUSALS = (ValueError, RuntimeError, EOFError, OSError, SyntaxError)  # errors of the package
 FILM_DIAGONAL = np.hypot(36.0, 24.0)  # [mm]: fields of view are compared along diagonals
@@ -315,9 +314,6 @@ MAX_SIDE, MAX_AREA = 30_000, 100_000_000  # [px] of an image or a camera; the la
 _SIDEWAYS = 5  # smallest EXIF orientation with exchanged width and height
 _STRIP = 256  # rows of an image converted to grey levels at a time
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-FOREIGN_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".webp", ".gif", ".bmp", ".jp2", ".jxl",
-                    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")  # fmt: skip
 CONVERT = (
     "write them as JPEG of quality 95 or more, or PNG, without turning or scaling them "
     "(magick mogrify -format jpg -quality 98 *.HEIC), or set the phone to the most compatible "
