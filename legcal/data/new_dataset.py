@@ -250,9 +250,11 @@ def plan_new_dataset(
     matching = match(rows, photographs, str(path))
     view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
     cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
-    sigma, sigma_notes = _sigmas(
-        options.encoder_sigma, sheet.motors, sheet_readings, MIN_SIGMA * machine.size
-    )
+    stated = options.encoder_sigma
+    if isinstance(stated, Mapping):
+        stated = {joint: x for joint, x in stated.items() if joint not in sheet.unknown}
+    least = MIN_SIGMA * machine.size
+    sigma, sigma_notes = _sigmas(stated, sheet.motors, sheet_readings, least)
     views_stated = any(row.view for row in rows)
     return NewDataset(
         machine=machine,
