@@ -183,22 +183,21 @@ def response(
 
     *changes* has (n, q, c) for factors by name.
     """
-    gradient, elements, _ = _gradients(problem, linear, changes)
-    kept = gradient[:-1]
-    if normal.tangent is not None:
-        kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, elements, optimize=True)
-        elements = np.swapaxes(normal.tangent.Z, 1, 2) @ elements
-    kept = kept - np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ elements, optimize=True)
+    kept, _, _ = _gradients(problem, linear, normal, changes)
     return -normal.moved_by(kept)
 
 
 def _gradients(
-    problem: EstimationProblem[S], linear: Linearization, columns: Mapping[str, Array]
+    problem: EstimationProblem[S],
+    linear: Linearization,
+    normal: NormalEquations,
+    columns: Mapping[str, Array],
 ) -> tuple[Array, Array, csc_array]:
     """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
 
-    For kept unknowns and fixed ones (n_kept + 1, c), and for elements (n_elements, d, c). Columns
-    are sparse: there may be thousands, each of which acts on few measurements.
+    For kept unknowns with elements at their minimum (n_kept, c), and for elements in the tangent
+    space of their constraints (n_elements, d, c). Columns are sparse: there may be thousands, each
+    of which acts on few measurements.
     """
     c = next(iter(columns.values())).shape[-1]
     kept = np.zeros((problem.n_kept + 1, c))
@@ -222,7 +221,12 @@ def _gradients(
             place = unknown.ravel(), measured.ravel()
             by = csc_array((rows.J_element.ravel(), place), (len(elements), n * q))
             elements += (by @ flat).toarray()
-    return kept, elements.reshape(problem.n_elements, problem.d_element, c), vstack(stacked, "csc")
+    following = _element_derivatives(normal).reshape(-1, problem.n_kept)
+    kept = kept[:-1] + following.T @ elements
+    of_elements = elements.reshape(problem.n_elements, problem.d_element, c)
+    if normal.tangent is not None:
+        of_elements = np.swapaxes(normal.tangent.Z, 1, 2) @ of_elements
+    return kept, of_elements, vstack(stacked, "csc")
 
 
 def restricted_log_likelihood(problem: EstimationProblem[S], minimum: Minimum[S]) -> float:
@@ -281,12 +285,8 @@ class Projected:
         columns: Mapping[str, Array],
     ) -> Projected:
         """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
-        kept, elements, stacked = _gradients(problem, linear, columns)
+        kept, elements, stacked = _gradients(problem, linear, normal, columns)
         c = stacked.shape[1]
-        following = _element_derivatives(normal).reshape(-1, problem.n_kept)
-        kept = kept[:-1] + following.T @ elements.reshape(-1, c)
-        if normal.tangent is not None:
-            elements = np.swapaxes(normal.tangent.Z, 1, 2) @ elements
         moved = normal.V_inverse @ elements
         gradient = np.concatenate([kept, elements.reshape(-1, c)])
         response = np.concatenate([normal.moved_by(kept), moved.reshape(-1, c)])
