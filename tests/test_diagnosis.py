@@ -15,9 +15,9 @@ from thinned import thinned
 
 from legcal import Dataset, calibrate, load_dataset, simulate
 from legcal.calibration.diagnosis import diagnosis
-from legcal.calibration.diagnosis.diagnosis import Diagnosis, diagnose
+from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.leg_names import _permuted
-from legcal.calibration.diagnosis.mistakes import Mistake, mistakes
+from legcal.calibration.diagnosis.mistakes import Diagnosis, Mistake, mistakes
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names

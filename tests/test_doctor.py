@@ -14,7 +14,7 @@ from simulated import simulated
 
 from legcal import doctor
 from legcal.calibration.detection import CHECKS, Examination, Finding
-from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 
 pytestmark = pytest.mark.usefixtures("without_remedies")
 

@@ -25,7 +25,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.board import needs_rough_cameras, rough_placement
-from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import (
     DiagnosisBlock,
     LeftOut,

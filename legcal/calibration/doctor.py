@@ -36,7 +36,8 @@ from legcal.calibration.detection import (
     views_to_click,
     write_detection,
 )
-from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, Diagnosis, diagnose, notes_beside
+from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, diagnose, notes_beside
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.parameter_choices import Choices

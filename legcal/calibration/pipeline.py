@@ -27,13 +27,9 @@ from typing import get_args
 import numpy as np
 
 from legcal.calibration.board import board_notes, rough_placement
-from legcal.calibration.diagnosis.diagnosis import (
-    Diagnosis,
-    agreement_with_zeros,
-    diagnose,
-    notes_beside,
-    wrong_names,
-)
+from legcal.calibration.diagnosis.diagnosis import agreement_with_zeros, diagnose, notes_beside
+from legcal.calibration.diagnosis.leg_names import exchanged_legs
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import (
@@ -479,7 +475,7 @@ def _wrong_names(estimate: Estimate) -> tuple[Diagnosis, ...]:
     seen = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
     cameras = [T.inv() if v in seen else None for v, T in enumerate(solution.T_camera_Rb)]
     A, B = (joints[m.pose] for joints in ends)
-    return wrong_names(solution.outlines, m, solution.legs, (A, B), cameras)
+    return exchanged_legs(solution.outlines, m, solution.legs, (A, B), cameras)
 
 
 def _leaves_out_many(estimate: Estimate) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import (
     AxisInLink,
     BoardPose,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from legcal.calibration.diagnosis.diagnosis import Diagnosis
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.doubts import (
     CAMERA,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
@@ -19,8 +19,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.board import observe_board
 from legcal.calibration.diagnosis.leg_names import exchanged_legs
 from legcal.calibration.diagnosis.mistakes import (
+    MIN_SHARE,
     TURNS,
     Assumed,
+    Diagnosis,
     Mistake,
     as_given,
     joints_of,
@@ -29,13 +31,9 @@ from legcal.calibration.diagnosis.mistakes import (
     moved_cameras,
     turned_images,
 )
-from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
 from legcal.errors import LegcalError
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.perception.agreement import (
     Agreement,
@@ -71,88 +69,12 @@ _SYMMETRIC = 0.03  # of the size of the machine, and the sine of angles
 _SAME = 0.03  # in the share of legs: no more than the lens makes of mirrored images
 _NEARLY = 0.8  # of the support of things as they are, near their cameras: others may suit better
 _ALIKE = 0.9  # of the best support: as good, where images do not tell them apart
-_MIN_SHARE = 0.5  # of the images, that agree then
 _MIN_GAIN, _SURE_GAIN = 0.1, 0.05  # in the share of legs that images show, on average
 _MIRROR_X, _MIRROR_Y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
 _MIN_SIGMAS = 2.5  # of its signed ranks: chance gains in some images and loses in others
 _PLAIN_GAIN, _FEW_SIGMAS = 0.3, 2.2  # of all of six images
 _LEAST_GAIN = 0.03  # where an opposite is worse: errors of the model make up for less
 _SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """The likely mistake of a session.
-
-    Attributes
-    ----------
-    kind : str
-        What it is in a few words: ``columns exchanged``, ``handedness``, ...
-    what : str
-        The same as a clause that names columns, views and legs.
-    same_as : tuple of str
-        Clauses of mistakes that images cannot distinguish from it: one of each kind, then more of
-        these kinds, the commoner first.
-    n_kinds : int
-        Number of these in the sentence.
-    mended : str
-        The correction, as a clause: "with the columns swapped".
-    images, before, after : int
-        Number of judged images, and of those that agree without and with the correction.
-    score : float
-        Fraction of the predicted legs that images show with the correction.
-    remedy : str
-        The remedy, as an imperative.
-    tests : tuple of str
-        Tests that distinguish it from the mistakes of ``same_as``.
-    """
-
-    kind: str
-    what: str
-    same_as: tuple[str, ...]
-    mended: str
-    images: int
-    before: int
-    after: int
-    score: float
-    remedy: str
-    tests: tuple[str, ...] = ()
-    n_kinds: int = 0
-
-    @property
-    def finding(self) -> str:
-        """The mistake and the number of images that agree, as a clause."""
-        more = len(self.same_as) - self.n_kinds
-        others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
-        others += f", or {more} similar mistake{'s' * (more > 1)}" * (more > 0)
-        rest = " (the other images may have a further problem)"
-        return (
-            f"{self.what}{others}: {self.mended}, {self.after} of {self.images} images agree"
-            f"{rest * (self.after < _MIN_SHARE * self.images)}, against {self.before} now"
-        )
-
-    @property
-    def remedies(self) -> str:
-        """What to do, and the tests that distinguish it from similar mistakes."""
-        tell = f". To distinguish them, {', or '.join(self.tests)}" if self.tests else ""
-        return f"{self.remedy}{tell}"
-
-    @property
-    def sentence(self) -> str:
-        """The diagnosis as a message."""
-        return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
-
-    def document(self) -> DiagnosisBlock:
-        """Return the entry of documents."""
-        return DiagnosisBlock(
-            kind=self.kind,
-            what=self.what,
-            same_as=list(self.same_as),
-            images_before=self.before,
-            images_after=self.after,
-            score=self.score,
-            remedy=self.remedy,
-        )
 
 
 def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
@@ -186,30 +108,6 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
     first = [what for what, _ in likeliest]
     return (_diagnosis(first, likeliest[0][1], judge.own, by_hints=by_hints),)
-
-
-def wrong_names(
-    outlines: Outlines,
-    measurements: Measurements,
-    legs: Sequence[Leg],
-    ends: tuple[Array, Array],
-    cameras: Sequence[RigidTransform | None],
-) -> tuple[Diagnosis, ...]:
-    """Return given outlines that name other legs, see :func:`exchanged_legs`."""
-    return tuple(
-        Diagnosis(
-            kind="legs exchanged",
-            what=one.what,
-            same_as=(),
-            mended="with the names corrected",
-            images=one.images,
-            before=one.before,
-            after=one.after,
-            score=one.score,
-            remedy=one.remedy,
-        )
-        for one in exchanged_legs(outlines, measurements, legs, ends, cameras)
-    )
 
 
 def agreement_with_zeros(data: OrderedDataset, zeros: Sequence[Mapping[str, float]]) -> list[float]:
@@ -299,7 +197,7 @@ class _Judge:
                 cameras |= group.cameras(one.cameras[0])
         ends = self.given.joints(range(m.n_rows))
         of_views = [cameras.get(v) for v in range(len(m.views))]
-        return wrong_names(self.data.photographs.keep, m, machine.legs, ends, of_views)
+        return exchanged_legs(self.data.photographs.keep, m, machine.legs, ends, of_views)
 
     def in_some_images(self, tried: Sequence[Mistake]) -> list[Mistake]:
         """Return mistakes in the readings of images that follow each other in the file.
@@ -700,7 +598,7 @@ def _explains(one: Agreement, own: Agreement) -> bool:
         return False
     changed = gain != 0.0
     size, sigmas = float(gain[changed].mean()), _signed_ranks(gain)
-    if np.mean(one.agrees[changed]) < _MIN_SHARE:  # images show little, whatever is true
+    if np.mean(one.agrees[changed]) < MIN_SHARE:  # images show little, whatever is true
         # The images of one view are too few for what is sure: they gain plainly, nearly all.
         least = _MIN_SIGMAS if size >= _PLAIN_GAIN else _SURE_SIGMAS
         return size >= _MIN_GAIN and sigmas >= least

@@ -6,11 +6,11 @@ Where the legs and a camera are known, nearly, it is seen which leg each outline
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, along_legs
 from legcal.files.schema import few
@@ -22,24 +22,13 @@ _NEARER = 0.2  # of the distance from the leg that they name: to the one that th
 _MIN_OUTLINES = 4  # of each leg
 
 
-class WrongNames(NamedTuple):
-    """Legs of some views whose outlines lie at each other's place."""
-
-    what: str  # this and the remedy are clauses, as in a Diagnosis
-    remedy: str
-    images: int  # that show them
-    before: int  # with their outlines nearer to the legs that they name
-    after: int
-    score: float  # share of the outlines that are nearer to others
-
-
 def exchanged_legs(
     outlines: Outlines,
     measurements: Measurements,
     legs: Sequence[Leg],
     ends: tuple[Array, Array],
     cameras: Sequence[RigidTransform | None],
-) -> list[WrongNames]:
+) -> tuple[Diagnosis, ...]:
     """Return legs whose outlines lie at each other's place in views.
 
     Parameters
@@ -72,7 +61,7 @@ def exchanged_legs(
     for v in range(len(cameras)):
         for names in _permuted(off[at == v], o.leg[at == v]):
             found.setdefault(names, []).append(v)
-    return [_in_words(measurements, legs, o, off, *one) for one in found.items()]
+    return tuple(_diagnosis(measurements, legs, o, off, *one) for one in found.items())
 
 
 def _distances(rays: Array, A: Array, B: Array, radius: Array) -> Array:
@@ -110,15 +99,15 @@ def _permuted(off: Array, leg: IntArray) -> Iterator[tuple[tuple[int, int], ...]
             del belongs[done]
 
 
-def _in_words(
+def _diagnosis(
     m: Measurements,
     legs: Sequence[Leg],
     o: Outlines,
     off: Array,
     names: tuple[tuple[int, int], ...],
     views: Sequence[int],
-) -> WrongNames:
-    """Return outlines that name other legs in some views, in words."""
+) -> Diagnosis:
+    """Return the diagnosis of outlines that name other legs in some views."""
     renamed = dict(names)
     of = np.flatnonzero(np.isin(m.view[o.row], views) & np.isin(o.leg, list(renamed)))
     own = off[of, o.leg[of]]
@@ -132,11 +121,14 @@ def _in_words(
     else:
         pairs = [f"{legs[j].name} those of {legs[k].name}" for j, k in names]
         what, remedy = f"{few(named)} name other legs ({few(pairs)})", "correct these names"
-    return WrongNames(
-        f"the outlines of {what} in {where}",
-        f"{remedy} there (columns leg and part of observations.csv)",
-        len(rows),
-        int(np.sum(nearer <= 0.0)),
-        int(np.sum(nearer > 0.0)),
-        float(np.mean(other < own)),
+    return Diagnosis(
+        kind="legs exchanged",
+        what=f"the outlines of {what} in {where}",
+        same_as=(),
+        mended="with the names corrected",
+        images=len(rows),
+        before=int(np.sum(nearer <= 0.0)),
+        after=int(np.sum(nearer > 0.0)),
+        score=float(np.mean(other < own)),
+        remedy=f"{remedy} there (columns leg and part of observations.csv)",
     )

@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.image_tables import inverse
 from legcal.data.measurements import row_names
@@ -22,6 +23,7 @@ from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, readings_at
 from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
 
+MIN_SHARE = 0.5  # of the images, that agree with a mistake corrected
 _STEP = 1.0 / 16.0  # smallest step from home to readings, relative to the way
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 _MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -98,6 +100,81 @@ class Mistake:
     # Hypothesis with the opposite correction, which has to agree worse with the images than the
     # data as given. None if it may agree as well.
     opposite: Assumed | None = None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The likely mistake of a session.
+
+    Attributes
+    ----------
+    kind : str
+        What it is in a few words: ``columns exchanged``, ``handedness``, ...
+    what : str
+        The same as a clause that names columns, views and legs.
+    same_as : tuple of str
+        Clauses of mistakes that images cannot distinguish from it: one of each kind, then more of
+        these kinds, the commoner first.
+    n_kinds : int
+        Number of these in the sentence.
+    mended : str
+        The correction, as a clause: "with the columns swapped".
+    images, before, after : int
+        Number of judged images, and of those that agree without and with the correction.
+    score : float
+        Fraction of the predicted legs that images show with the correction.
+    remedy : str
+        The remedy, as an imperative.
+    tests : tuple of str
+        Tests that distinguish it from the mistakes of ``same_as``.
+    """
+
+    kind: str
+    what: str
+    same_as: tuple[str, ...]
+    mended: str
+    images: int
+    before: int
+    after: int
+    score: float
+    remedy: str
+    tests: tuple[str, ...] = ()
+    n_kinds: int = 0
+
+    @property
+    def finding(self) -> str:
+        """The mistake and the number of images that agree, as a clause."""
+        more = len(self.same_as) - self.n_kinds
+        others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
+        others += f", or {more} similar mistake{'s' * (more > 1)}" * (more > 0)
+        rest = " (the other images may have a further problem)"
+        return (
+            f"{self.what}{others}: {self.mended}, {self.after} of {self.images} images agree"
+            f"{rest * (self.after < MIN_SHARE * self.images)}, against {self.before} now"
+        )
+
+    @property
+    def remedies(self) -> str:
+        """What to do, and the tests that distinguish it from similar mistakes."""
+        tell = f". To distinguish them, {', or '.join(self.tests)}" if self.tests else ""
+        return f"{self.remedy}{tell}"
+
+    @property
+    def sentence(self) -> str:
+        """The diagnosis as a message."""
+        return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
+
+    def document(self) -> DiagnosisBlock:
+        """Return the entry of documents."""
+        return DiagnosisBlock(
+            kind=self.kind,
+            what=self.what,
+            same_as=list(self.same_as),
+            images_before=self.before,
+            images_after=self.after,
+            score=self.score,
+            remedy=self.remedy,
+        )
 
 
 def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:
