@@ -4,9 +4,11 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from fit_sessions import MachineSession, body_edges, machine_session
 from machines import ROOT
 from simulated import PLACES, settings, small_camera
@@ -21,9 +23,10 @@ from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.outlines import Outlines, no_outlines
 from legcal.data.reasons import Reason
 from legcal.files.motions import MotionEntry
+from legcal.machine.inspection import machine_document
 from legcal.machine.parameters import geometries, vector_of
-from legcal.machine.shapes import PlacedOccluders
-from legcal.perception.body_edges import bodies_in_view, bodies_of, edges_of_body
+from legcal.machine.shapes import SECTIONS, PlacedOccluders, bodies_of
+from legcal.perception.body_edges import bodies_in_view, edges_of_body
 from legcal.perception.photographs import nominal_placement
 from legcal.simulation.cameras import mild_lens, read_lens
 from legcal.simulation.settings import Level
@@ -144,6 +147,35 @@ def with_bodies(tmp_path_factory: pytest.TempPathFactory) -> Path:
         file = folder / kind / f"hexapod.{'urdf' if content else 'yaml'}"
         file.write_text(content or (ROOT / "models/hexapod.yaml").read_text())
     return folder / "models/hexapod.yaml"
+
+
+def test_the_part_of_a_mesh_that_has_one_section_is_a_body(with_bodies: Path) -> None:
+    """An extrusion with a groove, an end plate and a motor beside is the body that a box is."""
+    parts = [
+        trimesh.creation.box(size).apply_translation(at)
+        for size, at in (
+            ((0.026, 0.030, 0.110), (-0.002, 0.0, 0.0)),
+            ((0.004, 0.012, 0.110), (0.013, 0.009, 0.0)),
+            ((0.004, 0.012, 0.110), (0.013, -0.009, 0.0)),
+            ((0.036, 0.036, 0.004), (0.0, 0.0, 0.053)),
+        )
+    ]
+    parts.append(trimesh.creation.cylinder(0.012, 0.02).apply_translation((0.03, 0.0, -0.045)))
+    mesh: Any = trimesh.util.concatenate(parts)
+    mesh.export(with_bodies.parent / "body.stl")
+    drawn = (with_bodies.parent.parent / "urdf/hexapod.urdf").read_text()
+    first, others = drawn.split('<link name="leg2_', 1)
+    first = first.replace('<box size="0.03 0.03 0.11"/>', '<mesh filename="body.stl"/>')
+    (with_bodies.parent / "mesh.urdf").write_text(f'{first}<link name="leg2_{others}')
+    text = with_bodies.read_text().replace("../urdf/hexapod.urdf", "mesh.urdf")
+    (with_bodies.parent / "mesh.yaml").write_text(text)
+    legs = machine_document(load_mechanism(with_bodies.parent / "mesh.yaml"))["legs"]
+    lengths = [[body["length"] for body in leg["bodies"]] for leg in legs]
+    assert lengths[0] == [pytest.approx(0.11 - 0.004 - 0.02, abs=2 * 0.11 / SECTIONS)]
+    assert lengths[1:] == [[pytest.approx(0.11)]] * 5
+    machine = load_mechanism(with_bodies.parent / "mesh.yaml")
+    (body,), (box,) = bodies_of(machine.occluders, 6)[:2]
+    assert body.radius == pytest.approx(box.radius, rel=1e-3)
 
 
 def test_a_leg_with_a_body_alone_is_identified_and_calibrated(

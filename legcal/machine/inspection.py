@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -14,8 +15,9 @@ from legcal.geometry.types import Array
 from legcal.machine.closing import LOOSE, dimensionless, project_pose, singularity
 from legcal.machine.files import LegcalBlock, motor_entries
 from legcal.machine.home import home_reading_in_words, legs_outside
-from legcal.machine.leg import JointType, Leg, LegKind
+from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
+from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import ties_in_words
 from legcal.machine.topology import level_rotation
 
@@ -68,6 +70,13 @@ class CylinderBlock(Document):
     radius: Number
 
 
+class BodyBlock(Document):
+    """A body of a leg whose edges are measured: its link, and its length [m]."""
+
+    link: str
+    length: Number
+
+
 class InspectedLeg(SparseDocument):
     """A leg as classified."""
 
@@ -85,6 +94,7 @@ class InspectedLeg(SparseDocument):
     platform_axis: Triple | None
     twist: Number | None  # [rad]
     cylinders: list[CylinderBlock]
+    bodies: list[BodyBlock] | None = None  # omitted if there are none
     actuator: str | None = None  # joint of the motor that moves A; omitted if A is fixed
 
 
@@ -113,6 +123,7 @@ def machine_document(machine: Machine) -> dict[str, Any]:
     kinds = [leg.kind for leg in machine.legs]
     readings = readings_at(machine, machine.home).tolist()
     stated = motor_entries(machine.actuators)
+    bodies = bodies_of(machine.occluders, machine.n_legs)
     actuators = dict[str, InspectedActuator]()
     for a in machine.actuators:
         document = a.document() | stated.get(a.joint, {})
@@ -132,13 +143,13 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         idle_spins=sum(leg.idle_spins for leg in machine.legs),
         base_frame=[machine.leg_names[j] for j in machine.frame_legs],
         home=Pose.of(machine.home),
-        legs=[_leg(leg, q) for leg, q in zip(machine.legs, readings, strict=True)],
+        legs=[_leg(*one) for one in zip(machine.legs, readings, bodies, strict=True)],
         actuators=actuators or None,
         diagnostics=list(machine.diagnostics),
     ).document()
 
 
-def _leg(leg: Leg, q_home: float) -> InspectedLeg:
+def _leg(leg: Leg, q_home: float, bodies: Sequence[Cylinder]) -> InspectedLeg:
     has_travel = leg.has_value and bool(np.isfinite(leg.travel).all())
     return InspectedLeg(
         name=leg.name,
@@ -155,6 +166,7 @@ def _leg(leg: Leg, q_home: float) -> InspectedLeg:
         platform_axis=None if leg.platform_axis is None else leg.platform_axis.tolist(),
         twist=leg.twist,
         cylinders=[CylinderBlock(link=c.link, radius=c.radius) for c in leg.cylinders],
+        bodies=[BodyBlock(link=b.link, length=b.end - b.start) for b in bodies] or None,
         actuator=None if leg.actuator is None else leg.actuator.joint,
     )
 
@@ -283,8 +295,10 @@ def _level_note(machine: Machine, q: Array) -> list[str]:
 
 
 def _unseen_notes(machine: Machine) -> list[str]:
-    """Return notes on legs without visible cylinder."""
-    unseen = [leg.name for leg in machine.legs if not leg.cylinders]
+    """Return notes on legs without visible cylinder or body."""
+    bodies = bodies_of(machine.occluders, machine.n_legs)
+    of_legs = zip(machine.legs, bodies, strict=True)
+    unseen = [leg.name for leg, around in of_legs if not leg.cylinders and not around]
     if not unseen:
         return []
     if len(unseen) == 1:

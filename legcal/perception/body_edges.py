@@ -36,13 +36,12 @@ from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
-from legcal.machine.shapes import Occluder, PlacedOccluders
+from legcal.machine.shapes import Occluder, PlacedOccluders, bodies_of
 from legcal.perception.blocks import BlockLine, fit_lines
 from legcal.perception.photographs import Photographs
 from legcal.perception.placement import (
     Placement,
     Search,
-    housings_of_legs,
     predict_legs_and_arms,
 )
 from legcal.perception.profiles import Samples
@@ -82,11 +81,6 @@ def measure_body_edges(
         tables.append(edges)
         report(stage, n + 1, len(rows))
     return join_outlines(tables)
-
-
-def bodies_of(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cylinder]]:
-    """Return the long bodies around the axis of each leg, as cylinders that look as thick."""
-    return housings_of_legs([o for o in occluders if o.triangles is None], n_legs)
 
 
 def has_bodies(machine: Machine) -> bool:

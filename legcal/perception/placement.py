@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from legcal.causes import Cause, by_cause
@@ -22,7 +21,7 @@ from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
 from legcal.machine.rods import arms_at
-from legcal.machine.shapes import LegHalf, Occluder
+from legcal.machine.shapes import Occluder, bodies_of
 from legcal.perception.candidate_pairs import (
     CandidatePairs,
     Still,
@@ -42,8 +41,6 @@ Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that 
 
 # Of joint centres that the nominal model and its platform pose predict, of the mean leg length
 PREDICTED_JOINT_ERROR = 0.01
-# Of solids around legs by which these are recognised: distance of their axes, length [radii]
-HOUSING_OFF, HOUSING_LENGTH = 0.4, 4.0
 NEAR_IMAGES = 6  # images of a group that are searched first where a rough pose is given
 
 
@@ -117,31 +114,9 @@ class Search:
 
     @cached_property
     def shapes(self) -> list[tuple[Cylinder, ...]]:
-        """The cylinders by which each leg is recognised, with housings as such."""
-        housings = housings_of_legs(self.occluders, self.n_legs)
-        return [(*own, *around) for own, around in zip(self.cylinders, housings, strict=True)]
-
-
-def housings_of_legs(occluders: Sequence[Occluder], n_legs: int) -> list[list[Cylinder]]:
-    """Return long solids around the axis of each leg as cylinders that look as thick.
-
-    A convex solid is as wide as its circumference over pi, in the mean of all directions from
-    which it is seen; a square one differs from that by up to 21 %.
-    """
-    housings: list[list[Cylinder]] = [[] for _ in range(n_legs)]
-    for occluder in occluders:
-        half = occluder.carrier
-        if not isinstance(half, LegHalf):
-            continue
-        across, along = occluder.corners[:, :2], occluder.corners[:, 2]
-        start, end = float(along.min()), float(along.max())
-        hull = across[ConvexHull(across).vertices]
-        around = float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
-        radius = around / (2.0 * np.pi)
-        off = float(np.linalg.norm(hull.mean(axis=0)))
-        if off <= HOUSING_OFF * radius and end - start >= HOUSING_LENGTH * radius:
-            housings[half.leg].append(Cylinder(occluder.link, radius, half.side, start, end))
-    return housings
+        """The cylinders by which each leg is recognised, with bodies as such."""
+        bodies = bodies_of(self.occluders, self.n_legs)
+        return [(*own, *around) for own, around in zip(self.cylinders, bodies, strict=True)]
 
 
 def sensor_extent(camera: Camera) -> Array:

@@ -122,6 +122,7 @@ def inspect_table(description: dict[str, Any]) -> Report:
         table(*columns_of_axes, rows=axes) if axes else None,
         [
             _home(description["home"]),
+            *_bodies(legs),
             Text(legend, style="dim"),
             *(f"note: {note}" for note in description["diagnostics"]),
         ],
@@ -181,6 +182,18 @@ def _radii(leg: dict[str, Any]) -> str:
     """Return the different radii of a leg in millimetres."""
     rounded = [round(1e3 * cylinder["radius"], 2) for cylinder in leg["cylinders"]]
     return ", ".join(dict.fromkeys(f"{radius:g}" for radius in rounded))
+
+
+def _bodies(legs: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a line on bodies that are measured by their edges, for each length."""
+    legs_of: dict[str, list[str]] = {}
+    for leg in legs:
+        for body in leg.get("bodies", ()):
+            legs_of.setdefault(f"{1e3 * body['length']:.0f} mm", []).append(leg["name"])
+    return [
+        f"Edges are measured on bodies of {length}: {', '.join(names)}."
+        for length, names in legs_of.items()
+    ]
 
 
 def _length_at(leg: dict[str, Any], q: float) -> float:

@@ -66,6 +66,7 @@ from legcal.machine.parameters import (
     sparse_basis,
     split_by_motion,
 )
+from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import ties_in_words
 from legcal.paper.conditions import (
     Condition,
@@ -73,7 +74,6 @@ from legcal.paper.conditions import (
     three_legs_at_once,
     two_directions,
 )
-from legcal.perception.body_edges import bodies_of
 
 _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction

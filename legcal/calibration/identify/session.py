@@ -54,9 +54,9 @@ from legcal.machine.rods import (
     actuators_of,
     ends_at_poses,
 )
-from legcal.machine.shapes import Occluder
+from legcal.machine.shapes import Occluder, bodies_of
 from legcal.machine.ties import by_step, independent, machine_ties, on_ties
-from legcal.perception.body_edges import bodies_of, predicted_edges
+from legcal.perception.body_edges import predicted_edges
 from legcal.vision.board import Board, FixedBoard, facing_board
 from legcal.vision.camera import sample_camera
 from legcal.vision.visibility import Bodies, visible_parts
