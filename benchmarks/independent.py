@@ -14,6 +14,7 @@ it lies there or otherwise:
     jpeg60, jpeg85   none, with photographs saved again with that quality
     gamma      none, with the gamma of the camera left to be estimated
     radii      none, with the radii of the legs fixed
+    shaken     none, with photographs by cameras that turn by 1 px from image to image (seed 1)
     clicks     none, with landmarks.csv: the true joints in one picture of each view, as far as they
                are inside, with 3 px of noise (seed 1); where these have the cameras is printed
 
@@ -44,7 +45,7 @@ import cv2
 import numpy as np
 import yaml
 from real_cameras import normalised_square
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import LegcalError, calibrate, load_dataset, load_mechanism
 from legcal.calibration.doubts import width_counts
@@ -55,8 +56,9 @@ from legcal.geometry.motions import components, pose_distance
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
 
-VARIANTS = "none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii", "clicks"
+VARIANTS = "none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii", "shaken", "clicks"
 CLICK_PX = 3.0  # noise of clicks
+SHAKE_PX = 1.0  # of a camera that does not stand still
 OF_RADIUS = 0.3  # part of a radius within which a part is the rod whose contours are known
 VISIBLE = 0.5  # share of a leg above which it ought to be used
 HEADER = (
@@ -115,6 +117,8 @@ def varied(folder: Path, variant: str, copy: Path) -> None:
             view.pop("T_base_camera", None)
             view.pop("legs", None)
         file.write_text(yaml.safe_dump(content, sort_keys=False))
+    if variant == "shaken":
+        shake(copy)
     if variant == "clicks":
         click_joints(copy, folder.with_name(folder.name + "-truth"))
     if variant == "half":
@@ -139,6 +143,23 @@ def varied(folder: Path, variant: str, copy: Path) -> None:
             cv2.imwrite(str(again), picture, quality)
             text = text.replace(file.name, again.name)
         table.write_text(text)
+
+
+def shake(folder: Path) -> None:
+    """Turn the camera of each photograph about a random axis, by a pixel or so."""
+    dataset, rng = load_dataset(folder, check_images=False), np.random.default_rng(1)
+    for row in range(dataset.measurements.n_rows):
+        file = dataset.image_path(row)
+        camera = dataset.measurements.views[dataset.measurements.view[row]].camera
+        picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if file is None or picture is None:
+            raise SystemExit(f"{file} could not be read")
+        turn = Rotation.from_rotvec(SHAKE_PX / camera.K[0, 0] * rng.normal(size=3))
+        H = camera.K @ turn.as_matrix() @ np.linalg.inv(camera.K)
+        size = picture.shape[1], picture.shape[0]
+        flags = cv2.INTER_LANCZOS4
+        turned = cv2.warpPerspective(picture, H, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        cv2.imwrite(str(file), turned, [cv2.IMWRITE_JPEG_QUALITY, 95])
 
 
 def click_joints(folder: Path, truth: Path) -> None:

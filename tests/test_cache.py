@@ -27,6 +27,7 @@ from legcal.data.outlines import Outlines, join_outlines, write_observations
 from legcal.errors import DatasetError
 from legcal.geometry.types import BoolArray
 from legcal.perception.photographs import detection_settings
+from legcal.vision.image_file import Move
 
 __all__ = ["folder"]
 
@@ -171,6 +172,14 @@ def test_every_change_of_the_dataset_makes_stored_outlines_stale(
     plan = _plan(folder)
     assert plan.detect.tolist() == list(ALL)
     assert len(plan.keep) == 0
+
+
+def test_moves_of_cameras_are_kept_with_the_outlines(folder: Folder) -> None:
+    dataset = load_dataset(folder.path)
+    moves = {dataset.measurements.image[1]: Move(0.5, -0.25, 1e-4, 0.0, 0.0, 1e-7)}
+    current = fingerprint(dataset, SETTINGS)
+    store_outlines(replace(dataset, moves=moves), _hexapod_outlines(), current, _mask(()))
+    assert _plan(folder).moves == moves
 
 
 def test_settings_model_and_version_make_them_stale(

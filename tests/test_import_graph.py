@@ -26,8 +26,8 @@ data: cache corners dataset dataset_file image_choice image_tables landmarks mea
     reasons
 recordings: frames importing
 estimation: clusters loss problem solver uncertainty variances
-perception: agreement board_adjustment board_corners body_edges camera_search candidate_pairs
-    diagnostics free_poses image_quality outline overlays photographs placement
+perception: agreement alignment board_adjustment board_corners body_edges camera_search
+    candidate_pairs diagnostics free_poses image_quality outline overlays photographs placement
 paper: conditions criteria four_steps unknowns
 calibration: camera_calibration.calibration camera_calibration.document
     camera_calibration.projection detection doctor documents evaluation identify.identifiability

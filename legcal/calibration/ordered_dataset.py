@@ -30,6 +30,7 @@ from legcal.data.image_tables import (
 from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, images_in_words, row_names
 from legcal.data.outlines import Outlines
+from legcal.data.photograph_notes import notes_on_moves
 from legcal.errors import DatasetError
 from legcal.files.schema import few
 from legcal.geometry.motions import components, product
@@ -41,6 +42,7 @@ from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.parameters import geometries
 from legcal.machine.redundancy import Contradiction, contradictions
 from legcal.paper.criteria import Criteria
+from legcal.perception.alignment import camera_moves
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs
 from legcal.progress import Report
@@ -223,12 +225,12 @@ def order_dataset(
 
     Outlines stored by an earlier run are used if they have this fingerprint.
     """
-    names = dataset.machine.leg_names
+    names, plan = dataset.machine.leg_names, plan_dataset(dataset, fingerprint)
     order = canonical_order(dataset.measurements, names)
     return OrderedDataset(
-        dataset=dataset,
+        dataset=_with_moves(dataset, plan, pool, progress),
         order=order,
-        plan=plan_dataset(dataset, fingerprint),
+        plan=plan,
         pool=pool,
         progress=progress,
         machine=dataset.machine.with_leg_order([names[leg] for leg in order.legs]),
@@ -236,6 +238,17 @@ def order_dataset(
         rows=np.arange(dataset.measurements.n_rows),
         left_out=() if left_out is None else np.flatnonzero(left_out[order.rows]).tolist(),
     )
+
+
+def _with_moves(dataset: Dataset, plan: DetectionPlan, pool: Run, progress: Report) -> Dataset:
+    """Return a dataset that reads images as if each camera had stood still between them."""
+    m, moves = dataset.measurements, plan.moves
+    if len(plan.detect):
+        load = dataset.image_reader(range(m.n_rows))
+        found = camera_moves(load, m, plan.detect.tolist(), pool, progress)
+        moves = {m.image[row]: move for row, move in found.items()}
+    notes = (*dataset.file_notes, *notes_on_moves(m, moves))
+    return replace(dataset, moves=moves, file_notes=notes) if moves else dataset
 
 
 def nominal_poses(

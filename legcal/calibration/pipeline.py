@@ -218,6 +218,7 @@ def calibrate(
         use = key if use_cache else ""
         data = order_dataset(dataset, pool, report, fingerprint=use, left_out=left_out)
         options = Options(choices, None if only else criteria)
+        dataset = data.dataset
         estimate, turned = estimate_teeth(data, fitted, options)
     cache_notes = _store_outlines(data, estimate, key)
     prediction = _compare_held_out(data, estimate, held_out) if len(held_out) else None

@@ -9,11 +9,11 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
 from legcal.data.image_tables import canonical_order, reorder_measurements
@@ -31,6 +31,7 @@ from legcal.files.schema import FileSchema, few
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.version import __version__
 from legcal.vision.board import board_document
+from legcal.vision.image_file import Move
 
 FORMAT = 1
 _INCOMPLETE = "incomplete"  # the fingerprint while the table is being written: it matches nothing
@@ -44,6 +45,7 @@ class CacheEntry(FileSchema):
     given: list[tuple[str, str]]  # images with outlines from the user; they are never detected
     notes: tuple[str, ...] = ()  # notes on the images
     outlines: int = 0  # rows of the table; a table with fewer rows was changed
+    moves: dict[str, Move] = Field(default_factory=dict)  # of images, by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class DetectionPlan:
     given: BoolArray  # (n_rows,) rows with outlines from the user
     notes: tuple[str, ...] = ()  # notes on the images from the earlier detection
     is_cached: bool = False  # whether all outlines come from an earlier run
+    moves: Mapping[str, Move] = field(default_factory=dict)  # of images, found by the earlier run
 
 
 def plan_detection(
@@ -96,7 +99,7 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     plan = plan_detection(dataset.observations, has_image, recorded, current, from_user)
     if entry is None or recorded != current or len(plan.detect):
         return plan
-    return replace(plan, notes=entry.notes, is_cached=True)
+    return replace(plan, notes=entry.notes, is_cached=True, moves=entry.moves)
 
 
 def note_on_missing_photographs(dataset: Dataset) -> list[str]:
@@ -206,7 +209,7 @@ def store_outlines(
         "given": sorted(list(name) for name, is_given in names if is_given),
         "notes": list(notes),
         "outlines": len(outlines),
-    }
+    } | ({"moves": dict(dataset.moves)} if dataset.moves else {})
     path = dataset.folder / OBSERVATIONS_NAME
     try:
         _write_entry(dataset.folder, entry)

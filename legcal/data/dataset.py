@@ -58,7 +58,7 @@ from legcal.machine.model import Machine
 from legcal.vision.board import FixedBoard, parse_boards
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
-from legcal.vision.image_file import Grey, ImageFacts, decode_image, inspect_image
+from legcal.vision.image_file import Grey, ImageFacts, Move, decode_image, inspect_image
 
 CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
@@ -94,6 +94,8 @@ class Dataset:
     # Metadata of the image files that were inspected, by name
     facts: Mapping[str, ImageFacts] = field(default_factory=dict)
     file_notes: tuple[str, ...] = ()  # oddities in these files
+    # Images that a camera took which did not stand still, by name: they are read as if it had
+    moves: Mapping[str, Move] = field(default_factory=dict)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -116,6 +118,7 @@ class Dataset:
             tuple(None if path is None else path.absolute() for path in map(self.image_path, rows)),
             tuple(m.views[m.view[row]].camera for row in rows),
             tuple(map(self.where, rows)),
+            tuple(self.moves.get(m.image[row]) for row in rows),
         )
 
     def where(self, row: int) -> Place:
@@ -130,6 +133,7 @@ class ImageReader:
     paths: tuple[Path | None, ...]  # the files, absolute; None where a row has no image
     cameras: tuple[Camera, ...]  # the camera of each image
     places: tuple[Place, ...]  # where each image is named
+    moves: tuple[Move | None, ...]  # of each image, to be undone
 
     def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
@@ -145,7 +149,9 @@ class ImageReader:
                     *self.places[k],
                 )
             )
-        return _decoded(path, self.cameras[k], self.places[k]).astype(np.float32)
+        grey = _decoded(path, self.cameras[k], self.places[k]).astype(np.float32)
+        move = self.moves[k]
+        return grey if move is None else move.undone(grey)
 
 
 _Decoded = NDArray[np.uint8] | Grey

@@ -7,6 +7,7 @@ not compared, and neither are missing values. Every note names the images.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 
 from legcal.data.measurements import Measurements, few_views
 from legcal.files.schema import few
-from legcal.vision.image_file import ImageFacts, size_change
+from legcal.vision.image_file import ImageFacts, Move, size_change
 
 GOOD_QUALITY = 95  # JPEG quality from which the loss is far below the noise of a camera
 _TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned by 90 deg",
@@ -240,4 +241,28 @@ def compression_notes(measurements: Measurements, facts: Mapping[str, ImageFacts
         f"Lossy compression moves outlines: found JPEGs of quality {min(qualities.values())} or so "
         f"in photographs of {few_views(list(qualities))}, needed {GOOD_QUALITY} or more, PNG or "
         "TIFF; the stated uncertainty includes it."
+    ]
+
+
+def notes_on_moves(measurements: Measurements, moves: Mapping[str, Move]) -> list[str]:
+    """Return a note on cameras that did not stand still, if there are any.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The rows of the photographs.
+    moves : mapping
+        How images were moved, by the names of the images.
+    """
+    most: dict[str, float] = {}
+    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
+        if image in moves:
+            view, move = measurements.views[v], moves[image]
+            most[view.name] = max(math.hypot(move.x, move.y), most.get(view.name, 0.0))
+    if not most:
+        return []
+    return [
+        f"The camera of {few_views(list(most))} did not stand still: its background moves by up to "
+        f"{max(most.values()):.1f} px from image to image. They were aligned by it. For the next "
+        "session, release the shutter without touching the camera, and turn stabilisation off."
     ]

@@ -575,6 +575,45 @@ def reduced(px: Array, scale: float) -> Array:
     return np.asarray((px + 0.5) / scale - 0.5)
 
 
+class Move(NamedTuple):
+    """How an image was moved beside the others of its view: by a camera that did not stand still.
+
+    From the middle of the image, what is at p in the others is at (p + shift + zoom p + turn J p) /
+    (1 - slant . p), with J a quarter turn from x to y. A lens that is shifted has no slant; a
+    camera that turns has one of the shift over the square of the focal length.
+    """
+
+    x: float  # shift [px]
+    y: float
+    zoom: float
+    turn: float  # [rad]
+    slant_x: float  # [1/px]
+    slant_y: float
+
+    @property
+    def homography(self) -> Array:
+        """The matrix (3, 3) from the middle of the other images to that of this one."""
+        return np.array(
+            [
+                [1.0 + self.zoom, -self.turn, self.x],
+                [self.turn, 1.0 + self.zoom, self.y],
+                [-self.slant_x, -self.slant_y, 1.0],
+            ]
+        )
+
+    def undone(self, grey: Grey) -> Grey:
+        """Return an image as if the camera had stood still."""
+        height, width = grey.shape
+        from_middle = np.eye(3)
+        from_middle[:2, 2] = 0.5 * (width - 1), 0.5 * (height - 1)
+        H = from_middle @ self.homography @ np.linalg.inv(from_middle)
+        flags = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
+        still = cv2.warpPerspective(
+            grey, H, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(still, dtype=np.float32)
+
+
 def shrink(grey: Grey, factor: int) -> Grey:
     """Return an image made smaller by a whole factor, each pixel the mean of a square."""
     if factor == 1:

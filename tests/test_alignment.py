@@ -1,0 +1,130 @@
+"""Cameras that do not stand still between the images of a view: their moves, by the background."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from hypothesis import given
+from hypothesis import settings as tried
+from hypothesis import strategies as st
+from simulated import settings, small_camera, standing
+
+from legcal import detect, load_dataset, simulate
+from legcal.data.measurements import Measurements, View
+from legcal.geometry.types import Array
+from legcal.perception.alignment import camera_moves
+from legcal.progress import no_progress
+from legcal.simulation.settings import Level
+from legcal.vision.camera import Camera
+from legcal.vision.image_file import Grey, Move
+from legcal.workers import in_turn
+
+WIDTH, HEIGHT, N = 640, 480, 7
+K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
+CORNERS = np.array([[x, y, 1.0] for x in (-320.0, 320.0) for y in (-240.0, 240.0)])
+SIZES = np.array([1.0, 1.0, 1e-3, 1e-3, 2e-6, 2e-6])
+
+
+def move(x: float, y: float = 0.0, zoom: float = 0.0) -> Move:
+    return Move(x, y, zoom, 0.0, 0.0, 0.0)
+
+
+def at_corners(move: Move) -> Array:
+    """Return how a move shifts the corners of an image, (4, 2) [px]."""
+    there = CORNERS @ move.homography.T
+    return np.asarray(there[:, :2] / there[:, 2:] - CORNERS[:, :2])
+
+
+def texture(seed: int) -> Grey:
+    """Return a background with structure of a few pixels."""
+    noise = np.random.default_rng(seed).normal(size=(HEIGHT, WIDTH))
+    fine, coarse = (cv2.GaussianBlur(noise, (0, 0), size) for size in (2, 12))
+    both = fine / fine.std() + coarse / coarse.std()
+    return np.asarray(110.0 + 18.0 * both, dtype=np.float32)
+
+
+def moved(picture: Grey, move: Move) -> Grey:
+    """Return what a camera takes of a picture that has moved, by other code than undoes it."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    middle = 0.5 * np.array([WIDTH - 1, HEIGHT - 1])
+    p = np.stack([u.ravel() - middle[0], v.ravel() - middle[1], np.ones(u.size)])
+    from_there = np.linalg.solve(move.homography, p)
+    u, v = (
+        (from_there[k] / from_there[2] + middle[k]).reshape(u.shape).astype(np.float32)
+        for k in range(2)
+    )
+    return np.asarray(cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
+
+
+def taken(background: Grey, moves: list[Move], seed: int = 0) -> list[Grey]:
+    """Return noisy images of a background with a leg elsewhere in each."""
+    images, rng = [], np.random.default_rng(seed)
+    for k, one in enumerate(moves):
+        scene = background.copy()
+        scene[40:440, 60 + 70 * k : 140 + 70 * k] = 200.0 - 0.3 * np.arange(80)
+        images.append(moved(scene, one) + 2.0 * rng.normal(size=scene.shape).astype(np.float32))
+    return images
+
+
+def found_in(images: list[Grey]) -> dict[int, Move]:
+    n = len(images)
+    measurements = Measurements(
+        views=(View("c1", Camera(K, WIDTH, HEIGHT)),),
+        view=np.zeros(n, dtype=np.intp),
+        pose=np.arange(n),
+        image=tuple(f"{k}.png" for k in range(n)),
+        q=np.zeros((n, 1)),
+        sigma_q=1e-5,
+    )
+    return camera_moves(images.__getitem__, measurements, range(n), in_turn, no_progress)
+
+
+@given(seed=st.integers(0, 99), size=st.floats(0.3, 1.5))
+@tried(max_examples=6, deadline=None)
+def test_moves_are_found_whatever_the_legs_do(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    true = [Move(*(size * SIZES * rng.normal(size=6)).tolist()) for _ in range(N)]
+    found = found_in(taken(texture(seed), true, seed))
+    assert sorted(found) == list(range(N))
+    off = np.array([at_corners(found[k]) - at_corners(one) for k, one in enumerate(true)])
+    assert np.abs(off - np.median(off, axis=0)).max() < 0.1
+
+
+def test_what_stood_still_shows_little_or_another_scene_is_left_alone() -> None:
+    still, shaken = [move(0.0)] * N, [move(0.7 * k) for k in range(N)]
+    background = texture(1)
+    assert found_in(taken(background, still)) == {}
+    assert found_in(taken(np.full_like(background, 110.0), shaken)) == {}
+    assert found_in(taken(background, shaken)[:4]) == {}
+    images = taken(background, shaken)
+    images[2] = taken(texture(2), shaken)[2]
+    assert sorted(found_in(images)) == [0, 1, 3, 4, 5, 6]
+
+
+def test_legs_are_found_as_if_the_camera_had_stood_still(tmp_path: Path) -> None:
+    """Photographs before a wallpaper, as they are, and by a camera that was touched."""
+    views = standing("hexapod", 1, small_camera(tmp_path, WIDTH, HEIGHT))
+    shot = settings(level=Level.PHOTOGRAPHS, views=views, poses=6)
+    still = simulate("hexapod", tmp_path / "still", shot).folder
+    paper = texture(3)
+    paper[70:, 130:-130] = np.nan
+    for file in sorted((still / "images").iterdir()):
+        picture = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+        before_it = np.where(np.isnan(paper), picture, np.rint(np.nan_to_num(paper)))
+        cv2.imwrite(str(file), before_it.astype(np.uint8))
+    shaken = shutil.copytree(still, tmp_path / "shaken")
+    for k, file in enumerate(sorted((shaken / "images").iterdir())):
+        picture = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)).astype(np.float32)
+        there = moved(picture, move(0.9 * k, -0.4 * k, 1e-3 * k))
+        cv2.imwrite(str(file), np.clip(np.rint(there), 0, 255).astype(np.uint8))
+    seen, as_still = (detect(load_dataset(folder)) for folder in (shaken, still))
+    (note,) = set(seen.notes) - set(as_still.notes)
+    assert "The camera of view c1 did not stand still" in note
+    both = seen.outlines.used & as_still.outlines.used
+    assert np.count_nonzero(both) > 0.8 * np.count_nonzero(as_still.outlines.used)
+    middle = 0.5 * np.array([WIDTH - 1, HEIGHT - 1])
+    common = middle + 1.0025 * (as_still.outlines.ends[both] - middle) + (2.25, -1.0)
+    lens = seen.dataset.measurements.views[0].camera
+    off = lens.line_offset(seen.outlines.h[both][:, None], lens.undistort(common))
+    assert np.median(np.abs(off)) < 0.2  # of images up to 5 px away
