@@ -53,7 +53,7 @@ from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_datase
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import few_views, images_in_words, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
-from legcal.data.photograph_notes import compression_notes, notes_on_photographs
+from legcal.data.photograph_notes import compression_notes, notes_on_moves, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, Problem
 from legcal.files.folder import output_path
@@ -483,6 +483,8 @@ def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
 def _searched(checklist: _Checklist, data: OrderedDataset) -> Detection | None:
     """Search the images for the legs; None if that fails."""
     m = data.dataset.measurements
+    for message in notes_on_moves(m, data.dataset.moves):
+        checklist.add("photographs", "note", message)
     rows = np.array([row for row in range(m.n_rows) if m.image[row]], dtype=np.intp)
     if checklist.refuses and (views := views_to_click(data)):  # on the written page
         return unsearched(data, rows, views)
