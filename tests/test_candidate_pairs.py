@@ -73,7 +73,7 @@ def test_what_stands_still_in_the_pictures_of_a_view_is_no_edge_of_a_leg() -> No
 
     moved = [moving(x) for x in (-0.02, -0.008, 0.005, 0.017, 0.03)]
     pictures = [_picture(camera, [still, *bars]) for bars in moved]
-    background = still_picture(pictures)
+    background = still_picture(pictures, 1)
     assert background is not None
 
     def offsets(found: EdgeSegments, bar: Bar) -> list[float]:
@@ -87,4 +87,4 @@ def test_what_stands_still_in_the_pictures_of_a_view_is_no_edge_of_a_leg() -> No
         for bar in bars:
             assert max(*offsets(every, bar), *offsets(found, bar)) < 1.5
         assert min(offsets(found, still)) > 10.0
-    assert still_picture(pictures[:3]) is None  # of which legs stand still in most
+    assert still_picture(pictures[:3], 1) is None  # of which legs stand still in most

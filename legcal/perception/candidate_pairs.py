@@ -84,10 +84,11 @@ class Still(NamedTuple):
 
     picture: Grey
     noise: float  # by which most pixels of pictures differ from it [grey levels]
+    factor: int  # by which they are reduced
 
 
-def still_picture(pictures: Sequence[Grey]) -> Still | None:
-    """Return the static background in reduced images of one view; None if they are few.
+def still_picture(pictures: Sequence[Grey], factor: int) -> Still | None:
+    """Return the static background in images of one view reduced by a factor; None if they are few.
 
     Legs are somewhere else in most pictures.
     """
@@ -95,7 +96,7 @@ def still_picture(pictures: Sequence[Grey]) -> Still | None:
         return None
     middle = np.median(np.stack(pictures), axis=0).astype(np.float32)
     away = [_middle(np.abs(one - middle)[::STRIDE, ::STRIDE]) for one in pictures]
-    return Still(middle, float(np.median(away)))
+    return Still(middle, float(np.median(away)), factor)
 
 
 def moving_pixels(picture: Grey, still: Still) -> Image:

@@ -530,8 +530,8 @@ def _inspect_images(
             small[row] = own
         count(row)
     defects = defects_of(measurements, exposures)
-    photographs.still.update(_still_pictures(measurements, small, defects))
     search = photographs.search(nominal)
+    photographs.still.update(_still_pictures(search, small, defects))
     pairs = {  # in this process: pictures take about as long to send
         row: search.pairs_of_reduced(picture, int(measurements.view[row]))
         for row, picture in small.items()
@@ -540,14 +540,16 @@ def _inspect_images(
 
 
 def _still_pictures(
-    measurements: Measurements, small: Mapping[int, Grey], defects: Collection[int]
+    search: Search, small: Mapping[int, Grey], defects: Collection[int]
 ) -> dict[int, Still]:
     """Return the static background of each view with enough reduced images."""
     of_view: dict[int, list[Grey]] = {}
     for row, picture in small.items():
         if row not in defects:
-            of_view.setdefault(int(measurements.view[row]), []).append(picture)
-    still = {view: still_picture(pictures) for view, pictures in of_view.items()}
+            of_view.setdefault(int(search.measurements.view[row]), []).append(picture)
+    still = {
+        view: still_picture(pictures, search.reduction(view)) for view, pictures in of_view.items()
+    }
     return {view: picture for view, picture in still.items() if picture is not None}
 
 

@@ -90,7 +90,9 @@ class Search:
         return self.pairs_of_reduced(shrink(self.load(row), self.reduction(view)), view)
 
     def reduction(self, view: int) -> int:
-        """Return the factor by which the pictures of a view are reduced."""
+        """Return the factor by which the pictures of a view are reduced: that of its background."""
+        if view in self.still:
+            return self.still[view].factor
         thinnest = min((c.radius for one in self.cylinders for c in one), default=self.size)
         return reduction(self.measurements.views[view].camera, 2.0 * thinnest / self.size)
 
