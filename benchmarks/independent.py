@@ -159,7 +159,7 @@ def shake(folder: Path) -> None:
         size = picture.shape[1], picture.shape[0]
         flags = cv2.INTER_LANCZOS4
         turned = cv2.warpPerspective(picture, H, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        cv2.imwrite(str(file), turned, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        cv2.imwrite(str(file), turned, [cv2.IMWRITE_JPEG_QUALITY, 98])
 
 
 def click_joints(folder: Path, truth: Path) -> None:
