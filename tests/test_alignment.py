@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import settings as tried
 from hypothesis import strategies as st
@@ -87,6 +88,16 @@ def test_moves_are_found_whatever_the_legs_do(seed: int, size: float) -> None:
     true = [Move(*(size * SIZES * rng.normal(size=6)).tolist()) for _ in range(N)]
     found = found_in(taken(texture(seed), true, seed))
     assert sorted(found) == list(range(N))
+    off = np.array([at_corners(found[k]) - at_corners(one) for k, one in enumerate(true)])
+    assert np.abs(off - np.median(off, axis=0)).max() < 0.1
+
+
+def test_many_images_are_compared_with_the_background_of_some(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("legcal.perception.alignment.MOST_IMAGES", 5)
+    true = [move(0.6 * (k % 3), -0.4 * (k % 2)) for k in range(N)]
+    found = found_in(taken(texture(5), true))
     off = np.array([at_corners(found[k]) - at_corners(one) for k, one in enumerate(true)])
     assert np.abs(off - np.median(off, axis=0)).max() < 0.1
 

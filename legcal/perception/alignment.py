@@ -11,6 +11,7 @@ the camera had stood still (:class:`legcal.data.dataset.ImageReader`).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import partial
 
@@ -29,6 +30,7 @@ LONG_SIDE = 1200  # about which images are reduced [px]
 TILE, MARGIN = 24, 4  # side of a square, and how far around it is looked [px]
 ACROSS = 16  # squares beside each other
 MIN_IMAGES = 5  # of a view
+MOST_IMAGES = 60  # of a view by which its background is known, and at a time
 MIN_TILES, MIN_SHARE = 12, 0.35  # squares that show something, and the share of these that agree
 SHARP = 0.1  # standard deviation of the shift of a square that shows something, at most [px]
 LEAST_NOISE = 0.3  # of pixels [grey levels]
@@ -62,19 +64,35 @@ def camera_moves(
     for row in rows:
         of_view.setdefault(int(measurements.view[row]), []).append(row)
     groups = [group for group in of_view.values() if len(group) >= MIN_IMAGES]
-    wanted = [row for group in groups for row in group]
-    tiles = dict[int, Samples]()
-    for row, own in zip(wanted, run(partial(_tiles, load), wanted), strict=True):
-        tiles[row] = own
-        report("Comparing backgrounds", len(tiles), len(wanted))
+    samples = [
+        [group[k * len(group) // n] for k in range(n)]
+        for group in groups
+        for n in [min(len(group), MOST_IMAGES)]
+    ]
+    n_read, n_total = itertools.count(1), sum(map(len, samples))
+
+    def squares(some: Sequence[int]) -> Samples:
+        read = []
+        for own in run(partial(_squares, load), some):
+            read.append(own)
+            report("Comparing backgrounds", min(next(n_read), n_total), n_total)
+        return np.stack(read)
+
     moves = dict[int, Move]()
-    for group in groups:
+    for group, sample in zip(groups, samples, strict=True):
         camera = measurements.views[measurements.view[group[0]]].camera
         size = camera.width, camera.height
-        found = _moves_of_view(np.stack([tiles.pop(row) for row in group]), size)
-        known = zip(group, found, strict=bool(found))
-        moves |= {row: move for row, move in known if move is not None}
+        found, still = _moves_of_view(squares(sample), size)
+        moves |= _known(sample, found)
+        rest = [row for row in group if row not in set(sample)] if still is not None else []
+        for first in range(0, len(rest), MOST_IMAGES):
+            some = rest[first : first + MOST_IMAGES]
+            moves |= _known(some, _moves_of_view(squares(some), size, still)[0])
     return moves
+
+
+def _known(rows: Sequence[int], found: Sequence[Move | None]) -> dict[int, Move]:
+    return {row: move for row, move in zip(rows, found, strict=True) if move is not None}
 
 
 def _factor(size: tuple[int, int]) -> int:
@@ -93,7 +111,7 @@ def _places(size: tuple[int, int]) -> tuple[IntArray, Array]:
     return at, at + 0.5 * (TILE + 2 * MARGIN) - 0.5 * reduced
 
 
-def _tiles(load: Load, row: int) -> Samples:
+def _squares(load: Load, row: int) -> Samples:
     """Return the squares (n, side, side) of an image."""
     grey, side = load(row), TILE + 2 * MARGIN
     size = grey.shape[1], grey.shape[0]
@@ -103,13 +121,17 @@ def _tiles(load: Load, row: int) -> Samples:
     return np.stack([small[y : y + side, x : x + side] for x, y in _places(size)[0].tolist()])
 
 
-def _moves_of_view(tiles: Samples, size: tuple[int, int]) -> list[Move | None]:
-    """Return the move of each image by its squares (n_images, n, side, side).
+def _moves_of_view(
+    tiles: Samples, size: tuple[int, int], still: Samples | None = None
+) -> tuple[list[Move | None], Samples | None]:
+    """Return the move of each image by its squares (n_images, n, side, side), and their background.
 
-    None for an image that shows too little of the background; no moves if the camera stood still.
+    The *still* background is that of other images of the view, or else the median. None for an
+    image that shows too little of it, and for all, and no background, if the camera stood still.
     """
+    stood: tuple[list[Move | None], None] = [None] * len(tiles), None
     if not tiles.shape[1]:
-        return []
+        return stood
     middle, factor = _places(size)[1], _factor(size)
     by_motion = _shifts_by_motion(middle)
     everywhere = np.einsum("kdp,kdq->pq", by_motion, by_motion) / len(by_motion)
@@ -117,28 +139,29 @@ def _moves_of_view(tiles: Samples, size: tuple[int, int]) -> list[Move | None]:
     at = np.zeros((*tiles.shape[:2], 2))  # the shifts at which squares are read
     for _ in range(ROUNDS):
         before = motion
-        motion, sigma = _motions(_smooth(now) if smooth else now, at, by_motion, everywhere)
+        behind = np.median(now, axis=0) if still is None else still
+        blurred = (_smooth(now), _smooth(behind[None])[0]) if smooth else (now, behind)
+        motion, sigma = _motions(*blurred, at, by_motion, everywhere)
         seen, sigma = np.isfinite(sigma), factor * sigma
-        if np.count_nonzero(seen) < MIN_IMAGES:
-            return []
-        motion[seen] -= np.median(motion[seen], axis=0)
-        away = factor * _size(motion, everywhere)
-        if not np.any(away[seen] > np.maximum(LEAST_MOVE, SIGMAS * sigma[seen])):
-            return []
-        step = float(_size(motion - before, everywhere)[seen].max())
+        if still is None:
+            if np.count_nonzero(seen) < MIN_IMAGES:
+                return stood
+            motion[seen] -= np.median(motion[seen], axis=0)
+            away = factor * _size(motion, everywhere)
+            if not np.any(away[seen] > np.maximum(LEAST_MOVE, SIGMAS * sigma[seen])):
+                return stood
+        step = float(_size(motion - before, everywhere)[seen].max(initial=0.0))
         if step < SETTLED and not smooth:
             break
         smooth &= step > NEAR
         at = np.round(np.einsum("kdp,np->nkd", by_motion, motion) / READ) * READ
         now = np.stack([_moved(*one) for one in zip(tiles, at, strict=True)])
     known = sigma < MAX_SIGMA
-    if np.count_nonzero(known) < MIN_IMAGES:
-        return []
+    if still is None and np.count_nonzero(known) < MIN_IMAGES:
+        return stood
     motion *= np.array([factor, factor, 1.0, 1.0, 1.0 / factor, 1.0 / factor])
-    return [
-        Move(*own) if is_known else None
-        for is_known, own in zip(known.tolist(), motion.tolist(), strict=True)
-    ]
+    moves = zip(known.tolist(), motion.tolist(), strict=True)
+    return [Move(*own) if is_known else None for is_known, own in moves], np.median(now, axis=0)
 
 
 def _smooth(tiles: Samples) -> Samples:
@@ -152,13 +175,14 @@ def _size(motion: Array, everywhere: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("np,pq,nq->n", motion, everywhere, motion)))
 
 
-def _motions(tiles: Samples, at: Array, by_motion: Array, everywhere: Array) -> tuple[Array, Array]:
-    """Return the motions (n_images, 6) of images, whose squares are read at shifts.
+def _motions(
+    tiles: Samples, still: Samples, at: Array, by_motion: Array, everywhere: Array
+) -> tuple[Array, Array]:
+    """Return the motions (n_images, 6) of images against a background, read at shifts.
 
     With the standard deviation of shifts (n_images,) [px], rms over all places, infinite where few
     squares agree.
     """
-    still = np.median(tiles, axis=0)
     noise = 1.4826 * np.median(np.abs(tiles - still), axis=(0, 2, 3))
     noise = np.maximum(noise, LEAST_NOISE)
     information, slope = _information(still)
