@@ -135,13 +135,16 @@ def _moves_of_view(
     middle, factor = _places(size)[1], _factor(size)
     by_motion = _shifts_by_motion(middle)
     everywhere = np.einsum("kdp,kdq->pq", by_motion, by_motion) / len(by_motion)
+    model = by_motion, everywhere
     motion, now, smooth = np.zeros((len(tiles), by_motion.shape[2])), tiles, True
     at = np.zeros((*tiles.shape[:2], 2))  # the shifts at which squares are read
     for _ in range(ROUNDS):
         before = motion
         behind = np.median(now, axis=0) if still is None else still
-        blurred = (_smooth(now), _smooth(behind[None])[0]) if smooth else (now, behind)
-        motion, sigma = _motions(*blurred, at, by_motion, everywhere)
+        if smooth:
+            motion, sigma = _motions(_smooth(now), _smooth(behind[None])[0], at, *model)
+        else:
+            motion, sigma = _motions(now, behind, at, *model)
         seen, sigma = np.isfinite(sigma), factor * sigma
         if still is None:
             if np.count_nonzero(seen) < MIN_IMAGES:
