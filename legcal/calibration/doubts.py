@@ -18,7 +18,7 @@ from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import CrossValidation, cross_validate
-from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
     PlatformError,
@@ -642,7 +642,7 @@ class _Evidence:
 
 def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:
     """Return stated lengths that are the nominal ones to all digits, as nobody measures them."""
-    known = known_parameters(dataset.machine, dataset.measurements.views, boards=dataset.boards)
+    known = dataset_parameters(dataset)
     return [
         name
         for name, value in stated_lengths(solution.posterior.problem).items()

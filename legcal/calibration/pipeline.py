@@ -48,8 +48,8 @@ from legcal.calibration.joint_fit.parameter_choices import (
     Choices,
     Group,
     Prior,
-    known_parameters,
-    resolve,
+    choices_of,
+    dataset_parameters,
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
@@ -197,9 +197,7 @@ def calibrate(
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
-    choices = chosen_parameters(dataset, overrides)
-    by_parts = Choices.by_tolerances(dataset.machine, only)
-    choices = replace(choices, built=by_parts.built, only=by_parts.only)
+    choices = chosen_parameters(dataset, overrides, only)
     leave_out = ",".join(listed(leave_out))
     left_out = chosen_images(dataset, leave_out) if leave_out else None
     if zeros := own_zeros(dataset, listed(split), left_out):
@@ -546,21 +544,18 @@ def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[
     return [note] if note else []
 
 
-def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
+def chosen_parameters(
+    dataset: Dataset, overrides: Sequence[Override], only: Group | None = None
+) -> Choices:
     """Return the choices of dataset and call for the parameters.
 
     Twists without an explicit choice get a prior: every leg has an error of its twist, and a twist
     fixed at nominal would bias the others.
     """
-    known = known_parameters(
-        dataset.machine,
-        dataset.measurements.views,
-        boards=dataset.boards,
-    )
-    choices = resolve([*dataset.overrides, *overrides], known)
+    choices = choices_of(dataset, overrides, only)
     twists = {
         name: Prior(parameter.nominal, float(np.radians(TWIST_SIGMA_DEG)))
-        for name, parameter in known.by_name.items()
+        for name, parameter in dataset_parameters(dataset).by_name.items()
         if ParameterId.parse(name).kind == "twist"
         and choices.holds(name, by_default=True)
         and name not in choices.fixed

@@ -45,7 +45,7 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
+from legcal.calibration.joint_fit.parameter_choices import board_scale, dataset_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
@@ -292,7 +292,6 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
     numbers = vector_of(kinematic, calibration.solution.legs, geometries(machine)).tolist()
     values = {**found.values, **dict(zip(kinematic.names, numbers, strict=True))}
     sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
-    known = known_parameters(machine, dataset.measurements.views, boards=dataset.boards).by_name
     return [
         ParameterRow(
             name=name,
@@ -303,7 +302,7 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
             unit=parameter.unit,
             status=found.status.get(name, "fixed"),
         )
-        for name, parameter in known.items()
+        for name, parameter in dataset_parameters(dataset).by_name.items()
         if name in values
     ]
 

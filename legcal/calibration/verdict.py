@@ -20,7 +20,7 @@ from legcal.calibration.doubts import (
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
-from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.sensitivity import EXACT_CAMERAS, SIGMA_EXACT
@@ -300,9 +300,7 @@ def _error_of_exact_cameras(platform: PlatformAccuracy) -> str:
 
 def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, float, str]:
     """Return the change of joints and lengths, its uncertainty, rms [m], and a clause of both."""
-    known = known_parameters(
-        dataset.machine, dataset.measurements.views, boards=dataset.boards
-    ).by_name
+    known = dataset_parameters(dataset).by_name
     found = solution.estimates
     lengths = [
         (found.values[name] - known[name].nominal, sigma)

@@ -31,8 +31,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
     Group,
-    known_parameters,
-    resolve,
+    choices_of,
 )
 from legcal.calibration.joint_fit.part_errors import PartSigma, predicted_sigmas, sigmas_in_words
 from legcal.calibration.joint_fit.platform import moved_by
@@ -427,16 +426,7 @@ def answer(
     from legcal.data.dataset import load_dataset
 
     dataset = load_dataset(path, check_images=False)
-    parameters = known_parameters(
-        dataset.machine,
-        dataset.measurements.views,
-        boards=dataset.boards,
-    )
-    by_parts = Choices.by_tolerances(dataset.machine, only)
-    choices = replace(
-        resolve(dataset.overrides, parameters), built=by_parts.built, only=by_parts.only
-    )
-    return identifiability_of_dataset(dataset, choices, expected)
+    return identifiability_of_dataset(dataset, choices_of(dataset, only=only), expected)
 
 
 def identifiability(

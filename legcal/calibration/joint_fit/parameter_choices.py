@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import permutations
 from typing import Literal
 
 import numpy as np
 
+from legcal.data.dataset import Dataset
 from legcal.data.dataset_file import Action, Override
 from legcal.data.measurements import View
 from legcal.errors import DatasetError, UsageError
@@ -185,6 +186,11 @@ def known_parameters(
     return KnownParameters(by_name | seen | board, others, synonyms, lengths)
 
 
+def dataset_parameters(dataset: Dataset) -> KnownParameters:
+    """Return the parameters of the machine of a dataset, its cameras and boards."""
+    return known_parameters(dataset.machine, dataset.measurements.views, boards=dataset.boards)
+
+
 def _lengths(machine: Machine) -> dict[str, KnownParameter]:
     """Return the distances of joints on the base and on the platform, by LEG.SIDE:LEG.SIDE.
 
@@ -287,6 +293,15 @@ def _rejected_names(machine: Machine) -> dict[str, str]:
 
 
 _PAST_TENSE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
+
+
+def choices_of(
+    dataset: Dataset, overrides: Sequence[Override] = (), only: Group | None = None
+) -> Choices:
+    """Return the choices of a dataset and of a call, with tolerances as priors for ``--only``."""
+    by_parts = Choices.by_tolerances(dataset.machine, only)
+    choices = resolve([*dataset.overrides, *overrides], dataset_parameters(dataset))
+    return replace(choices, built=by_parts.built, only=by_parts.only)
 
 
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:

@@ -30,7 +30,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     NoiseModel,
     notes_on_blur,
 )
-from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.scale import sensitivity_to_scale
@@ -438,13 +438,12 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     Solution
         B of legs fixed to the platform is at the point that model files use.
     """
-    machine, measurements = dataset.machine, dataset.measurements
+    machine = dataset.machine
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
     origin = np.asarray(machine.T_platform_Re.inv().translation)
     geometry = with_platform_points([solution.legs[j] for j in legs], machine.frame_legs, origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
-    parameters = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     steps = _indices_of(parametrization.names, solution.kinematic.parametrization.names)
@@ -462,7 +461,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         cameras=tuple(solution.cameras[v] for v in views),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses),
         radii=dict(sorted(radii.items())),
-        estimates=estimates.in_order(tuple(parameters)),
+        estimates=estimates.in_order(tuple(dataset_parameters(dataset).by_name)),
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities={what: moved[steps] for what, moved in solution.sensitivities.items()},
         outlines=order.restore(solution.outlines),
