@@ -501,7 +501,6 @@ class Examination:
             used=self.n_used,
             left_out=left_out,
             overlays=overlays,
-            diagnosis=[diagnosis.document() for diagnosis in self.diagnosis],
         ).document()
 
 

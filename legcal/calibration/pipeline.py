@@ -371,7 +371,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         said = [*(one.sentence for one in diagnosis), *refused]
         refusal = _with_notes(error, said, data.dataset, notes)
         if diagnosis:
-            refusal.diagnosis = tuple(mistake.document().document() for mistake in diagnosis)
+            refusal.diagnosis = tuple(mistake.document() for mistake in diagnosis)
             refusal.consequences = error.facts
         raise refusal from error
 

@@ -255,7 +255,7 @@ def _result_of(calibration: Calibration) -> Result:
         holdout=calibration.held_out,
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
-        diagnosis=[one.document() for one in calibration.diagnosis] or None,
+        diagnosis=list(calibration.diagnosis) or None,
         only=None if calibration.group is None else calibration.group.group,
         zeros=None if calibration.group is None else calibration.group.zeros,
         overlays=overlay_blocks(places(measurements), calibration.overlays) or None,

@@ -127,8 +127,8 @@ def _diagnosis(
         same_as=(),
         mended="with the names corrected",
         images=len(rows),
-        before=int(np.sum(nearer <= 0.0)),
-        after=int(np.sum(nearer > 0.0)),
+        images_before=int(np.sum(nearer <= 0.0)),
+        images_after=int(np.sum(nearer > 0.0)),
         score=float(np.mean(other < own)),
         remedy=f"{remedy} there (columns leg and part of observations.csv)",
     )

@@ -194,12 +194,8 @@ class ObservedOutlines:
 
     def through(self, cameras: Sequence[Camera]) -> ObservedOutlines:
         """Project the same pixels onto the sensor planes of other cameras."""
-        feet, lens = self.feet.copy(), self.lens.copy()
-        for v in np.unique(self.view):
-            of_view = self.view == v
-            feet[of_view] = cameras[v].undistort(self.pixels[of_view])
-            lens[of_view] = _inverses(cameras[v].pixels_per_unit(feet[of_view]))
-        return replace(self, feet=feet, lens=lens)
+        feet, by_xy = _through_lenses(cameras, self.view, self.pixels)
+        return replace(self, feet=feet, lens=_inverses(by_xy))
 
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
         """Return the distance of both ends from the predicted outline, (n, 2) [px]."""
@@ -308,12 +304,9 @@ def observed_outlines(
     feet, pixels, lens = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2, 2))
     for v in np.unique(view):
         camera, of_view = measurements.views[v].camera, view == v
-        rows_of_view = index[of_view]
-        normal, xy = (
-            outlines.h[rows_of_view, None, :2],
-            camera.undistort(outlines.ends[rows_of_view]),
-        )
-        value = np.sum(normal * xy, axis=-1, keepdims=True) + outlines.h[rows_of_view, None, 2:]
+        h, xy = outlines.h[index[of_view], None], camera.undistort(outlines.ends[index[of_view]])
+        normal = h[..., :2]
+        value = np.sum(normal * xy, axis=-1, keepdims=True) + h[..., 2:]
         feet[of_view] = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
         lens[of_view] = _inverses(camera.pixels_per_unit(feet[of_view]))
         pixels[of_view] = camera.distort(feet[of_view])
@@ -390,6 +383,18 @@ def _by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
     given = np.array([view.camera.gamma_is_given for view in measurements.views], dtype=np.bool_)
     unknown = ~given[measurements.view[outlines.row]] & np.isfinite(outlines.by_gamma)
     return np.where(unknown, outlines.by_gamma, 0.0)
+
+
+def _through_lenses(
+    cameras: Sequence[Camera], view: IntArray, pixels: Array
+) -> tuple[Array, Array]:
+    """Return points (n, ..., 2) on the sensor plane at pixels, and derivatives of pixels there."""
+    xy, by_xy = np.zeros(pixels.shape), np.zeros((*pixels.shape, 2))
+    for v in np.unique(view).tolist():
+        of_view = view == v
+        xy[of_view] = cameras[v].undistort(pixels[of_view])
+        by_xy[of_view] = cameras[v].pixels_per_unit(xy[of_view])
+    return xy, by_xy
 
 
 def _inverses(M: Array) -> Array:
@@ -514,7 +519,7 @@ def observed_edges(
     """
     edges = no_outlines() if edges is None else edges
     index = np.flatnonzero(edges.used)
-    n, row, leg = len(index), edges.row[index], edges.leg[index]
+    row, leg = edges.row[index], edges.leg[index]
     pixels, covariance = edges.ends[index], edges.covariance[index]
     problems = _bad_covariances(covariance, row, leg, measurements, legs)
     if problems:
@@ -523,11 +528,7 @@ def observed_edges(
     bodies = tuple(sorted(set(keys)))
     body = np.array([bodies.index(key) for key in keys], dtype=np.intp)
     view = measurements.view[row]
-    feet, lens = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
-    for v in np.unique(view).tolist():
-        of_view = view == v
-        feet[of_view] = cameras[v].undistort(pixels[of_view])
-        lens[of_view] = np.swapaxes(_inverses(cameras[v].pixels_per_unit(feet[of_view, 1])), 1, 2)
+    feet, by_xy = _through_lenses(cameras, view, pixels)
     difference = np.array([-1.0, 1.0])
     variance = np.einsum("i,nij,j->n", difference, covariance, difference)
     return ObservedEdges(
@@ -538,7 +539,7 @@ def observed_edges(
         body,
         feet,
         pixels,
-        lens,
+        np.swapaxes(_inverses(by_xy[:, 1]), 1, 2),
         np.sqrt(variance),
         edges.edge[index],
         bodies,
@@ -833,11 +834,7 @@ def _corners_on(
         [np.bincount(which, weights=weight * corners.px[used, i]) / total for i in range(2)], axis=1
     )
     view, pose, corner = unique_keys.T.astype(np.intp)
-    feet, lens = np.zeros((len(view), 2)), np.zeros((len(view), 2, 2))
-    for v in np.unique(view).tolist():
-        of_view = view == v
-        feet[of_view] = cameras[v].undistort(pixels[of_view])
-        lens[of_view] = cameras[v].pixels_per_unit(feet[of_view])
+    feet, lens = _through_lenses(cameras, view, pixels)
     point, sigma = fixed.board.points[corner - fixed.first], 1.0 / np.sqrt(total)
     return ObservedCorners(link, view, pose, corner, point, feet, pixels, lens, sigma)
 
