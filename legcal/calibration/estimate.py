@@ -632,7 +632,7 @@ def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> 
         norms = minimum.linear["outlines"].squared_norms
         log_determinants = np.linalg.slogdet(fit.noise.covariance(o.covariance))[1]
         log_densities = -0.5 * (norms + log_determinants) * kept
-        shared = restricted_log_likelihood(problem, minimum) + 0.5 * float(norms.sum())
+        shared = restricted_log_likelihood(minimum) + 0.5 * float(norms.sum())
         for c, views in enumerate(cameras):
             of_camera = np.array([name in views for name in o.views], dtype=np.bool_)[o.view]
             share = float(np.sum(of_camera & kept)) / max(float(np.sum(kept)), 1.0)

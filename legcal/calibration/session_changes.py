@@ -28,14 +28,14 @@ from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
 from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
-from legcal.calibration.joint_fit.variables import LegConstraints, State
+from legcal.calibration.joint_fit.variables import LegConstraints
 from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.image_choice import images_to_name
 from legcal.data.measurements import Measurements, few_views, row_names
-from legcal.estimation.problem import Linearization, linearize
-from legcal.estimation.solver import NormalEquations, normal_equations
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import normal_equations
 from legcal.estimation.uncertainty import (
     LEAST_SEEN,
     Estimated,
@@ -665,10 +665,7 @@ def _subsets(sequences: Sequence[int], few: Sequence[tuple[int, ...]]) -> Sequen
 class _Fit:
     """A fit at its minimum, and the course of its images: what it may lack, with the scores."""
 
-    problem: FitProblem
-    state: State
-    linear: Linearization
-    normal: NormalEquations
+    normal: FitNormal
     course: _Course
 
     @classmethod
@@ -676,11 +673,13 @@ class _Fit:
         cls, posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
     ) -> _Fit:
         """Linearise a fit."""
-        problem, state = posterior.problem, posterior.state
-        linear = linearize(problem, state)
-        normal = normal_equations(problem, state, linear)
-        course = _Course.of(posterior, measurements, sequences)
-        return cls(problem, state, linear, normal, course)
+        normal = normal_equations(linearize(posterior.problem, posterior.state))
+        return cls(normal, _Course.of(posterior, measurements, sequences))
+
+    @property
+    def problem(self) -> FitProblem:
+        """The joint fit."""
+        return self.normal.problem
 
     def of_motors(self) -> Iterator[_Hypothesis]:
         """Yield what may be wrong with the readings of motors."""
@@ -720,7 +719,7 @@ class _Fit:
         A file may be wrong in all views that have it, or in one. Corners of a board on the base are
         means over the images of a view, changed by the share of those after a change.
         """
-        problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        problem, linear, course = self.problem, self.normal.linear, self.course
         owners = np.array(shared_cameras(problem.outlines.views, problem.first_cameras))
         of_files = [owners == owner for owner in owners]
         boards = {corners.name: corners for corners in problem.boards if len(corners)}
@@ -728,7 +727,7 @@ class _Fit:
             name: course.of_images(table.view, table.pose)
             for name, table in ({"outlines": problem.outlines} | boards).items()
         }
-        residuals = CameraResiduals(problem, state, linear)
+        residuals = CameraResiduals(linear)
         for v, view in enumerate(problem.outlines.views):
             if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
                 continue
@@ -736,8 +735,8 @@ class _Fit:
             moved = []
             for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
                 error = np.zeros((len(problem.outlines.views), 6))
-                error[v] = np.append(turn, np.cross(turn, state.camera_pose.t[v]) - shift)
-                moved.append(residual_changes(problem, linear, "camera_pose", error))
+                error[v] = np.append(turn, np.cross(turn, linear.state.camera_pose.t[v]) - shift)
+                moved.append(residual_changes(linear, "camera_pose", error))
             camera = {
                 name: np.stack([change[name] for change in moved], axis=-1) for name in shares
             }
@@ -753,7 +752,7 @@ class _Fit:
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""
-        problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        problem, linear, course = self.problem, self.normal.linear, self.course
         constraints, legs = LegConstraints(problem.parameters), problem.legs
         readings, outlines = problem.readings, problem.outlines
         share = {
@@ -767,8 +766,8 @@ class _Fit:
                 for column in range(columns.start, columns.stop):
                     error = np.zeros((len(legs.names), LegColumns.COUNT))
                     error[j, column] = 1.0
-                    change = residual_changes(problem, linear, "legs", error)
-                    motion = constraints.following(state, j, column)
+                    change = residual_changes(linear, "legs", error)
+                    motion = constraints.following(linear.state, j, column)
                     moved.append(
                         {
                             of: change[of]
@@ -831,7 +830,7 @@ class _Fit:
                     of_factor[:, :, column[k][blocks]] = (
                         values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
                     )
-        return _Scores(Projected.of(self.problem, self.linear, self.normal, stacked), columns)
+        return _Scores(Projected.of(self.normal, stacked), columns)
 
     def better(self, least: float, by_scatter: float) -> _Solved | None:
         """Return a joint that moved or an error once a turn that explains more than what was found.
@@ -910,8 +909,7 @@ class _Fit:
             name: (values @ amount) * (hypothesis.share[name] @ holds)[:, None]
             for name, values in hypothesis.columns.items()
         }
-        steps = response(self.problem, self.linear, self.normal, changes)
-        return kinematic_steps(self.problem, steps)
+        return kinematic_steps(self.problem, response(self.normal, changes))
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:

@@ -495,8 +495,8 @@ class _Free:
     def estimate(self) -> tuple[Array, Array]:
         """Return the tested parameters (n,) and their covariance (n, n), at most the prior's."""
         problem, state, tested = self.problem, self.minimum.state, self.tested
-        normal = information(problem, state, self.minimum.linear, problem.loss)
-        named = named_covariance(problem, state, normal.kept_covariance())
+        linear = self.minimum.linear
+        named = named_covariance(linear, information(linear, problem.loss).kept_covariance())
         covariance, unit = (
             named[np.ix_(tested, tested)] + self.more,
             np.outer(self.prior, self.prior),
@@ -521,8 +521,9 @@ def _fits(
     number = np.array([block.labels.index(name) for name in prior.names], dtype=np.intp)
     tested = problem.where("legs")[number]
     # Local edge biases do not show in residuals.
-    normal = information(problem, state, linearize(problem, state), loss)
-    at_places = named_covariance(problem, state, posterior.covariance - normal.kept_covariance())
+    linear = linearize(problem, state)
+    without = information(linear, loss).kept_covariance()
+    at_places = named_covariance(linear, posterior.covariance - without)
     at_places = at_places[np.ix_(tested, tested)]
     held = solution.kinematic.of_values(prior.names)[1]
     additional = at_places + prior.held_sigma**2 * held.T @ held

@@ -16,14 +16,14 @@ from scipy.special import chdtrc
 from legcal.calibration.joint_fit.determinacy import HeldDirections, undetermined_directions
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.calibration.tuning import SCATTER_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation.solver import NormalEquations, information, inverse_on_range
+from legcal.estimation.solver import information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LINKS, Leg, ParameterId, radius_name
@@ -50,23 +50,24 @@ RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
 
-def refuse_contradicted_priors(problem: FitProblem, state: State, normal: NormalEquations) -> None:
+def refuse_contradicted_priors(normal: FitNormal) -> None:
     """Refuse stated priors that contradict the measurements.
 
-    *normal* is the information at *state*, a minimum.
+    *normal* is the information at a minimum.
 
     Raises
     ------
     DidNotConverge
         With one sentence for each prior.
     """
+    problem = normal.problem
     if not problem.settings.judges_stated_values:
         return
     names = problem.choices.priors.keys()
     unit_of = dict(zip(problem.named, problem.units, strict=True))
     problems = [
         _contradiction(name, unit_of[name], (prior.mean, prior.sigma), estimate.mean, apart)
-        for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
+        for name, prior, estimate, apart in _contradicted(normal, names)
     ]
     if problems:
         raise DidNotConverge(problems)
@@ -90,21 +91,21 @@ def _contradiction(
     )
 
 
-def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
+def refuse_contradicted_board(normal: FitNormal) -> None:
     """Refuse a calibration board whose dimensions in the dataset contradict the measurements.
 
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
-    *normal* is the information at *state*, a first minimum.
+    *normal* is the information at a first minimum.
     """
     board_of = {board_scale(link): "" if link == "base" else f" on the {link}" for link in LINKS}
-    names = board_of.keys() - problem.choices.priors.keys()
+    names = board_of.keys() - normal.problem.choices.priors.keys()
     problems = [
         f"The dimensions of the calibration board{board_of[name]} contradict the readings and the "
         f"legs: the board is {estimate.mean:.4g} times the size stated in the dataset "
         f"({apart:.0f} standard deviations; assumed accuracy {1e2 * prior.sigma:.2g} %); "
         "measure the board and correct its dimensions in dataset.yaml, or the scale of the "
         f"readings if the board is right, or estimate the size of the board (--set {name}=free)."
-        for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
+        for name, prior, estimate, apart in _contradicted(normal, names)
         if estimate.sigma <= _MAX_SCALE_SIGMA
     ]
     if problems:
@@ -112,11 +113,7 @@ def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalE
 
 
 def _contradicted(
-    problem: FitProblem,
-    state: State,
-    normal: NormalEquations,
-    names: Collection[str],
-    most: float = _SIGNIFICANT,
+    normal: FitNormal, names: Collection[str], most: float = _SIGNIFICANT
 ) -> Iterator[tuple[str, Prior, Prior, float]]:
     """Yield priors of named unknowns that the measurements contradict.
 
@@ -126,8 +123,8 @@ def _contradicted(
     For the information I of the measurements, an estimate at a distance d from the prior mean moves
     to d (1 + 1 / (I sigma^2)) without the prior. The difference has the variance sigma^2 + 1 / I.
     """
-    priors, coordinates = problem.priors, problem.coordinates(state)
-    information_of_named = named_information(problem, state, normal)
+    problem, information_of_named = normal.problem, named_information(normal)
+    priors, coordinates = problem.priors, problem.coordinates(normal.state)
     for i, mean, sigma in zip(
         priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
     ):
@@ -257,8 +254,7 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
 def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
     """Fit with the stated parameters free; return the fit and its held directions."""
     first = first_minimum(problem, state)
-    normal = information(problem, first.state, first.linear, problem.loss)
-    held = undetermined_directions(problem, first.state, normal)
+    held = undetermined_directions(information(first.linear, problem.loss))
     return fit_in_rounds(problem, first, held), held
 
 
@@ -275,10 +271,8 @@ def _compare(
     M f - P w - K m at the stated values m.
     """
     problem, state = fit.problem, fit.state
-    normal = information(problem, state, fit.minimum.linear, problem.loss)
-    total_information = named_information(problem, state, normal) + _held_information(
-        problem, held, state.mean_length
-    )
+    total_information = named_information(information(fit.minimum.linear, problem.loss))
+    total_information += _held_information(problem, held, state.mean_length)
     unknowns = np.array([problem.named.index(name) for name in stated], dtype=np.intp)
     fitted = problem.coordinates(state)[unknowns]
     M, P = (
@@ -477,19 +471,15 @@ def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
     )
 
 
-def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquations) -> list[str]:
-    """Return a note on nominal radii, with default priors, that contradict the measurements.
-
-    *normal* is the information at *state*.
-    """
+def contradicted_radii(normal: FitNormal) -> list[str]:
+    """Return a note on nominal radii, with default priors, that contradict the measurements."""
+    problem = normal.problem
     radii = {radius_name(problem.legs.names[leg], part) for leg, part in problem.outlines.parts}
     names = radii - problem.choices.priors.keys()
     contradictions = [
         f"{name} {1e3 * estimate.mean:.2f} mm against {1e3 * prior.mean:.2f} +- "
         f"{1e3 * prior.sigma:.2f} mm ({apart:.0f} standard deviations)"
-        for name, prior, estimate, apart in _contradicted(
-            problem, state, normal, names, RADIUS_SIGMAS
-        )
+        for name, prior, estimate, apart in _contradicted(normal, names, RADIUS_SIGMAS)
     ]
     if not contradictions:
         return []

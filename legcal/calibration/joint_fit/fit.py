@@ -40,7 +40,7 @@ from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, robust_noise
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
-from legcal.calibration.joint_fit.problem import FitProblem, build_fit
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
@@ -58,7 +58,6 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import (
     Minimum,
-    NormalEquations,
     information,
     minimise,
     normal_equations,
@@ -191,8 +190,8 @@ def _gain_by_edges(fit: Posterior) -> float:
         )[..., problem.free]
         errors = []
         for one in (problem, without):
-            normal = normal_equations(one, state, linearize(one, state))
-            undetermined_directions(one, state, normal)
+            normal = normal_equations(linearize(one, state))
+            undetermined_directions(normal)
             covariance = normal.kept_covariance()[:n, :n]
             errors.append(expected_error(by_parameters, covariance).mean_displacement)
     except NotIdentifiable:
@@ -371,8 +370,7 @@ def _first_minimum_from(
     """First minimum from a state, with the directions held that are open there."""
     begin = problem.projected(begin)
     with contextlib.suppress(NotIdentifiable):  # at the start only, or reported at the minimum
-        normal = information(problem, begin, linearize(problem, begin))
-        held = undetermined_directions(problem, begin, normal)
+        held = undetermined_directions(information(linearize(problem, begin)))
         if len(held.basis):
             problem, begin = held_at_nominal(problem, begin, held)
     return first_minimum(problem, begin, must_converge=must_converge)
@@ -386,9 +384,10 @@ def _refine_minimum(
 ) -> Solution:
     """Refine a first minimum: held directions, rounds, checks, result."""
     refuse_contradicted_values(problem, start, first.state)
-    normal = information(problem, first.state, first.linear, problem.loss)
-    held = undetermined_directions(problem, first.state, normal)
-    refuse_contradicted_board(problem, first.state, normal)
+    # The first minimum may hold directions that are open at its start
+    normal = information(dataclasses.replace(first.linear, problem=problem), problem.loss)
+    held = undetermined_directions(normal)
+    refuse_contradicted_board(normal)
     while True:
         try:
             fit, normal = _fit_holding(problem, held, first)
@@ -408,17 +407,17 @@ def _refine_minimum(
             held = more
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(problem, start, first.state, with_priors=True)
-    refuse_contradicted_priors(fit.problem, fit.state, normal)
+    refuse_contradicted_priors(normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
 
 
 def _fit_holding(
     problem: FitProblem, held: HeldDirections, first: Minimum[State]
-) -> tuple[Fit, NormalEquations]:
+) -> tuple[Fit, FitNormal]:
     """Fit with held directions; also return the information, which must determine all others."""
     fit = fit_in_rounds(problem, first, held)
-    normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-    refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
+    normal = information(fit.minimum.linear, problem.loss)
+    refuse_undetermined_inliers(normal, held, fit.accepted)
     _refuse_other_radii(problem, fit.state)
     return fit, normal
 
@@ -433,15 +432,14 @@ def _open_farther_on(
     """
     with contextlib.suppress(DidNotConverge, NotIdentifiable):
         near = minimise(held, state, held.loss, must_converge=False).state
-        there = linearize(problem, near)
-        found = undetermined_directions(problem, near, information(problem, near, there))
+        found = undetermined_directions(information(linearize(problem, near)))
         return found if len(found.basis) > n_held else None
     return None
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     """Raise NotIdentifiable if open directions explain a failed fit."""
-    undetermined_directions(problem, state, information(problem, state, linearize(problem, state)))
+    undetermined_directions(information(linearize(problem, state)))
 
 
 def _refuse_contradicted(problem: FitProblem, state: State) -> None:
@@ -450,9 +448,7 @@ def _refuse_contradicted(problem: FitProblem, state: State) -> None:
     noise = NoiseModel()
     if len(claimed):
         noise = robust_noise(problem.offsets(state), claimed)
-    problem = problem.weighted(noise)
-    linear = linearize(problem, state)
-    refuse_contradicted_priors(problem, state, information(problem, state, linear))
+    refuse_contradicted_priors(information(linearize(problem.weighted(noise), state)))
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:

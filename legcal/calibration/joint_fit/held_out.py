@@ -21,13 +21,13 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.problem import Residuals, linearize
-from legcal.estimation.solver import NormalEquations, information, minimise
+from legcal.estimation.solver import information, minimise
 from legcal.estimation.uncertainty import left_out_blocks, leverage
 from legcal.geometry.types import Array, IntArray
 
@@ -137,9 +137,9 @@ def compare_held_out(
             f"The held-out images could not be compared with the fit: for {n_inside} outlines, the "
             "readings put a camera inside the leg; check the readings."
         )
-    readings = information(problem, state, linear, only=_READINGS)
+    readings = information(linear, only=_READINGS)
     _refuse_undetermined(readings)
-    expected = np.eye(2) + leverage(problem, linear, readings, "outlines", predicted.covariance)
+    expected = np.eye(2) + leverage(readings, "outlines", predicted.covariance)
     offsets = (L @ linear["outlines"].r[..., None])[..., 0]
     r = linear["outlines"].r
     norm = np.sqrt(np.einsum("ni,nij,nj->n", r, np.linalg.inv(expected), r))  # Mahalanobis
@@ -161,7 +161,7 @@ def compare_held_out(
     )
 
 
-def _refuse_undetermined(readings: NormalEquations) -> None:
+def _refuse_undetermined(readings: FitNormal) -> None:
     """Raise NotIdentifiable if readings do not determine a pose."""
     eigenvalues = np.linalg.eigvalsh(readings.V)
     undetermined = np.flatnonzero(eigenvalues[:, 0] <= _RANK_TOLERANCE * eigenvalues[:, -1])
@@ -219,8 +219,8 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     if problem.n_elements < 2:
         return None
     problem = with_weights(problem, state)
-    linear, block = linearize(problem, state), _blocks(state)
-    left_out = left_out_blocks(problem, state, linear, block)
+    block = _blocks(state)
+    left_out = left_out_blocks(linearize(problem, state), block)
     squares = np.array([one.squares for one in left_out])
     dof = np.array([one.dof for one in left_out], dtype=np.intp)
     held = problem.changed(held_directions=np.eye(problem.n_kinematic))
@@ -243,8 +243,7 @@ def _squares_near(problem: FitProblem, begin: State, block: IntArray) -> float:
     minimum = minimise(
         problem, begin, max_iterations=_STEPS_TO_NOMINAL, tolerance=_NEARLY, must_converge=False
     )
-    left_out = left_out_blocks(problem, minimum.state, minimum.linear, block)
-    return float(sum(one.squares for one in left_out))
+    return float(sum(one.squares for one in left_out_blocks(minimum.linear, block)))
 
 
 def _as_if_true(problem: FitProblem, state: State) -> FitProblem:

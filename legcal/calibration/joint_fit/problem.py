@@ -61,10 +61,12 @@ from legcal.estimation.problem import (
     EstimationProblem,
     Frames,
     GaussianPrior,
+    Linearization,
     Variables,
     all_free,
     fixed_at_start,
 )
+from legcal.estimation.solver import NormalEquations
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms
@@ -268,6 +270,10 @@ class FitProblem(EstimationProblem[State]):
         return _build_problem(
             self.legs, observed, cameras, n_poses, self.images, self.settings, choices
         )
+
+
+FitLinear = Linearization[FitProblem, State]
+FitNormal = NormalEquations[FitProblem, State]
 
 
 def build_fit(

@@ -31,7 +31,7 @@ from legcal.calibration.joint_fit.outline_errors import (
     notes_on_blur,
 )
 from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.scale import sensitivity_to_scale
 from legcal.calibration.joint_fit.sensitivity import (
@@ -47,7 +47,7 @@ from legcal.data.image_tables import Order, inverse, reorder_measurements
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.estimation.problem import linearize
-from legcal.estimation.solver import NormalEquations, robust_cost
+from legcal.estimation.solver import robust_cost
 from legcal.estimation.uncertainty import WorstDirection, named_covariance, worst_directions
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import (
@@ -228,7 +228,7 @@ class Solution:
 
 def assemble_solution(
     fit: Fit,
-    normal: NormalEquations,
+    normal: FitNormal,
     held: HeldDirections,
     outlines: Outlines,
     label: str,
@@ -244,9 +244,9 @@ def assemble_solution(
     kept = normal.kept_covariance()
     if fit.absorbed is not None:
         kept = kept + fit.absorbed[1]
-    covariance = named_covariance(problem, state, kept)
+    covariance = named_covariance(linear, kept)
     quality = _goodness_of_fit(fit, normal, len(held.basis))
-    cameras = CameraResiduals(problem, state, linear)
+    cameras = CameraResiduals(linear)
     contradicted = tuple(cameras.contradicted())
     gammas = _gammas(problem, state, kept, outlines)
     return Solution(
@@ -270,7 +270,7 @@ def assemble_solution(
         gammas=gammas,
         sensitivities=sensitivity_to_cameras(cameras, normal, contradicted)
         | sensitivity_to_exact_cameras(cameras)
-        | sensitivity_to_scale(problem, state, linear, kept)
+        | sensitivity_to_scale(linear, kept)
         | sensitivity_to_intrinsics(problem, kept),
         outlines=_with_rejections(outlines, fit),
         start=label,
@@ -286,24 +286,24 @@ def assemble_solution(
             *reversed_motors(problem, state),
             *map(str, gammas),
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
-            *contradicted_radii(problem, state, normal),
+            *contradicted_radii(normal),
             *map(str, contradicted),
         ),
     )
 
 
-def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
+def _goodness_of_fit(fit: Fit, normal: FitNormal, n_held: int) -> GoodnessOfFit:
     """Residual statistics of a fit with *n_held* held directions."""
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     offsets = problem.offsets(state)
     used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, linear, normal)
+    readings = judged_readings(normal)
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
     claimed = problem.weighted(NoiseModel())
     return GoodnessOfFit(
-        cost=robust_cost(claimed, linearize(claimed, state), claimed.loss),
+        cost=robust_cost(linearize(claimed, state), claimed.loss),
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
         dof=n_residuals - problem.n_unknowns + n_held,
         rms_px=rms(used),
