@@ -681,20 +681,26 @@ class _Fit:
         """The joint fit."""
         return self.normal.problem
 
+    def _wrong_readings(
+        self, kind: Kind, subject: str, unit: str, by: Array, groups: Array | None = None
+    ) -> _Hypothesis:
+        """Return the hypothesis that readings are wrong by multiples of *by* (n, d).
+
+        In blocks of images, or in *groups* of these (n_blocks, n_groups).
+        """
+        problem, readings = self.problem, self.problem.readings
+        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
+        columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
+        share = self.course.of_poses(readings.pose)
+        share = share if groups is None else share @ groups
+        return _Hypothesis(kind, subject, unit, columns, {"readings": share}, kind == "encoder")
+
     def of_motors(self) -> Iterator[_Hypothesis]:
         """Yield what may be wrong with the readings of motors."""
-        problem, course, legs = self.problem, self.course, self.problem.legs.nominal
-        readings, reading = problem.readings, problem.readings.reading
+        course, legs, wrong_by = self.course, self.problem.legs.nominal, self._wrong_readings
+        readings, reading = self.problem.readings, self.problem.readings.reading
         row = course.row_of_pose[readings.pose]
-        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
-        share = {"readings": course.of_poses(readings.pose)}
         last_move = _last_moves(reading, readings.leg, row, course.before)
-
-        def wrong_by(kind: Kind, subject: str, unit: str, by: Array) -> _Hypothesis:
-            """Return the hypothesis that readings are wrong by multiples of *by* (n, d)."""
-            columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
-            return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
-
         motors = np.unique(readings.leg)
         if len(motors) > 1 and len(units := {legs[j].reading_unit for j in motors.tolist()}) == 1:
             of_each = np.equal(readings.leg[:, None], motors)
@@ -708,8 +714,7 @@ class _Fit:
             yield wrong_by("backlash", subject, unit, of_motor * 0.5 * np.sign(last_move)[:, None])
             turned = math.tau if leg.reads_angle else math.inf
             if np.ptp(reading[of_motor[:, 0]]) > _GOOD_PART * turned:
-                once_a_turn = np.column_stack([np.cos(reading), np.sin(reading)])
-                yield wrong_by("eccentricity", subject, unit, of_motor * once_a_turn)
+                yield wrong_by("eccentricity", subject, unit, of_motor * _once_a_turn(reading))
         yield wrong_by("lag", "", "1", last_move[:, None])
         yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
 
@@ -785,32 +790,19 @@ class _Fit:
 
     def of_screws(self) -> Iterator[list[_Hypothesis]]:
         """Yield errors once a turn of the screws of each motor that slides, of usual leads."""
-        problem, course = self.problem, self.course
-        readings, reading = problem.readings, problem.readings.reading
-        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
-        group = (
-            np.arange(course.n_blocks) * min(_COARSE, course.n_blocks) // max(course.n_blocks, 1)
-        )
-        coarse = np.equal(group[:, None], np.unique(group)).astype(np.float64)
-        share = {"readings": course.of_poses(readings.pose) @ coarse}
+        readings, n = self.problem.readings, self.course.n_blocks
+        group = np.arange(n) * min(_COARSE, n) // max(n, 1)
+        groups = np.equal(group[:, None], np.unique(group)).astype(np.float64)
         for j in np.unique(readings.leg).tolist():
-            leg = problem.legs.nominal[j]
-            if leg.reads_angle:
-                continue
-            by_error = -readings.sign * whitening * (readings.leg == j)
-            turns = [math.tau * reading / (1e-3 * lead) for lead in _LEADS]
-            once_a_turn = (np.column_stack([np.cos(turn), np.sin(turn)]) for turn in turns)
-            yield [
-                _Hypothesis(
-                    "eccentricity",
-                    leg.motor_label,
-                    "m",
-                    {"readings": by_error[:, None, None] * by[:, None]},
-                    share,
-                    False,
-                )
-                for by in once_a_turn
-            ]
+            leg, of_motor = self.problem.legs.nominal[j], (readings.leg == j)[:, None]
+            if not leg.reads_angle:
+                turns = (math.tau * readings.reading / (1e-3 * lead) for lead in _LEADS)
+                yield [
+                    self._wrong_readings(
+                        "eccentricity", leg.motor_label, "m", of_motor * _once_a_turn(turn), groups
+                    )
+                    for turn in turns
+                ]
 
     def scores(self, hypotheses: Sequence[_Hypothesis]) -> _Scores:
         """Compute the scores of hypotheses."""
@@ -912,6 +904,11 @@ class _Fit:
         return kinematic_steps(self.problem, response(self.normal, changes))
 
 
+def _once_a_turn(angle: Array) -> Array:
+    """Return the numbers (n, 2) of an error that comes again with each turn."""
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
     """Return how far readings are from those of the pose before, zero for first poses."""
     keys = zip(leg.tolist(), row.tolist(), strict=True)
@@ -1006,28 +1003,32 @@ class _Solved(NamedTuple):
         return self.estimated.covariance * self.scatter
 
 
+def _encoders(hypotheses: Sequence[_Hypothesis]) -> dict[str, list[tuple[int, int]]]:
+    """Return the hypotheses of the zeros of single encoders, and their number, by unit."""
+    found: dict[str, list[tuple[int, int]]] = {"m": [], "rad": []}
+    for i, h in enumerate(hypotheses):
+        if h.kind == "encoder" and h.subject != ALL_MOTORS:
+            found[h.unit].append((i, 0))
+    return found
+
+
 def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
     """Return what scatters from image to image: readings beyond what is stated, or a camera."""
-    encoders = [
-        i for i, h in enumerate(hypotheses) if h.kind == "encoder" and h.subject != ALL_MOTORS
-    ]
+    encoders = _encoders(hypotheses)
+    single = sorted(one for alike in encoders.values() for one in alike)
     groups: list[tuple[Kind, str, list[tuple[int, int]]]] = [
-        ("reading_noise", hypotheses[i].subject, [(i, 0)]) for i in encoders
+        ("reading_noise", hypotheses[one[0]].subject, [one]) for one in single
     ]
-    for unit in ("m", "rad"):
-        alike = [(i, 0) for i in encoders if hypotheses[i].unit == unit]
+    for unit, alike in encoders.items():
         if len(alike) > 1:
-            subject = ALL_MOTORS if len(alike) == len(encoders) else f"all motors [{unit}]"
+            subject = ALL_MOTORS if len(alike) == len(single) else f"all motors [{unit}]"
             groups.append(("reading_noise", subject, alike))
     for i, hypothesis in enumerate(hypotheses):
         if hypothesis.kind == "focal_length":
             groups.append(("autofocus", hypothesis.subject, [(i, 0)]))
         if hypothesis.kind == "camera":
             groups.append(("vibration", hypothesis.subject, [(i, row) for row in range(3)]))
-    tests = [
-        _Scatter.of(kind, subject, group, hypotheses, scores, len(groups))
-        for kind, subject, group in groups
-    ]
+    tests = [_Scatter.of(*group, hypotheses, scores, len(groups)) for group in groups]
     if all(test.p_value > DOUBT_BY_CHANCE for test in tests):
         return None
     best = max(tests, key=lambda test: test.gain)
@@ -1046,11 +1047,23 @@ class _Scatter:
     kind: Kind
     subject: str
     group: Sequence[tuple[int, int]]  # hypotheses and their numbers that scatter alike
-    p_value: float  # times the number of tests
     sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block [m, rad or 1]
     stated: float  # of a reading, in the median of motors, or of a camera that stands still
     eigenvalues: Array  # (c,) of K
     squares: Array  # (c,) of z along the eigenvectors
+    n_tests: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such squares by chance, times the number of tests.
+
+        A weighted sum of squares is nearly chi-squared.
+        """
+        own, least = self.eigenvalues, np.finfo(np.float64).tiny
+        total = max(float(own.sum()), least)
+        dof = total**2 / max(float(own @ own), least)
+        by_chance = float(chdtrc(dof, float(self.squares.sum()) * dof / total))
+        return min(self.n_tests * by_chance, 1.0)
 
     @cached_property
     def _likeliest(self) -> tuple[float, float]:
@@ -1093,41 +1106,27 @@ class _Scatter:
         group: Sequence[tuple[int, int]],
         hypotheses: Sequence[_Hypothesis],
         scores: _Scores,
-        n_tests: int,
+        n_tests: int = 1,
     ) -> _Scatter:
-        """Test what scatters."""
-        own, squares, sigmas, stated = _spectrum(group, hypotheses, scores)
-        # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
-        total = max(float(own.sum()), np.finfo(np.float64).tiny)
-        dof = total**2 / max(float(own @ own), np.finfo(np.float64).tiny)
-        p_value = min(n_tests * float(chdtrc(dof, float(squares.sum()) * dof / total)), 1.0)
-        return cls(kind, subject, group, p_value, sigmas, stated, own, squares)
-
-
-def _spectrum(
-    group: Sequence[tuple[int, int]], hypotheses: Sequence[_Hypothesis], scores: _Scores
-) -> tuple[Array, Array, list[Array], float]:
-    """Return the eigenvalues of K and the squares of z along its vectors, see :class:`_Scatter`.
-
-    Also what is stated: of single blocks, and in the median of a reading or a camera.
-    """
-    sigmas, stated = list[Array](), list[float]()
-    for i, row in group:
-        hypothesis = hypotheses[i]
-        if steady := _STEADY.get(hypothesis.kind):
-            stated.append(steady)
-            sigmas.append(np.full(scores.column[i].shape[1], steady))
-            continue
-        ((name, wrong),) = hypothesis.columns.items()
-        read = wrong[:, 0, row] != 0.0
-        stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
-        n = hypothesis.share[name][read].sum(axis=0)
-        sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
-    columns, sigma = scores.of_single(group, sigmas)
-    z = sigma * scores.scores.score[columns]
-    K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
-    own, vector = np.linalg.eigh(K)
-    return np.maximum(own, 0.0), (vector.T @ z) ** 2, sigmas, float(np.median(stated))
+        """Return the scatter of a group of numbers."""
+        sigmas, stated = list[Array](), list[float]()
+        for i, row in group:
+            hypothesis = hypotheses[i]
+            if steady := _STEADY.get(hypothesis.kind):
+                stated.append(steady)
+                sigmas.append(np.full(scores.column[i].shape[1], steady))
+                continue
+            ((name, wrong),) = hypothesis.columns.items()
+            read = wrong[:, 0, row] != 0.0
+            stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
+            n = hypothesis.share[name][read].sum(axis=0)
+            sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
+        columns, sigma = scores.of_single(group, sigmas)
+        z = sigma * scores.scores.score[columns]
+        K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
+        own, vector = np.linalg.eigh(K)
+        squares, usual = (vector.T @ z) ** 2, float(np.median(stated))
+        return cls(kind, subject, group, sigmas, usual, np.maximum(own, 0.0), squares, n_tests)
 
 
 def _loss(more: Array, own: Array, squares: Array) -> float:
@@ -1139,17 +1138,13 @@ def _loss(more: Array, own: Array, squares: Array) -> float:
 def _overstated(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> dict[str, tuple[float, ...]]:
     """Return how much readings of a unit scatter, and what is stated, where that is far more."""
     found = dict[str, tuple[float, ...]]()
-    for unit in ("m", "rad"):
-        group = [
-            (i, 0)
-            for i, h in enumerate(hypotheses)
-            if h.kind == "encoder" and h.subject != ALL_MOTORS and h.unit == unit
-        ]
+    for unit, group in _encoders(hypotheses).items():
         if not group:
             continue
-        own, squares, _, stated = _spectrum(group, hypotheses, scores)
+        one = _Scatter.of("reading_noise", unit, group, hypotheses, scores)
+        own, squares = one.eigenvalues, one.squares
         less = np.square(_LESS) - 1.0  # of the variance
         loss = [_loss(v * np.minimum(own, 1.0), own, squares) for v in less]
         if min(loss) < -_SURELY_LESS:
-            found[unit] = float(_LESS[int(np.argmin(loss))]) * stated, stated
+            found[unit] = float(_LESS[int(np.argmin(loss))]) * one.stated, one.stated
     return found
