@@ -251,13 +251,8 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         if arms:
             outlines = join_outlines([outlines, _of_arms(data, measured, arms)])
         of_views = data.measurements.views
-        hints = hint_notes(
-            [view.name for view in of_views],
-            [view.T_base_camera for view in of_views],
-            cameras,
-            BEFORE_FIT,
-            by_landmarks=data.measurements.clicked_views,
-        )
+        clicked = data.measurements.clicked_views
+        hints = hint_notes(of_views, cameras, BEFORE_FIT, by_landmarks=clicked)
         barely = image_notes(data.measurements, measured.placement.barely)
         notes_on_images = [*hints, *measured.placement.notes, *barely]
         if without_gamma := [v.name for v in of_views if not v.camera.gamma_is_given]:

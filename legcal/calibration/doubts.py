@@ -197,11 +197,9 @@ def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
     It is grave where platform poses were looked for near the stated cameras.
     """
     m, machine = dataset.measurements, dataset.machine
-    shown = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
-    places = solution.cameras_in_base(machine.T_base_Rb)
     strayed = far_from_hints(
         [None if view.name in m.clicked_views else view.T_base_camera for view in m.views],
-        [T if v in shown else None for v, T in enumerate(places)],
+        solution.shown_cameras(m, machine.T_base_Rb),
     )
     if not strayed:
         return []

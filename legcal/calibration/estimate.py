@@ -43,8 +43,6 @@ from legcal.data.outlines import (
     along_legs,
     join_outlines,
     no_outlines,
-    polished_parts,
-    reject_unused_legs,
     through_cameras,
 )
 from legcal.data.photograph_notes import compression_notes
@@ -53,10 +51,8 @@ from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.solver import minimise
 from legcal.estimation.uncertainty import restricted_log_likelihood
 from legcal.files.schema import few
-from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
-from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.body_edges import has_bodies, measure_body_edges
 from legcal.perception.diagnostics import is_visible, reject_images
 from legcal.perception.outline import measure_in_brief, used_as_before
@@ -67,7 +63,7 @@ from legcal.perception.photographs import (
     place_and_measure,
     with_measured_radii,
 )
-from legcal.perception.placement import Joined, Placement, placed_arms
+from legcal.perception.placement import Joined, Placement
 
 # Least common bias of all outlines in photographs [px]: limb shading outside of the model acts like
 # a change of the radii, so that residuals never show it.
@@ -156,10 +152,7 @@ def fit_outlines(
     NotIdentifiable, DidNotConverge
         As the joint fit.
     """
-    fitted_outlines = outlines.at(fitted.rows)
-    fitted_outlines = reject_unused_legs(
-        fitted_outlines, fitted.measurements, fitted.machine.leg_names
-    )
+    fitted_outlines = fitted.of_used_legs(outlines)
     unseen = unseen_legs(fitted.machine, fitted.measurements, fitted_outlines)
     if options.every_leg and unseen:
         raise NotVisible(
@@ -169,10 +162,6 @@ def fit_outlines(
         )
     if steps is None:
         steps = four_steps(fitted, fitted_outlines, board, options)
-    fitted_edges = None if edges is None else edges.at(fitted.rows)
-    if fitted_edges is not None:
-        names = fitted.machine.leg_names
-        fitted_edges = reject_unused_legs(fitted_edges, fitted.measurements, names)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in fitted_outlines.source:
@@ -186,7 +175,7 @@ def fit_outlines(
         settings,
         board=None if board is None else board.at(fitted.rows),
         choices=choices,
-        edges=fitted_edges,
+        edges=None if edges is None else fitted.of_used_legs(edges),
     )
     fitted.progress("Joint fit", 1, 1)
     corners = None if board is None else board.reject_outliers(solution, fitted)
@@ -403,21 +392,11 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 
 
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
-    """Return the legs and cameras of a fit, with R_b on the nominal one."""
-    T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
-    m = data.measurements
-    q = measured_readings(solution.legs, *poses, m.q_of_poses)
-    A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
-    pose = data.measurements.pose
-    cameras = tuple(
-        None if known is None else T
-        for known, T in zip(
-            seen.placement.T_base_camera, solution.cameras_in_base(T_base_Rb), strict=True
-        )
-    )
-    arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
-    polished = polished_parts(solution.outlines)
-    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms, polished)
+    """Return the legs and cameras of a fit in all images; none of views without any before it."""
+    poses = data.poses_by(solution.legs)
+    placed = solution.placement(data.machine, data.measurements, poses, seen.blur)
+    both = zip(seen.placement.T_base_camera, placed.T_base_camera, strict=True)
+    return replace(placed, T_base_camera=tuple(None if known is None else T for known, T in both))
 
 
 def shown_near(estimate: Estimate, placement: Placement) -> Placement:

@@ -29,7 +29,7 @@ from legcal.data.image_tables import (
 )
 from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, images_in_words, row_names
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, reject_unused_legs
 from legcal.errors import DatasetError
 from legcal.files.schema import few
 from legcal.geometry.motions import components, product
@@ -203,6 +203,11 @@ class OrderedDataset:
             measurements=measurements_at(self.measurements, rows),
             rows=self.rows[rows],
         )
+
+    def of_used_legs(self, outlines: Outlines) -> Outlines:
+        """Return the outlines in these images of all, those of legs not named in views rejected."""
+        own = outlines.at(self.rows)
+        return reject_unused_legs(own, self.measurements, self.machine.leg_names)
 
     def in_file_order(self) -> tuple[Dataset, Order]:
         """Return the dataset of these images in the order of the files, and that order."""

@@ -69,7 +69,6 @@ from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import Override, listed, overrides_of_call
 from legcal.data.image_choice import chosen_images, dataset_at, own_zeros, split_images
 from legcal.data.measurements import few_views, image_notes, still_encoders
-from legcal.data.outlines import reject_unused_legs
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import (
     DatasetError,
@@ -82,10 +81,8 @@ from legcal.errors import (
 )
 from legcal.files.folder import check_destination, output_path
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.motions import components
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.machine.leg import ParameterId
-from legcal.machine.rods import ends_at_poses
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.outline import measure_in_brief
@@ -468,12 +465,11 @@ def _estimate(
 
 def _wrong_names(estimate: Estimate) -> tuple[Diagnosis, ...]:
     """Return given outlines that the fit has at the place of other legs."""
-    solution, m = estimate.solution, estimate.fitted.measurements
-    ends = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
-    seen = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
-    cameras = [T.inv() if v in seen else None for v, T in enumerate(solution.T_camera_Rb)]
-    A, B = (joints[m.pose] for joints in ends)
-    return exchanged_legs(solution.outlines, m, solution.legs, (A, B), cameras)
+    solution, m, machine = estimate.solution, estimate.fitted.measurements, estimate.fitted.machine
+    placed = solution.placement(machine, m)
+    cameras = solution.shown_cameras(m, machine.T_base_Rb)
+    ends = placed.A_base, placed.B_base
+    return exchanged_legs(solution.outlines, m, solution.legs, ends, cameras)
 
 
 def _leaves_out_many(estimate: Estimate) -> bool:
@@ -494,20 +490,10 @@ def _leaves_out_many(estimate: Estimate) -> bool:
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
-    fitted, o = estimate.fitted, estimate.solution.outlines
-    shown = set(fitted.measurements.view[o.row[o.used]].tolist())
-    views = fitted.measurements.views
-    cameras = [
-        T if v in shown else None
-        for v, T in enumerate(estimate.solution.cameras_in_base(fitted.machine.T_base_Rb))
-    ]
-    hints = hint_notes(
-        [view.name for view in views],
-        [view.T_base_camera for view in views],
-        cameras,
-        by_landmarks=fitted.measurements.clicked_views,
-    )
-    return (*hints, *image_notes(fitted.measurements, estimate.outliers))
+    m = estimate.fitted.measurements
+    cameras = estimate.solution.shown_cameras(m, estimate.fitted.machine.T_base_Rb)
+    hints = hint_notes(m.views, cameras, by_landmarks=m.clicked_views)
+    return (*hints, *image_notes(m, estimate.outliers))
 
 
 def _refuse_too_few(
@@ -583,9 +569,7 @@ def _fitted_and_held_out(
 
 def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> Holdout:
     held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
-    outlines = estimate.outlines.at(held_out.rows)
-    outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
-    poses = held_out.poses_by(solution.legs)
+    outlines, poses = held_out.of_used_legs(estimate.outlines), held_out.poses_by(solution.legs)
     return compare_held_out(solution.posterior, held_out.measurements, outlines, poses)
 
 

@@ -46,7 +46,6 @@ from legcal.errors import (
 )
 from legcal.files.folder import RESULT, in_the_way, path_problem, result_folder
 from legcal.files.reading import read_json
-from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.home import home_of_legs
@@ -63,9 +62,7 @@ from legcal.machine.parameters import (
     turns_between,
     vector_of,
 )
-from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.pages.document import PAGE
-from legcal.perception.placement import placed_arms
 from legcal.progress import Report, no_progress
 from legcal.vision.camera import Camera, camera_numbers, intrinsic_names, intrinsic_values
 from legcal.workers import Run, in_turn
@@ -462,30 +459,20 @@ def earlier_overlays(destination: Path) -> list[Path]:
 
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines, legs and cameras of a fit as a detection."""
-    machine, measurements = dataset.machine, dataset.measurements
-    poses = components(solution.T_Rb_Re)
-    q = measured_readings(solution.legs, *poses, measurements.q_of_poses)
-    A, B = ends_in_base(solution.legs, machine.T_base_Rb, *poses, q)
-    cylinders = with_radii(
-        [leg.cylinders for leg in machine.legs],
-        lambda j, c: solution.radii.get((j, c.link), c.radius),
-    )
+    placed = solution.placement(dataset.machine, dataset.measurements)
     return Detection(
         dataset=dataset,
         outlines=solution.outlines,
-        A_base=A[measurements.pose],
-        B_base=B[measurements.pose],
-        cylinders=cylinders,
-        T_base_camera=solution.cameras_in_base(machine.T_base_Rb),
+        A_base=placed.A_base,
+        B_base=placed.B_base,
+        cylinders=with_radii(
+            [leg.cylinders for leg in dataset.machine.legs],
+            lambda j, c: solution.radii.get((j, c.link), c.radius),
+        ),
+        T_base_camera=placed.T_base_camera,
         rows=rows_with_image(dataset),
         unplaced={},
         image_notes=(),
         leg_notes=(),
-        arms=placed_arms(
-            solution.legs,
-            q,
-            measurements.pose,
-            T_base=machine.T_base_Rb,
-            radii=solution.radii,
-        ),
+        arms=placed.arms,
     )

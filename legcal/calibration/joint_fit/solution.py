@@ -44,11 +44,13 @@ from legcal.calibration.joint_fit.sensitivity import (
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import Order, inverse, reorder_measurements
-from legcal.data.outlines import Outlines
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, polished_parts
 from legcal.data.reasons import Reason, Rejection
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import robust_cost
 from legcal.estimation.uncertainty import WorstDirection, named_covariance, worst_directions
+from legcal.geometry.motions import components
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import (
     Leg,
@@ -56,7 +58,10 @@ from legcal.machine.leg import (
     radius_name,
     with_platform_points,
 )
+from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries, parametrize, vector_of
+from legcal.machine.rods import ends_in_base, measured_readings
+from legcal.perception.placement import Placement, placed_arms
 from legcal.vision.camera import Camera
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
@@ -224,6 +229,32 @@ class Solution:
     def cameras_in_base(self, T_base_Rb: RigidTransform) -> tuple[RigidTransform, ...]:
         """Return T_base_camera of every view, with R_b at its nominal pose in the base."""
         return tuple(T_base_Rb * T.inv() for T in self.T_camera_Rb)
+
+    def shown_cameras(
+        self, measurements: Measurements, T_base_Rb: RigidTransform
+    ) -> tuple[RigidTransform | None, ...]:
+        """Return T_base_camera of the views with an outline in the fit, None of others."""
+        shown = np.unique(measurements.view[self.outlines.row[self.outlines.used]])
+        cameras = self.cameras_in_base(T_base_Rb)
+        return tuple(T if v in shown else None for v, T in enumerate(cameras))
+
+    def placement(
+        self,
+        machine: Machine,
+        measurements: Measurements,
+        T_Rb_Re: Sequence[RigidTransform] | None = None,
+        blur: Sequence[float] = (),
+    ) -> Placement:
+        """Return the legs and cameras of the fit, with R_b on the nominal one.
+
+        At its own poses, or at those of other images of the same views.
+        """
+        T_base_Rb, poses = machine.T_base_Rb, components(T_Rb_Re or self.T_Rb_Re)
+        q = measured_readings(self.legs, *poses, measurements.q_of_poses)
+        A, B = (ends[measurements.pose] for ends in ends_in_base(self.legs, T_base_Rb, *poses, q))
+        arms = placed_arms(self.legs, q, measurements.pose, T_base=T_base_Rb, radii=self.radii)
+        cameras, polished = self.cameras_in_base(T_base_Rb), polished_parts(self.outlines)
+        return Placement.of_fit(A, B, cameras, blur, arms, polished)
 
 
 def assemble_solution(
