@@ -187,7 +187,7 @@ def mistakes(data: OrderedDataset) -> list[Mistake]:
         *_image_mistakes(data, given),
         *_handedness_mistake(given),
         *_radius_mistakes(given),
-        *_focal_length_mistakes(given),
+        *(_focal_length(given, factor) for factor in _FOCAL_LENGTHS),
     ]
     return [
         mistake for mistake in candidates if mistake.true.is_in_travel or not given.is_in_travel
@@ -712,12 +712,8 @@ def _radius_mistakes(given: Assumed) -> Iterator[Mistake]:
         )
 
 
-def _focal_length_mistakes(given: Assumed) -> Iterator[Mistake]:
-    """Yield focal lengths of images that were scaled or cropped."""
-    yield from (_focal_length(given, factor) for factor in _FOCAL_LENGTHS)
-
-
 def _focal_length(given: Assumed, factor: float) -> Mistake:
+    """Return the focal length of images that were scaled or cropped."""
     return Mistake(
         "focal length",
         f"the focal length appears to be {factor:.2g} times the stated one (images scaled or "

@@ -772,7 +772,7 @@ def find_remedies(
     raise a rank.
     """
     n_parameters = analysis.full.of
-    before = _score(analysis)
+    _, before = _score(analysis)
     images, more = int(np.bincount(analysis.session.view).min()), list[_Candidate]()
     if replanned is not None and images < _ENOUGH_IMAGES:
         text = f"take {_ENOUGH_IMAGES} images a view instead of {images}"
@@ -789,37 +789,29 @@ def find_remedies(
     return everything or sufficient or helpful
 
 
-@dataclass(frozen=True)
-class _Score:
-    """How many directions are open, and how many of them move the platform."""
-
-    open: int
-    harmful: int
-
-
 # What to do, the analysis with that, and parameters that are known then
 _Candidate = tuple[str, Analysis, Sequence[int]]
 
 
-def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
-    """Count the open directions with some parameters *known*."""
+def _score(analysis: Analysis, known: Sequence[int] = ()) -> tuple[int, int]:
+    """Count the open directions with some parameters *known*, and those that move the platform."""
     session, motion = analysis.session, analysis.motion
     extra = np.zeros((len(known), len(session.unit)))
     extra[np.arange(len(known)), list(known)] = _WELL_KNOWN / session.mean_length
     rows = np.concatenate([analysis.information, extra])
-    return _Score(len(undetermined(session, rows)), missing(session, rows, motion))
+    return len(undetermined(session, rows)), missing(session, rows, motion)
 
 
-def _try_kind(kind: Iterable[_Candidate], before: _Score, n_parameters: int) -> list[Remedy]:
+def _try_kind(kind: Iterable[_Candidate], before: int, n_parameters: int) -> list[Remedy]:
     """Return the first few sufficient candidates of a kind, else the most helpful one."""
     sufficient, helpful = list[Remedy](), list[tuple[int, Remedy]]()
     for tried, (text, changed, known) in enumerate(kind):
-        after = _score(changed, known)
-        gain = before.harmful - after.harmful
+        n_open, harmful = _score(changed, known)
+        gain = before - harmful
         if gain <= 0:
             continue
-        complete = after.harmful == 0
-        remedy = Remedy(text, n_parameters - after.open, complete)
+        complete = harmful == 0
+        remedy = Remedy(text, n_parameters - n_open, complete)
         if complete:
             sufficient.append(remedy)
         else:
@@ -831,12 +823,14 @@ def _try_kind(kind: Iterable[_Candidate], before: _Score, n_parameters: int) -> 
 
 def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield further camera positions that show weak legs and their neighbours."""
-    session, weak = analysis.session, _weak_legs(analysis)
+    session, touched = analysis.session, {p for d in _harmful(analysis) for p in d.parameters}
+    names = enumerate(session.leg_names)
+    weak = {j for j, name in names if any(p.startswith(f"{name}.") for p in touched)}
     ring = legs_around(session)
     largest = max(len(view) for view in session.views)
     for size in sorted({min(k, session.n_legs) for k in (3, 4, largest)}):
-        groups = [legs for legs in neighbours(ring, size) if set(weak) & set(legs)]
-        groups.sort(key=lambda legs: -len(set(weak) & set(legs)))
+        groups = [legs for legs in neighbours(ring, size) if weak & set(legs)]
+        groups.sort(key=lambda legs: -len(weak & set(legs)))
         for legs in groups:
             named = legs_in_words(legs, session.leg_names)
             more = analysis.elsewhere(_extended(session, legs))
@@ -863,12 +857,6 @@ def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:
     for which in choices:
         known = [names.index(name) for name in which]
         yield f"fix {list_in_words(which)}", analysis, known
-
-
-def _weak_legs(analysis: Analysis) -> list[int]:
-    touched = {p for d in _harmful(analysis) for p in d.parameters}
-    names = analysis.session.leg_names
-    return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
 
 
 def _harmful(analysis: Analysis) -> list[WeakDirection]:

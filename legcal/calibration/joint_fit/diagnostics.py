@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 
 import numpy as np
 from scipy.special import chdtrc
@@ -140,17 +139,6 @@ def _contradicted(
             yield problem.named[i], Prior(mean, sigma), estimate, apart
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """A stated value and its estimate from the measurements."""
-
-    name: str
-    unit: str
-    estimate: float
-    sigmas_joint: float  # difference in standard deviations, other stated values free
-    sigmas_alone: float  # the same, other stated values right
-
-
 def refuse_contradicted_values(
     problem: FitProblem,
     start: Start,
@@ -198,19 +186,21 @@ def refuse_contradicted_values(
     stated = {name: value for name, value in stated.items() if name in wider.named}
     if not stated:
         return
-    comparisons: list[_Comparison] = []
+    comparisons: list[tuple[str, str, float, tuple[float, float]]] = []
     for start_state in (wider.begin(start), state):
         try:
-            fit, held = _refit(wider, start_state)
+            first = first_minimum(wider, start_state)
+            held = undetermined_directions(information(first.linear, wider.loss))
+            fit = fit_in_rounds(wider, first, held)
         except (DidNotConverge, NotIdentifiable):
             continue
         comparisons = _compare(fit, held, stated, wide)
         break
-    for apart in (attrgetter("sigmas_joint"), attrgetter("sigmas_alone")):
+    for k in range(2):
         problems = [
-            _contradiction(one.name, one.unit, stated[one.name], one.estimate, apart(one))
-            for one in comparisons
-            if apart(one) > _SIGNIFICANT
+            _contradiction(name, unit, stated[name], estimate, sigmas[k])
+            for name, unit, estimate, sigmas in comparisons
+            if sigmas[k] > _SIGNIFICANT
         ]
         if problems:
             raise DidNotConverge(problems)
@@ -251,20 +241,16 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
     return Prior(value, max(float(wide), sigma))
 
 
-def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
-    """Fit with the stated parameters free; return the fit and its held directions."""
-    first = first_minimum(problem, state)
-    held = undetermined_directions(information(first.linear, problem.loss))
-    return fit_in_rounds(problem, first, held), held
-
-
 def _compare(
     fit: Fit,
     held: HeldDirections,
     stated: Mapping[str, tuple[float, float]],
     wide: Mapping[str, Prior],
-) -> list[_Comparison]:
+) -> list[tuple[str, str, float, tuple[float, float]]]:
     """Compare stated values with their estimates, where the measurements depend on them.
+
+    Return names and units, estimates, and their differences in standard deviations: with the other
+    stated values free, and with these right.
 
     M is the information of these parameters, including their wide priors P around w, and f the
     estimates. The measurements alone have the information K = M - P, and the gradient
@@ -289,15 +275,10 @@ def _compare(
         if measured < _MIN_INFORMATION_WIDE * P[i]:
             continue
         joint_sigmas = abs(fitted[i] - mean[i]) / np.sqrt(covariance[i, i] + sigma[i] ** 2)
-        comparisons.append(
-            _Comparison(
-                name,
-                problem.units[unknowns[i]],
-                float(fitted[i]),
-                float(joint_sigmas) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0,
-                float(abs(slope[i] / measured) / np.sqrt(1.0 / measured + sigma[i] ** 2)),
-            )
-        )
+        together = float(joint_sigmas) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0
+        alone = float(abs(slope[i] / measured) / np.sqrt(1.0 / measured + sigma[i] ** 2))
+        unit = problem.units[unknowns[i]]
+        comparisons.append((name, unit, float(fitted[i]), (together, alone)))
     return comparisons
 
 

@@ -40,8 +40,8 @@ from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, robust_noise
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
-from legcal.calibration.joint_fit.problem import FitNormal, FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
+from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
@@ -390,7 +390,10 @@ def _refine_minimum(
     refuse_contradicted_board(normal)
     while True:
         try:
-            fit, normal = _fit_holding(problem, held, first)
+            fit = fit_in_rounds(problem, first, held)
+            normal = information(fit.minimum.linear, problem.loss)
+            refuse_undetermined_inliers(normal, held, fit.accepted)
+            _refuse_other_radii(problem, fit.state)
             break
         except (DidNotConverge, NotIdentifiable) as failure:
             within, at = held_at_nominal(problem, first.state, held)
@@ -409,17 +412,6 @@ def _refine_minimum(
         refuse_contradicted_values(problem, start, first.state, with_priors=True)
     refuse_contradicted_priors(normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
-
-
-def _fit_holding(
-    problem: FitProblem, held: HeldDirections, first: Minimum[State]
-) -> tuple[Fit, FitNormal]:
-    """Fit with held directions; also return the information, which must determine all others."""
-    fit = fit_in_rounds(problem, first, held)
-    normal = information(fit.minimum.linear, problem.loss)
-    refuse_undetermined_inliers(normal, held, fit.accepted)
-    _refuse_other_radii(problem, fit.state)
-    return fit, normal
 
 
 def _open_farther_on(

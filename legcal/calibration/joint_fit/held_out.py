@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.documents import Holdout
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
-from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
+from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
@@ -138,7 +138,13 @@ def compare_held_out(
             "readings put a camera inside the leg; check the readings."
         )
     readings = information(linear, only=_READINGS)
-    _refuse_undetermined(readings)
+    eigenvalues = np.linalg.eigvalsh(readings.V)
+    undetermined = np.flatnonzero(eigenvalues[:, 0] <= _RANK_TOLERANCE * eigenvalues[:, -1])
+    if len(undetermined):
+        raise NotIdentifiable(
+            "The held-out images could not be compared with the fit: their readings do not "
+            f"determine platform pose {undetermined[0] + 1}; leave out --holdout."
+        )
     expected = np.eye(2) + leverage(readings, "outlines", predicted.covariance)
     offsets = (L @ linear["outlines"].r[..., None])[..., 0]
     r = linear["outlines"].r
@@ -159,17 +165,6 @@ def compare_held_out(
             for v in np.unique(view).tolist()
         },
     )
-
-
-def _refuse_undetermined(readings: FitNormal) -> None:
-    """Raise NotIdentifiable if readings do not determine a pose."""
-    eigenvalues = np.linalg.eigvalsh(readings.V)
-    undetermined = np.flatnonzero(eigenvalues[:, 0] <= _RANK_TOLERANCE * eigenvalues[:, -1])
-    if len(undetermined):
-        raise NotIdentifiable(
-            "The held-out images could not be compared with the fit: their readings do not "
-            f"determine platform pose {undetermined[0] + 1}; leave out --holdout."
-        )
 
 
 def rms(values: Array) -> float | None:

@@ -128,7 +128,11 @@ def judged_readings(normal: FitNormal) -> JudgedReadings | None:
         image, unit = _first_image(problem, pose), legs[leg].reading_unit
         motor, alike = legs[leg].motor_label, list[str]()
         if not _has_other_measurements(problem, pose):
-            linear_with = linearize(_with_used(problem, k), state)
+            factor = problem.factor("readings")
+            whitening = np.array(factor.whitening)
+            whitening[k] = 1.0 / readings.sigma[k]
+            restored = problem.with_factors(replace(factor, whitening=whitening))
+            linear_with = linearize(restored, state)
             tests_with = _tests(information(linear_with, problem.loss))
             alike = [
                 legs[int(tests_with.leg[i])].motor_label
@@ -255,14 +259,6 @@ def _has_other_measurements(problem: FitProblem, pose: int) -> bool:
         for f in problem.factors
         if f.robust and f.name != "readings" and f.element is not None and f.n
     )
-
-
-def _with_used(problem: FitProblem, number: int) -> FitProblem:
-    """Restore a rejected reading."""
-    factor = problem.factor("readings")
-    whitening = np.array(factor.whitening)
-    whitening[number] = 1.0 / problem.readings.sigma[number]
-    return problem.with_factors(replace(factor, whitening=whitening))
 
 
 def _tests(normal: FitNormal) -> ReadingTests:

@@ -149,7 +149,11 @@ def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
         (a, b, c), _ = _inverted(_covariance(noise.variances, turned))
         return float(np.median(a * ss + 2.0 * b * sd + c * dd) - MEDIAN_OF_2)
 
-    return _balanced(scale_of(ss, turned[0]), scale_of(dd, turned[2]), excess, offsets)
+    of_sums, of_differences = scale_of(ss, turned[0]), scale_of(dd, turned[2])
+    scale = max(min(of_sums, of_differences), _MIN_SCALE)
+    if of_differences <= of_sums:
+        return NoiseModel(scale, _root(lambda px: excess(NoiseModel(scale, px)), offsets))
+    return NoiseModel(scale, 0.0, _root(lambda px: excess(NoiseModel(scale, 0.0, px)), offsets))
 
 
 def estimate_noise(
@@ -279,17 +283,6 @@ def _likelihood(noise: NoiseModel, moments: Array, claimed: Array, weight: Array
     """Log-likelihood of weighted second moments (3, n) [px^2]."""
     inverse, determinant = _inverted(_covariance(noise.variances, claimed))
     return -0.5 * (float(weight @ np.log(determinant)) + _product(inverse, moments))
-
-
-def _balanced(
-    of_sums: float, of_differences: float, excess: Callable[[NoiseModel], float], offsets: Array
-) -> NoiseModel:
-    """Scale from the smaller mode, and the excess of the other as bias or tilt."""
-    if of_differences <= of_sums:
-        scale = max(of_differences, _MIN_SCALE)
-        return NoiseModel(scale, _root(lambda px: excess(NoiseModel(scale, px)), offsets))
-    scale = max(of_sums, _MIN_SCALE)
-    return NoiseModel(scale, 0.0, _root(lambda px: excess(NoiseModel(scale, 0.0, px)), offsets))
 
 
 def _root(excess: Callable[[float], float], offsets: Array) -> float:

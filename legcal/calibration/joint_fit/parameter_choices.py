@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import permutations
@@ -175,7 +175,11 @@ def known_parameters(
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
     by_name, others = _kinematic(machine), _rejected_names(machine)
-    seen: dict[str, KnownParameter] = dict(_radii(machine))
+    seen = {
+        radius_name(leg.name, part): KnownParameter(r, "m", "radius", r / _RATIO, r * _RATIO)
+        for leg in machine.legs
+        for part, r in leg.radius_of_part.items()
+    }
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
     board = {
@@ -233,14 +237,6 @@ def _kinematic(machine: Machine) -> dict[str, KnownParameter]:
             least = nominal / _RATIO
         parameters[name] = KnownParameter(nominal, unit, "kinematic", least, most)
     return parameters
-
-
-def _radii(machine: Machine) -> Iterator[tuple[str, KnownParameter]]:
-    """Yield the radii of the visible parts of the legs."""
-    for leg in machine.legs:
-        for part, radius in leg.radius_of_part.items():
-            limits = radius / _RATIO, radius * _RATIO
-            yield radius_name(leg.name, part), KnownParameter(radius, "m", "radius", *limits)
 
 
 def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[str, str]]:

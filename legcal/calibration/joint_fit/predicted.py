@@ -145,17 +145,10 @@ class Contributions:
         is_own = np.array([": " in name for name in self.names])
         shared, with_own = np.flatnonzero(~is_own), self.known[:, is_own].any(axis=1)
         rows = marginal_rows(np.concatenate([self.all_gains(), self.known[with_own]]), shared)
-        return self._stacked(
-            tuple(self.names[i] for i in shared), rows, self.known[~with_own][:, shared]
-        )
-
-    def _stacked(self, names: tuple[str, ...], rows: Array, known: Array) -> Contributions:
-        """Return rows (m, n) as those of one image."""
-        nothing = np.zeros((1, len(rows)))
-        site = np.zeros(1, dtype=np.intp)
-        return Contributions(
-            names, rows[None], known, self.basis, nothing, site, np.zeros((1, len(rows), 0))
-        )
+        names, known = tuple(self.names[i] for i in shared), self.known[~with_own][:, shared]
+        nothing, site = np.zeros((1, len(rows), 0)), np.zeros(1, dtype=np.intp)
+        no_errors = np.zeros((1, len(rows)))  # all rows count as those of one image
+        return Contributions(names, rows[None], known, self.basis, no_errors, site, nothing)
 
     def repeated(self, times: float) -> Contributions:
         """Return the information of *times* photographs in place of each one."""

@@ -302,7 +302,8 @@ def build_fit(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
     observed = observed_arrays(measurements, legs, outlines, board, cameras, edges)
-    n_poses, images = measurements.n_poses, _images(measurements)
+    places = zip(measurements.view.tolist(), measurements.pose.tolist(), strict=True)
+    images, n_poses = dict(zip(places, row_names(measurements), strict=True)), measurements.n_poses
     return _build_problem(legs, observed, cameras, n_poses, images, settings, choices)
 
 
@@ -314,12 +315,6 @@ def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
         if f"{owner}.{key}" in choices.values
     }
     return with_intrinsics(camera, given) if given else camera
-
-
-def _images(measurements: Measurements) -> dict[tuple[int, int], str]:
-    """Return the names of images by view and pose."""
-    places = zip(measurements.view.tolist(), measurements.pose.tolist(), strict=True)
-    return dict(zip(places, row_names(measurements), strict=True))
 
 
 def _build_problem(

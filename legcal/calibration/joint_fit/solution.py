@@ -388,7 +388,9 @@ def _estimates(
     status |= dict.fromkeys(held.names, "weak")
     names = tuple(name for name in values if status[name] == "estimated")
     indices = [problem.named.index(name) for name in names]
-    estimated, prior_sigma = covariance[np.ix_(indices, indices)], _prior_sigma(problem)
+    estimated, of_files = covariance[np.ix_(indices, indices)], set(problem.calibrated.tolist())
+    stated = zip(problem.priors.unknown.tolist(), problem.priors.sigma.tolist(), strict=True)
+    prior_sigma = {problem.named[i]: sigma for i, sigma in stated if i in of_files}
     ranked = [i for i, name in enumerate(names) if name not in prior_sigma]
     weak = worst_directions(
         estimated[np.ix_(ranked, ranked)],
@@ -404,13 +406,6 @@ def _estimates(
         prior_sigma,
         weak,
     )
-
-
-def _prior_sigma(problem: FitProblem) -> dict[str, float]:
-    """Return standard deviations of intrinsics in camera files, by name."""
-    priors, of_files = problem.priors, set(problem.calibrated.tolist())
-    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
 
 
 def _kinematic(
@@ -482,7 +477,9 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     estimates = solution.estimates.with_values(
         dict(zip(parametrization.names, vector, strict=True))
     )
-    poses = _pose_order(order, dataset).tolist()
+    of_rows = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
+    worked_pose = dict(zip(dataset.measurements.pose.tolist(), of_rows.tolist(), strict=True))
+    poses = [worked_pose[pose] for pose in range(dataset.measurements.n_poses)]
     file_pose = {worked: pose for pose, worked in enumerate(poses)}
     readings = solution.quality.redundant_readings
     return replace(
@@ -507,12 +504,3 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
 def _indices_of(names: Sequence[str], among: tuple[str, ...]) -> IntArray:
     """Return the indices of names in a permutation of them."""
     return np.array([among.index(name) for name in names], dtype=np.intp)
-
-
-def _pose_order(order: Order, dataset: Dataset) -> IntArray:
-    """Index in the order of work of every pose of the dataset."""
-    pose = dataset.measurements.pose
-    pose_in_work_order = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
-    work_pose = np.empty(dataset.measurements.n_poses, dtype=np.intp)
-    work_pose[pose] = pose_in_work_order
-    return work_pose
