@@ -149,7 +149,9 @@ class OrderedDataset:
         unreached = np.flatnonzero(residual > 0.0).tolist()
         if not unreached:
             return []
-        names = few([_image_of(self.measurements, pose) for pose in unreached])
+        m, images = self.measurements, row_names(self.measurements)
+        first = m.first_rows[unreached].tolist()
+        names = few([f"view {m.views[m.view[row]].name}, {images[row]}" for row in first])
         return [
             f"The nominal model cannot reach the readings of {names}: residuals of up to "
             f"{1e3 * float(residual.max()):.2f} mm remain at the nearest pose, from which the fit "
@@ -382,10 +384,3 @@ def _least_squares(
     solved = solve_poses(geometries(machine), machine.frame_legs, R, t, machine.sign * q)
     poses = RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
     return tuple(poses), solved.missed
-
-
-def _image_of(measurements: Measurements, pose: int) -> str:
-    """Return the name of the first image of a pose in messages."""
-    row = int(measurements.first_rows[pose])
-    view = measurements.views[measurements.view[row]]
-    return f"view {view.name}, {row_names(measurements)[row]}"

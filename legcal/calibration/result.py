@@ -447,7 +447,8 @@ class _LinkVector:
 
 def _in_link(machine: Machine, side: Link) -> Iterator[_LinkVector]:
     """Yield the joint centre of each leg and, if it has one, its axis."""
-    parametrization, R = parametrization_of(machine, twists=True), _rotation(machine, side)
+    parametrization = parametrization_of(machine, twists=True)
+    R = machine.T_link_frame(side).rotation.as_matrix()  # from R_b or R_e to the link
     centre, axis = LegColumns.A, LegColumns.BASE_AXIS
     if side == "platform":
         centre, axis = LegColumns.B, LegColumns.PLATFORM_AXIS
@@ -458,11 +459,6 @@ def _in_link(machine: Machine, side: Link) -> Iterator[_LinkVector]:
         if direction is not None:
             by_turns = R @ normal_basis(direction).T
             yield _LinkVector(j, direction, True, tuple(named[k] for k in place[axis]), by_turns)
-
-
-def _rotation(machine: Machine, side: Link) -> Array:
-    """Return the rotation (3, 3) from R_b or R_e to the link."""
-    return np.asarray(machine.T_link_frame(side).rotation.as_matrix())
 
 
 def joints_in_links(

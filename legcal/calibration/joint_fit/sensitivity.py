@@ -49,10 +49,11 @@ def sensitivity_to_cameras(
     of_priors = np.zeros(problem.n_kept + 1)
     of_priors[place] = error
     pull = problem.priors.whitened(of_priors[problem.priors.unknown])
-    changes = {
-        name: _efficiency(problem, name) * change[..., None]
-        for name, change in cameras.changes(np.where(place == problem.n_kept, error, 0.0)).items()
-    }
+    changes = dict[str, Array]()
+    for name, change in cameras.changes(np.where(place == problem.n_kept, error, 0.0)).items():
+        factor = problem.factor(name)
+        weight = problem.loss.efficiency(factor.n_rows) if factor.robust else 1.0
+        changes[name] = weight * change[..., None]
     steps = response(normal, changes)
     steps += normal.kept_covariance() @ normal.linear.prior_J.T @ pull[:, None]
     return {FITTED_CAMERA: kinematic_steps(problem, steps)}
@@ -100,12 +101,6 @@ def _camera_columns(problem: FitProblem) -> IntArray:
         if key in problem.keys:
             place[:, k] = problem.columns["cameras"][:, problem.keys.index(key)]
     return place
-
-
-def _efficiency(problem: FitProblem, name: str) -> float:
-    """Efficiency of the loss for a factor."""
-    factor = problem.factor(name)
-    return problem.loss.efficiency(factor.n_rows) if factor.robust else 1.0
 
 
 def _camera_error(state: State, relative: Mapping[str, float], added: Mapping[str, float]) -> Array:
