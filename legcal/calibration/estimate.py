@@ -282,7 +282,9 @@ def measure_again(
     last, refused = first, trials.found()
     if refused:
         with_gammas = search.fitted(best, refused)
-        if not loses_outlines(first.outlines, with_gammas.outlines):
+        used, still = (one.outlines.used_keys() for one in (first, with_gammas))
+        lost, gained = len(used - still), len(still - used)
+        if lost - gained <= SIGNIFICANCE * np.sqrt(lost + gained):  # McNemar's test
             last, refused = with_gammas, {}
     measured = {data.measurements.image[row] for row in photographs.detect.tolist()}
     facts = {image: fact for image, fact in data.dataset.facts.items() if image in measured}
@@ -617,10 +619,3 @@ def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> 
             share = float(np.sum(of_camera & kept)) / max(float(np.sum(kept)), 1.0)
             log_likelihood[i, c] = log_densities[of_camera].sum() + share * shared
     return log_likelihood
-
-
-def loses_outlines(before: Outlines, after: Outlines) -> bool:
-    """Whether significantly fewer outlines are used than before (McNemar's test)."""
-    used, still = before.used_keys(), after.used_keys()
-    lost, gained = len(used - still), len(still - used)
-    return bool(lost - gained > SIGNIFICANCE * np.sqrt(lost + gained))

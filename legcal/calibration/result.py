@@ -44,7 +44,6 @@ from legcal.calibration.documents import (
     overlay_blocks,
 )
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import Posterior
 from legcal.calibration.joint_fit.parameter_choices import board_scale, dataset_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
@@ -55,7 +54,6 @@ from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import places
-from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
 from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.types import Array, IntArray
@@ -109,24 +107,6 @@ class OutlineResiduals:
 
     def __len__(self) -> int:
         return len(self.index)
-
-
-def outline_residuals(
-    posterior: Posterior, dataset: Dataset, outlines: Outlines
-) -> OutlineResiduals:
-    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
-    problem = posterior.problem
-    offset = problem.offsets(posterior.state)
-    covariance = posterior.noise.covariance(problem.outlines.covariance)
-    L = np.linalg.cholesky(covariance) if len(offset) else covariance
-    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
-    # The fit numbers outlines as they stand in canonical order.
-    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
-    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
-    number = order.reorder(numbered).contrast.astype(np.intp)
-    index = number[problem.outlines.index]
-    back = np.argsort(index, kind="stable")
-    return OutlineResiduals(index[back], offset[back], whitened[back])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +164,19 @@ class Calibration(Summarised):
 
     @cached_property
     def residuals(self) -> OutlineResiduals:
-        """How far each outline is from the fit."""
-        solution = self.solution
-        return outline_residuals(solution.posterior, self.dataset, solution.outlines)
+        """How far each outline is from the fit, in the order of the table."""
+        posterior, outlines = self.solution.posterior, self.solution.outlines
+        problem = posterior.problem
+        offset = problem.offsets(posterior.state)
+        covariance = posterior.noise.covariance(problem.outlines.covariance)
+        L = np.linalg.cholesky(covariance) if len(offset) else covariance
+        whitened = np.linalg.solve(L, offset[..., None])[..., 0]
+        # The fit numbers outlines as they stand in canonical order
+        order = canonical_order(self.dataset.measurements, self.dataset.machine.leg_names)
+        numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
+        index = order.reorder(numbered).contrast.astype(np.intp)[problem.outlines.index]
+        back = np.argsort(index, kind="stable")
+        return OutlineResiduals(index[back], offset[back], whitened[back])
 
     def __repr__(self) -> str:
         return few_lines(f"Calibration of '{self.dataset.machine.name}'", self.result)

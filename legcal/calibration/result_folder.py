@@ -122,7 +122,13 @@ def write_result(
                     path.unlink(missing_ok=True)
         if calibration.overlays:
             try:
-                draw_overlays(calibration, folder, run, progress)
+                detection = replace(
+                    _as_detection(dataset, solution),
+                    outlines=with_body_edges(solution.outlines, solution.edges),
+                    rows=np.array(list(calibration.overlays), dtype=np.intp),
+                    corners=calibration.corners,
+                )
+                draw_images(detection, folder, run, progress)
             except (DatasetError, OutOfResources) as failure:
                 note = f"There are no overlays. {' '.join(failure.problems)}"
                 notes = (*calibration.notes, note)
@@ -411,21 +417,6 @@ def with_overlays(calibration: Calibration) -> Calibration:
     """Return the calibration with the files of its overlays, by row; nothing is drawn."""
     files = _as_detection(calibration.dataset, calibration.solution).overlay_files
     return replace(calibration, overlays=files)
-
-
-def draw_overlays(calibration: Calibration, folder: Path, run: Run, progress: Report) -> None:
-    """Draw the overlays of a calibration into a folder.
-
-    Raises DatasetError if a photograph cannot be read, and OutOfResources if one cannot be drawn.
-    """
-    solution = calibration.solution
-    detection = replace(
-        _as_detection(calibration.dataset, solution),
-        outlines=with_body_edges(solution.outlines, solution.edges),
-        rows=np.array(list(calibration.overlays), dtype=np.intp),
-        corners=calibration.corners,
-    )
-    draw_images(detection, folder, run, progress)
 
 
 def check_overlays(dataset: Dataset, destination: Path | None) -> None:

@@ -368,7 +368,8 @@ class Summarised:
 
     def plot_uncertainty(self) -> Figure:
         """Return a figure of the standard deviations of parameters, and of the platform."""
-        return uncertainty_figure(self.result).markup()
+        charts = [*parameter_charts(parameters_of(self.result)), *platform_chart(self.result)]
+        return stacked("How well the parameters are known", charts).markup()
 
 
 def doubt_lines(result: Result) -> list[str]:
@@ -545,9 +546,3 @@ def platform_chart(result: Result) -> list[Canvas]:
         )
     ]
     return [scatter("Platform error", lines, "pose", "platform [mm]", log="y")] if poses else []
-
-
-def uncertainty_figure(result: Result) -> Canvas:
-    """Draw changes and standard deviations of all parameters, and of the platform at poses."""
-    charts = parameter_charts(parameters_of(result))
-    return stacked("How well the parameters are known", [*charts, *platform_chart(result)])

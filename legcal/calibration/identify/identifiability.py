@@ -21,7 +21,7 @@ from legcal.calibration.identify.report import (
 from legcal.calibration.identify.session import (
     THIN,
     Session,
-    cameras_for,
+    default_cameras,
     legs_around,
     neighbours,
     planned_session,
@@ -78,6 +78,7 @@ _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determin
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
 _HARMLESS = 1e-3  # motion of the platform over it, below which it is harmless
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
+_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what is known exactly
 _KNOWN = 2.5e-9  # mean leg lengths: of a radius that is known
 _VAGUE = RefinementSettings.radius_sigma / 2.0  # of the scale
 
@@ -151,7 +152,7 @@ class Analysis:
         free = np.flatnonzero(by_coordinates.any(axis=0))
         k, (Q, S) = len(free), np.linalg.qr(by_coordinates[:, free], mode="complete")
         # Fixed parameters, and what the mechanism ties, are known exactly.
-        known = [Q[:, k:].T / session.sigma_exact]
+        known = [Q[:, k:].T / (_EXACT * session.mean_length)]
         if k:
             known.append(np.linalg.solve(S[:k].T, marginal_rows(rows, free).T).T @ Q[:, :k].T)
         return compress(np.concatenate(known))
@@ -755,6 +756,7 @@ def _directions(ranks: Ranks, *, harmless: bool) -> str:
 
 
 _MOST_OF_A_KIND = 2
+_SEED = 2003  # of a further camera
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
 _ENOUGH_IMAGES = 15  # a view
@@ -869,7 +871,9 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
     new = len(session.t) + np.arange(len(images))
     seen = np.zeros((1, session.n_legs), dtype=np.bool_)
     seen[0, list(legs)] = True
-    (further,) = cameras_for(session, [legs])
+    A, B = (end.mean(axis=0) for end in session.ends)
+    rng = np.random.default_rng(_SEED)
+    (further,) = default_cameras(A, B, [legs], session.spatial, rng)
     return replace(
         session,
         R=np.concatenate([session.R, session.R[images]]),

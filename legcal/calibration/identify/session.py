@@ -64,7 +64,6 @@ from legcal.vision.visibility import Bodies, visible_parts
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
 _SEED = 2002
-_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what is known exactly
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -280,11 +279,6 @@ class Session:
         """Mean leg length, by which angles become lengths [m]."""
         return float(self.length.mean())
 
-    @property
-    def sigma_exact(self) -> float:
-        """Standard deviation of the constraints of the mechanism [m]."""
-        return _EXACT * self.mean_length
-
     @cached_property
     def unit(self) -> Array:
         """A metre of every parameter in its own unit, (p,): angles at the leg's length."""
@@ -486,12 +480,6 @@ def default_cameras(
         camera = replace(sample_camera(), gamma_is_given=False)
         cameras.append(View(str(v + 1), camera, place, hand_held=hand_held))
     return tuple(cameras)
-
-
-def cameras_for(session: Session, views: Sequence[Sequence[int]]) -> tuple[View, ...]:
-    """Return the default positions of further cameras."""
-    A, B = (end.mean(axis=0) for end in session.ends)
-    return default_cameras(A, B, views, session.spatial, np.random.default_rng(_SEED + 1))
 
 
 def _axis(A: Array, B: Array) -> Array:

@@ -22,8 +22,8 @@ from legcal.calibration.location.document import (
     LocatedFrame,
     OpenPart,
     PoseComponent,
-    direction_of,
     open_parts_in_words,
+    signed,
 )
 from legcal.calibration.location.frames import (
     N_STEP,
@@ -438,7 +438,7 @@ def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
         if frame == "base":
             rows = frames[0, :, :3].T @ rows
         U, s, _ = np.linalg.svd(rows, full_matrices=False)
-        directions = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
+        directions = [signed(u).tolist() for u in U[:, s > _PART_TOLERANCE].T]
         if directions:
             parts.append(OpenPart(frame=frame, kind=kind, directions=directions))
     return parts
