@@ -879,7 +879,10 @@ class _Fit:
             )
             for (i, row), sigma in zip(noise.group, noise.sigma, strict=True)
         ]
-        sigma_of_ratio = 0.5 * noise.spread * noise.further**2 / noise.ratio
+        more = noise.further**2 * noise.eigenvalues
+        # Standard deviation of the logarithm of the further variance
+        spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
+        sigma_of_ratio = 0.5 * spread * noise.further**2 / noise.ratio
         return Finding(
             noise.kind,
             noise.subject,
@@ -1086,12 +1089,6 @@ class _Scatter:
     def further(self) -> float:
         """Standard deviation beside the stated one, over that."""
         return math.exp(0.5 * self._likeliest[0])
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the logarithm of the further variance."""
-        more = self.further**2 * self.eigenvalues
-        return math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
 
     @property
     def ratio(self) -> float:

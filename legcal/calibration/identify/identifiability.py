@@ -65,7 +65,7 @@ from legcal.machine.parameters import (
     sparse_basis,
     split_by_motion,
 )
-from legcal.machine.ties import ties_in_words
+from legcal.machine.ties import by_step, independent, ties_in_words
 from legcal.paper.conditions import (
     Condition,
     count_conditions,
@@ -167,7 +167,10 @@ class Analysis:
         """The joint fit."""
         basis = undetermined(self.session, self.information)
         weak = weak_directions(self.session, self.motion, basis)
-        n_p = len(self.session.unit) - self.session.n_ties
+        session = self.session
+        ties = session.fitted.ties.at(session.legs)
+        by_metres = by_step(ties, session.parametrization.place) * session.unit
+        n_p = len(session.unit) - len(independent(ties, by_metres)[1])
         return Ranks(n_p - len(weak), n_p, weak)
 
 
@@ -190,12 +193,6 @@ class PlatformMotion:
             self.why_not = str(error)
             return
         self.by_metres = moved * session.unit
-
-    def effect(self, direction: Array) -> RmsMotion | None:
-        """Motion of the platform by a direction (p,) in metres."""
-        if self.by_metres is None:
-            return None
-        return RmsMotion(*moved_by(self.by_metres, direction[:, None]).rms)
 
     def sigma(self, information: Array) -> RmsMotion | None:
         """Return the standard deviation of the platform for the information of parameters."""
@@ -248,13 +245,15 @@ def _direction(
     shown = shown[np.argsort(-np.abs(row[shown]).round(3), kind="stable")]
     row = row * (_ERROR * session.mean_length)
     names = tuple(session.parametrization.names[i] for i in shown)
-    effect = motion.effect(row)
+    dX_m, dE_rad = None, None
+    if motion.by_metres is not None:
+        dX_m, dE_rad = moved_by(motion.by_metres, row[:, None]).rms
     return WeakDirection(
         describe_direction(names, session.leg_names),
         names,
         tuple(float((row * session.unit)[i]) for i in shown),
-        None if effect is None else effect.dX_m,
-        None if effect is None else effect.dE_rad,
+        dX_m,
+        dE_rad,
         harmless,
     )
 

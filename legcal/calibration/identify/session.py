@@ -55,7 +55,7 @@ from legcal.machine.rods import (
     ends_at_poses,
 )
 from legcal.machine.shapes import Occluder
-from legcal.machine.ties import by_step, independent, machine_ties, on_ties
+from legcal.machine.ties import machine_ties, on_ties
 from legcal.perception.body_edges import bodies_of, predicted_edges
 from legcal.vision.board import Board, FixedBoard, facing_board
 from legcal.vision.camera import sample_camera
@@ -284,12 +284,6 @@ class Session:
         """A metre of every parameter in its own unit, (p,): angles at the leg's length."""
         lengths = np.array([unit == "m" for unit in self.parametrization.units], dtype=np.bool_)
         return np.where(lengths, 1.0, 1.0 / self.mean_length)
-
-    @property
-    def n_ties(self) -> int:
-        """Number of independent ties of the parameters to each other."""
-        rows = self.fitted.ties.at(self.legs)
-        return len(independent(rows, by_step(rows, self.parametrization.place) * self.unit)[1])
 
     @cached_property
     def with_length(self) -> BoolArray:

@@ -573,10 +573,6 @@ class Readings:
         """The readings (n,) [m or rad]."""
         return self.sign * self.length
 
-    def wrong_by(self, rows: Residuals) -> Array:
-        """Return measured minus predicted readings, (n,) [m or rad]."""
-        return -self.sign * rows.r[:, 0]
-
     def rows(self, state: State) -> Residuals:
         """Return predicted minus measured readings, (n, 1) [m or rad], with their derivatives.
 
@@ -976,7 +972,7 @@ class _EndsInCamera:
         derivatives by kept variables are A, B, camera, these, and the numbers of actuators.
         """
         by_ends, moved = slope.T, self.moved
-        n_numbers, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.n_q)
+        n_numbers, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.by_q.shape[1])
         by_A, by_B, n_leg_columns = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
         m = n_leg_columns + n_numbers
         J = np.empty((m + 6 + n_q, *by_ends.shape[1:]))
@@ -1017,11 +1013,6 @@ class _JointMotions:
     arms: IntArray  # (m,) the measurements of arms
     far_numbers: Array  # (3, 9, m)
     far_q: Array  # (3, n_actuators, m)
-
-    @property
-    def n_q(self) -> int:
-        """Number of readings in a posture."""
-        return int(self.by_q.shape[1])
 
 
 def _joint_motion(

@@ -122,7 +122,7 @@ def judged_readings(normal: FitNormal) -> JudgedReadings | None:
         return None
     legs, wrong = problem.legs.nominal, list[WrongReading]()
     readings, used = problem.readings, _used(problem)
-    error = readings.wrong_by(problem.factor("readings").rows(state))
+    off = -readings.sign * readings.rows(state).r[:, 0]  # measured minus predicted
     for k in np.flatnonzero(~used).tolist():
         leg, pose = int(readings.leg[k]), int(readings.pose[k])
         image, unit = _first_image(problem, pose), legs[leg].reading_unit
@@ -139,7 +139,7 @@ def judged_readings(normal: FitNormal) -> JudgedReadings | None:
                 for i in _suspects_of_pose(linear_with, tests_with, pose)
                 if tests_with.leg[i] != leg
             ]
-        wrong.append(WrongReading(leg, pose, motor, *image, float(error[k]), unit, tuple(alike)))
+        wrong.append(WrongReading(leg, pose, motor, *image, float(off[k]), unit, tuple(alike)))
     tests = _tests(normal)
     assumed = 1.0 / np.asarray(problem.factor("readings").whitening)[used, 0, 0]
     tests = replace(tests, r=tests.r * assumed / readings.sigma[used])  # of what is stated

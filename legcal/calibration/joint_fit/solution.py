@@ -130,10 +130,6 @@ class Estimates:
         """Return the values of named parameters, (len(names),)."""
         return np.array([self.values[name] for name in names])
 
-    def with_values(self, values: Mapping[str, float]) -> Estimates:
-        """Replace the values of named parameters."""
-        return replace(self, values={**self.values, **values})
-
     def transformed(
         self, values: Mapping[str, float], free: Collection[str], C: Array, by_fit: Array
     ) -> Estimates:
@@ -474,9 +470,8 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     steps = _indices_of(parametrization.names, solution.kinematic.parametrization.names)
     vector = vector_of(parametrization, geometry, geometries(machine)).tolist()
-    estimates = solution.estimates.with_values(
-        dict(zip(parametrization.names, vector, strict=True))
-    )
+    estimates, values = solution.estimates, dict(zip(parametrization.names, vector, strict=True))
+    estimates = replace(estimates, values={**estimates.values, **values})
     of_rows = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
     worked_pose = dict(zip(dataset.measurements.pose.tolist(), of_rows.tolist(), strict=True))
     poses = [worked_pose[pose] for pose in range(dataset.measurements.n_poses)]
