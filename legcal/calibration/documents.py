@@ -213,7 +213,7 @@ class WrongReadingBlock(Document):
     image: str
     off: Number  # how far it is above what all else shows
     unit: Literal["m", "rad"]
-    alike: list[str]  # other motors one of which may be meant as well
+    alike: tuple[str, ...]  # other motors one of which may be meant as well
 
 
 class ReadingResiduals(Document):
@@ -227,7 +227,7 @@ class ReadingResiduals(Document):
 class RedundantReadings(ReadingResiduals):
     """The same of a fit, which also leaves out wrong ones."""
 
-    wrong: list[WrongReadingBlock]
+    wrong: tuple[WrongReadingBlock, ...]
 
 
 class ResidualsBlock(FitQuality, SparseDocument):

@@ -320,19 +320,12 @@ class Check:
 
     def document(self) -> dict[str, Any]:
         """Return the output of ``--json``."""
-        movement = self.movement
-        return CheckDocument(
+        return CheckDocument.describing(
+            self.movement,
             legcal_check=1,
             result=str(self.earlier.folder),
-            moved=movement.moved,
-            significance=movement.significance,
-            p_value=movement.p_value,
-            statistic=movement.statistic,
-            dof=movement.dof,
             of=len(self.earlier.names),
-            noise_dof=movement.noise_dof,
             verdict=self.sentence,
-            explanations=list(movement.explanations),
             platform=self.at_platform,
             images=self.dataset.measurements.n_rows,
             residuals=FitQuality.model_validate(self.solution.quality),

@@ -8,11 +8,12 @@ stated ones they would bias the model, and outlines would be rejected instead.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
+from pydantic import Field
 
+from legcal.calibration.documents import RedundantReadings, WrongReadingBlock
 from legcal.calibration.joint_fit.problem import FitLinear, FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State
 from legcal.estimation.problem import linearize
@@ -30,37 +31,27 @@ _NO_INFORMATION = 1e-12  # floor of the information on an error
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squared residuals
 
 
-@dataclass(frozen=True, eq=False)
-class WrongReading:
-    """A rejected reading."""
+class WrongReading(WrongReadingBlock):
+    """A rejected reading, with the leg and the pose in the fit."""
 
-    leg: int
-    pose: int  # index in the fit
-    motor: str  # leg, or the actuated joint at A
-    view: str
-    image: str
-    off: float  # measured minus predicted [m or rad]
-    unit: Literal["m", "rad"]
-    alike: tuple[str, ...] = ()  # other motors that may be wrong instead
+    leg: int = Field(exclude=True)
+    pose: int = Field(exclude=True)
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedReadings:
+class JudgedReadings(RedundantReadings):
     """Rejected readings of redundant motors, and the residuals of the others."""
 
     wrong: tuple[WrongReading, ...]
-    rms: float  # of the residuals of the others, over their standard deviations
-    rms_expected: float  # the same for right readings, from their redundancy
-    rms_m: float  # of the residuals as displacements of joints [m]
-    doubts: tuple[tuple[str, str], ...]  # reasons to distrust the result, each with its remedy
+    # reasons to distrust the result, each with its remedy
+    doubts: tuple[tuple[str, str], ...] = Field(exclude=True)
 
     def renumbered(self, legs: Sequence[int], poses: Mapping[int, int]) -> JudgedReadings:
         """Renumber legs and poses."""
         wrong = (
-            replace(reading, leg=legs[reading.leg], pose=poses[reading.pose])
-            for reading in self.wrong
+            one.model_copy(update={"leg": legs[one.leg], "pose": poses[one.pose]})
+            for one in self.wrong
         )
-        return replace(self, wrong=tuple(wrong))
+        return self.model_copy(update={"wrong": tuple(wrong)})
 
 
 def with_inflated_reading_noise(problem: FitProblem) -> FitProblem:
@@ -125,8 +116,7 @@ def judged_readings(normal: FitNormal) -> JudgedReadings | None:
     off = -readings.sign * readings.rows(state).r[:, 0]  # measured minus predicted
     for k in np.flatnonzero(~used).tolist():
         leg, pose = int(readings.leg[k]), int(readings.pose[k])
-        image, unit = _first_image(problem, pose), legs[leg].reading_unit
-        motor, alike = legs[leg].motor_label, list[str]()
+        (view, image), alike = _first_image(problem, pose), list[str]()
         if not _has_other_measurements(problem, pose):
             factor = problem.factor("readings")
             whitening = np.array(factor.whitening)
@@ -139,7 +129,18 @@ def judged_readings(normal: FitNormal) -> JudgedReadings | None:
                 for i in _suspects_of_pose(linear_with, tests_with, pose)
                 if tests_with.leg[i] != leg
             ]
-        wrong.append(WrongReading(leg, pose, motor, *image, float(off[k]), unit, tuple(alike)))
+        wrong.append(
+            WrongReading(
+                motor=legs[leg].motor_label,
+                view=view,
+                image=image,
+                off=float(off[k]),
+                unit=legs[leg].reading_unit,
+                alike=tuple(alike),
+                leg=leg,
+                pose=pose,
+            )
+        )
     tests = _tests(normal)
     assumed = 1.0 / np.asarray(problem.factor("readings").whitening)[used, 0, 0]
     tests = replace(tests, r=tests.r * assumed / readings.sigma[used])  # of what is stated
@@ -148,7 +149,9 @@ def judged_readings(normal: FitNormal) -> JudgedReadings | None:
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, displacements))
     expected = float(np.sqrt(np.mean(tests.redundancy)))
     doubts = _doubts(normal.linear, tests, wrong)
-    return JudgedReadings(tuple(wrong), rms, expected, rms_m, doubts)
+    return JudgedReadings(
+        wrong=tuple(wrong), rms=rms, rms_expected=expected, rms_m=rms_m, doubts=doubts
+    )
 
 
 def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
