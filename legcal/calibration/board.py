@@ -205,6 +205,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
     if not dataset.boards:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
+    view_of_row = np.array(measurements.view_names)[measurements.view]
     hand_held = {view.name for view in used if view.hand_held}
     corners_in_table = None if dataset.corners is None else data.order.reorder(dataset.corners)
     T_board_camera: tuple[RigidTransform | None, ...] = (None,) * len(measurements.views)
@@ -222,9 +223,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
             corners_of_board = detect_corners(
                 fixed.board, data.photographs.load, rows, data.pool, data.progress
             )
-        shown_in = {
-            measurements.views[v].name for v in measurements.view[corners_of_board.row].tolist()
-        }
+        shown_in = set(view_of_row[corners_of_board.row].tolist())
         is_rarely_shown = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
         needed = hand_held if is_rarely_shown else set[str]()
         if corners_in_table is None:
@@ -251,8 +250,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
             )
         tables.append(replace(corners_of_board, corner=corners_of_board.corner + fixed.first))
     corners = join_corners(tables).sort()
-    names = tuple(measurements.views[v].name for v in measurements.view.tolist())
-    size = dataset.machine.size
+    names, size = tuple(view_of_row.tolist()), dataset.machine.size
     return BoardViews(dataset.boards, corners, T_board_camera, T_camera_board, names, size)
 
 
@@ -292,11 +290,8 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
         return _misplaced(dataset, solution)
     on_base = corners.used & fixed.has(corners.corner)
     shown_views = set(measurements.view[corners.row[on_base]].tolist())
-    without = [
-        measurements.views[v].name
-        for v in np.unique(measurements.view).tolist()
-        if v not in shown_views
-    ]
+    used = np.unique(measurements.view).tolist()
+    without = [measurements.view_names[v] for v in used if v not in shown_views]
     if without:
         others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
         notes.append(

@@ -179,7 +179,7 @@ class Detection:
     def overlay_files(self) -> dict[int, str]:
         """The overlay of each row, relative to the folder: by view and image."""
         measurements = self.dataset.measurements
-        folders = unique_names(view.name for view in measurements.views)
+        folders = unique_names(measurements.view_names)
         files: dict[int, str] = {}
         for v, folder in enumerate(folders):
             rows = [row for row in self.rows.tolist() if measurements.view[row] == v]

@@ -93,7 +93,7 @@ from legcal.perception.photographs import (
     place_and_measure,
 )
 from legcal.progress import Progress, shown_progress
-from legcal.vision.camera import shared_cameras, stated_covariances
+from legcal.vision.camera import stated_covariances
 from legcal.workers import Workers, worker_pool
 
 _TEETH, _UNLIKELY = 5, 60.0  # hypotheses that are fitted, and evidence against them at most
@@ -595,12 +595,11 @@ def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     """Return a note on cameras taken as exact because no covariance is stated."""
-    views = dataset.measurements.views
-    names, cameras = [view.name for view in views], [view.camera for view in views]
+    m = dataset.measurements
     stated = (*choices.free, *choices.priors, *choices.fixed)
     chosen = {ParameterId.parse(name).owner for name in stated}
-    known = {*chosen, *stated_covariances(names, cameras)}
-    owner_of = dict(zip(names, shared_cameras(names, cameras), strict=True))
+    known = {*chosen, *stated_covariances(m.view_names, m.cameras)}
+    owner_of = dict(zip(m.view_names, m.owners, strict=True))
     exact = {name: owner for name, owner in owner_of.items() if owner not in known}
     if not exact:
         return []

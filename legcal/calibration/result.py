@@ -71,7 +71,7 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
-from legcal.vision.camera import camera_numbers, shared_cameras
+from legcal.vision.camera import camera_numbers
 
 REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
 
@@ -187,7 +187,7 @@ def _result_of(calibration: Calibration) -> Result:
     solution, dataset = calibration.solution, calibration.dataset
     machine, measurements = dataset.machine, dataset.measurements
     names, views = machine.leg_names, measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
+    owners = measurements.owners
     rows, corners = solution.outlines.row[solution.outlines.used], calibration.corners
     if corners is not None:
         rows = np.concatenate([rows, corners.row[corners.used]])

@@ -395,8 +395,7 @@ def _side(measurements: Measurements, course: _Course, test: _Test) -> str:
     elif hypothesis.kind == "joint":
         images, by = list(course.rows_in_order), np.arange(measurements.n_rows)
     else:
-        names = [view.name for view in measurements.views]
-        of_view = measurements.view == names.index(hypothesis.subject)
+        of_view = measurements.view == measurements.view_names.index(hypothesis.subject)
         images = [rows[of_view[rows]] for rows in course.rows_in_order]
         by = np.arange(measurements.n_rows)
     seen = np.append(_blocks_of(hypothesis).any(axis=0), False)
@@ -521,7 +520,7 @@ class _Course:
                 last.append(names[members[-1]])
                 size.append(len(members))
             ordered.append(np.array(numbers, dtype=np.intp))
-        problem, views = posterior.problem, [view.name for view in measurements.views]
+        problem, views = posterior.problem, measurements.view_names
         row_of = {
             (views[v], name): row
             for row, (v, name) in enumerate(zip(measurements.view.tolist(), names, strict=True))

@@ -156,7 +156,7 @@ def judge(
 
 def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
     """Return a note on the file of each camera that the measurements contradict."""
-    names = [view.name for view in dataset.measurements.views]
+    names = dataset.measurements.view_names
     return [
         f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
         for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)

@@ -56,7 +56,6 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import first_rods
 from legcal.progress import Progress, shown_progress
-from legcal.vision.camera import shared_cameras
 from legcal.workers import Workers, worker_pool
 
 _SEEN = 1e-6  # change of a parameter over that of a part, below which it has no effect
@@ -451,21 +450,14 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
         name: Prior(mean, sigma)
         for name, mean, sigma in zip(prior.names, means, sigmas, strict=True)
     }
-    views = dataset.measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    intrinsics = {
-        owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)
-    }
+    m = dataset.measurements
+    cameras = dict(zip(m.owners, map(earlier.intrinsics, m.cameras), strict=True))
     # Lines of arms that the earlier images did not show were kept nominal and are uncertain.
     fixed = [name for name in earlier.fixed if ParameterId.parse(name).kind not in ARMS]
     return Choices(
         fixed=frozenset(fixed),
         priors=priors,
-        cameras={
-            owner: known_intrinsics
-            for owner, known_intrinsics in intrinsics.items()
-            if known_intrinsics is not None
-        },
+        cameras={owner: known for owner, known in cameras.items() if known is not None},
         least_shared_px=earlier.document.residuals.shared_px,
     )
 
@@ -474,7 +466,6 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
 class _Free:
     """The new images fitted with wide priors, at one of their minima."""
 
-    problem: FitProblem
     minimum: Minimum[State]
     tested: IntArray  # indices of the tested parameters among the named unknowns
     more: Array  # (n, n): covariance of the tested parameters not included in the information
@@ -487,16 +478,13 @@ class _Free:
 
     def estimate(self) -> tuple[Array, Array]:
         """Return the tested parameters (n,) and their covariance (n, n), at most the prior's."""
-        problem, state, tested = self.problem, self.minimum.state, self.tested
-        linear = self.minimum.linear
+        linear, tested = self.minimum.linear, self.tested
+        problem, unit = linear.problem, np.outer(self.prior, self.prior)
         named = named_covariance(linear, information(linear, problem.loss).kept_covariance())
-        covariance, unit = (
-            named[np.ix_(tested, tested)] + self.more,
-            np.outer(self.prior, self.prior),
-        )
+        covariance = named[np.ix_(tested, tested)] + self.more
         variance, vectors = np.linalg.eigh(covariance / unit)
         covariance = (vectors * np.minimum(variance, 1.0)) @ vectors.T * unit
-        return problem.coordinates(state)[tested], covariance
+        return problem.coordinates(linear.state)[tested], covariance
 
 
 def _fits(
@@ -538,9 +526,7 @@ def _fits(
     )
     near, elsewhere = minimum(problem, constrained.state), minimum(problem, state)
     best = elsewhere if near.cost - elsewhere.cost > BETTER else near
-    near_earlier, free = (
-        _Free(problem, result, tested, additional, prior.sigma) for result in (near, best)
-    )
+    near_earlier, free = (_Free(result, tested, additional, prior.sigma) for result in (near, best))
     saved = 2.0 * (constrained.cost - min(near.cost, elsewhere.cost))
     return free, near_earlier, max(saved, 0.0)  # zero for the images of the earlier result
 

@@ -86,15 +86,15 @@ def observed_arrays(
     DatasetError
         If an outline cannot be used.
     """
-    view_cameras = [view.camera for view in measurements.views]
-    observed = observed_outlines(outlines, measurements, legs)
-    if cameras is not None and any(a is not b for a, b in zip(cameras, view_cameras, strict=True)):
+    observed, given = observed_outlines(outlines, measurements, legs), measurements.cameras
+    cameras = given if cameras is None else cameras
+    if any(a is not b for a, b in zip(cameras, given, strict=True)):
         observed = observed.through(cameras)
     return Observed(
         observed,
         observed_readings(measurements, legs),
-        observed_edges(edges, measurements, legs, view_cameras if cameras is None else cameras),
-        *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
+        observed_edges(edges, measurements, legs, cameras),
+        *observed_corners(board, measurements, cameras),
     )
 
 
@@ -325,7 +325,7 @@ def observed_outlines(
         np.zeros((n, 0), dtype=np.intp),
         np.zeros((n, 0, 2)),
         parts,
-        tuple(v.name for v in measurements.views),
+        measurements.view_names,
         _series(measurements),
         cameras,
         legs.n_actuators > 0,
@@ -355,9 +355,8 @@ def _bad_covariances(
 
 def _series(measurements: Measurements) -> IntArray:
     """Return the representative view of each view, (n_views,)."""
-    views = measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    images = np.bincount(measurements.view, minlength=len(views))
+    owners = measurements.owners
+    images = np.bincount(measurements.view, minlength=len(owners))
     first: dict[str, int] = {}
     representative = [
         first.setdefault(owner, v) if n == 1 else v
@@ -427,8 +426,8 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
     gamma_of = {
         cameras[v]: gamma for v, gamma in zip(view, outlines.gamma[moved].tolist(), strict=True)
     }
-    names = [view.name for view in measurements.views]
-    return {n: gamma_of[c] for n, c in zip(names, cameras, strict=True) if c in gamma_of}
+    named = zip(measurements.view_names, cameras, strict=True)
+    return {name: gamma_of[camera] for name, camera in named if camera in gamma_of}
 
 
 # ---------------------------------------------------------------------------------------- edges

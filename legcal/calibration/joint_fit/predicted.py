@@ -257,7 +257,7 @@ def information_of_images(
     problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
     state = problem.begin(start)
     images = _Images(problem.weighted(NoiseModel()), state, noise)
-    return images.contributions([v.name for v in measurements.views], known_length, is_fit=is_fit)
+    return images.contributions(measurements.view_names, known_length, is_fit=is_fit)
 
 
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:

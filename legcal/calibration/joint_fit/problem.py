@@ -296,10 +296,9 @@ def build_fit(
     DatasetError
         If an outline cannot be used.
     """
-    names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
-    owners = shared_cameras(names, given)
     cameras = tuple(
-        _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
+        _with_values(camera, owner, choices)
+        for camera, owner in zip(measurements.cameras, measurements.owners, strict=True)
     )
     observed = observed_arrays(measurements, legs, outlines, board, cameras, edges)
     places = zip(measurements.view.tolist(), measurements.pose.tolist(), strict=True)
