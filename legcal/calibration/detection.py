@@ -937,10 +937,8 @@ def _expected(detection: Detection, row: int) -> dict[str, list[list[float]]]:
 def _ends(camera: Camera, leg: PredictedLeg, part: str, edge: int, n: int = 2) -> Array | None:
     """Return points (n, 2) of a predicted outline [px], from its end nearer to the base."""
     for i, segment in enumerate(leg.segments):
-        band = leg.bands[i]
-        if segment.link == part and band is not None:
-            h, t = leg.outlines[i][edge - 1], np.linspace(0.0, band.length, n)
-            xy = band.points(t, band.offsets(h, t))
+        if segment.link == part and (xy := leg.points_of(i, edge, n)) is not None:
+            h = leg.outlines[i, edge - 1]
             rays = np.column_stack([xy[[0, -1]], np.ones(2)])
             return camera.distort(xy if cross(rays[1], rays[0]) @ h > 0.0 else xy[::-1])
     return None

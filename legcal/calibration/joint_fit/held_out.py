@@ -33,15 +33,6 @@ from legcal.geometry.types import Array, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted:
-    """Prediction of a fit for held-out images."""
-
-    problem: FitProblem  # held-out outlines and readings, with the unknowns of the fit
-    state: State  # of the fit, at the poses of the held-out images
-    covariance: Array  # (n_kept, n_kept) of the fit; new biases have their prior
-
-
-@dataclass(frozen=True, eq=False)
 class Posterior:
     """The minimum of a fit, with the covariance of all unknowns but platform poses."""
 
@@ -62,8 +53,8 @@ class Posterior:
         measurements: Measurements,
         outlines: Outlines,
         T_Rb_Re: Sequence[RigidTransform],
-    ) -> Predicted:
-        """Predict other images of the same views, at given poses."""
+    ) -> Posterior:
+        """Return the same of other images of the views, at given poses; new biases have a prior."""
         problem_of_fit, legs, state = self.problem, self.problem.legs, self.state
         observed = observed_outlines(outlines, measurements, legs)
         observed = observed.with_parts_first(problem_of_fit.outlines.parts).through(state.cameras)
@@ -72,16 +63,14 @@ class Posterior:
         problem = problem_of_fit.with_measurements(measurements, observed, shifts)
         biases = self.biases
         other_radii = [legs.radii[part] for part in observed.parts[len(state.radii) :]]
-        return Predicted(
-            problem,
-            replace(
-                state,
-                radii=np.append(state.radii, other_radii),
-                biases=np.array([biases.get(name, 0.0) for name in shifts.names]),
-                platform_pose=problem.postures(state.legs, T_Rb_Re),
-            ),
-            self._covariance_of(problem, shifts),
+        predicted = replace(
+            state,
+            radii=np.append(state.radii, other_radii),
+            biases=np.array([biases.get(name, 0.0) for name in shifts.names]),
+            platform_pose=problem.postures(state.legs, T_Rb_Re),
         )
+        covariance = self._covariance_of(problem, shifts)
+        return replace(self, problem=problem, state=predicted, covariance=covariance)
 
     def _covariance_of(self, problem: FitProblem, shifts: EdgeBiases) -> Array:
         """Covariance of the unknowns of a problem with other biases."""
@@ -128,7 +117,6 @@ def compare_held_out(
     """
     predicted = posterior.of_images(measurements, outlines, T_Rb_Re)
     problem, state = predicted.problem.weighted(posterior.noise), predicted.state
-    predicted = replace(predicted, problem=problem)
     L = np.linalg.cholesky(posterior.noise.covariance(problem.outlines.covariance))
     linear = linearize(problem, state)
     n_inside = int(np.sum(~np.isfinite(linear["outlines"].r).all(axis=1)))
