@@ -438,21 +438,11 @@ Views = tuple[str, ...]  # of one camera
 
 @dataclass(frozen=True, eq=False)
 class GammaTrials:
-    """Fits to outlines measured with several gammas, in the order of trials.
+    """Fits to outlines measured with several gammas, in the order of trials."""
 
-    Attributes
-    ----------
-    cameras : tuple of tuple of str
-        Views of each camera with an unknown gamma.
-    solutions : tuple of Solution or None
-        The fit of each trial; None where it failed.
-    log_gamma : (n_trials, n_cameras) array
-        Logarithms of the gammas.
-    """
-
-    cameras: tuple[Views, ...]
-    solutions: tuple[Solution | None, ...]
-    log_gamma: Array
+    cameras: tuple[Views, ...]  # views of each camera with an unknown gamma
+    solutions: tuple[Solution | None, ...]  # the fit of each trial; None where it failed
+    log_gamma: Array  # (n_trials, n_cameras)
 
     @classmethod
     def begun(cls, first: Solution, given: Mapping[str, float]) -> GammaTrials:

@@ -452,24 +452,11 @@ def _in_link(machine: Machine, side: Link) -> Iterator[_LinkVector]:
 
 
 def joints_in_links(
-    machine: Machine, parameters: Sequence[ParameterRow], kinematic: Kinematic
+    machine: Machine,  # the nominal model
+    parameters: Sequence[ParameterRow],  # in R_b and R_e [m]
+    kinematic: Kinematic,  # with the covariance of all, zero for fixed or held ones
 ) -> dict[Link, LinkBlock]:
-    """Return the joints of a calibration in the links of base and platform.
-
-    Parameters
-    ----------
-    machine : Machine
-        The nominal model.
-    parameters : sequence of ParameterRow
-        Parameters of ``result.json``, in R_b and R_e [m].
-    kinematic : Kinematic
-        The covariance of all kinematic parameters by name, zero for fixed or held ones.
-
-    Returns
-    -------
-    dict
-        A :class:`LinkBlock` for ``base`` and ``platform`` [m]; joints in the order of the legs.
-    """
+    """Return the joints of a calibration in the links of base and platform, in leg order [m]."""
     rows = {row.name: row for row in parameters}
     number = {name: k for k, name in enumerate(kinematic.names)}
     everything = np.array(kinematic.covariance)

@@ -91,43 +91,26 @@ OF_SCATTER: frozenset[Kind] = frozenset(("reading_noise", "autofocus", "vibratio
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A number that a fit lacks.
+    """A number that a fit lacks."""
 
-    Attributes
-    ----------
-    kind : str
-        What changed, or how readings follow motors.
-    subject : str
-        The motor, the view or the joint; "" where it is all motors. Several motors have commas.
-    unit : str
-        ``m``, ``rad`` or ``1``.
-    amount, sigma : float
-        The number; of a camera the angle or the distance, whichever is surer, of noise the
-        standard deviation of readings.
-    between : (str, str) or None
-        The images, or the views, before and after a change; None where it is of all images.
-    p_value : float
-        Probability of such a score by chance, times the number of tests.
-    steps : (p, c) array
-        The error of the kinematic parameters of the fit without the number, as in the
-        parametrization of its problem; of noise, c independent errors.
-    images : str
-        The images on one side of a change, as options name them: before that of an encoder, the
-        fewer ones beside that of a camera.
-    stated : float
-        The standard deviation of readings that is stated, of noise alone.
-    """
-
-    kind: Kind
+    kind: Kind  # what changed, or how readings follow motors
+    # the motor, the view or the joint; "" where it is all motors. Several motors have commas
     subject: str
-    unit: str
+    unit: str  # ``m``, ``rad`` or ``1``
+    # amount, sigma: the number; of a camera the angle or the distance, whichever is surer, of noise
+    # the standard deviation of readings
     amount: float
     sigma: float
+    # the images, or views, before and after a change; None where it is of all images
     between: tuple[str, str] | None
-    p_value: float
+    p_value: float  # probability of such a score by chance, times the number of tests
+    # (p, c): the error of the kinematic parameters of the fit without the number, as in the
+    # parametrization of its problem; of noise, c independent errors
     steps: Array
+    # the images on one side of a change, as options name them: before that of an encoder, the fewer
+    # ones beside that of a camera
     images: str = ""
-    stated: float = 0.0
+    stated: float = 0.0  # the standard deviation of readings that is stated, of noise alone
 
     @property
     def size(self) -> str:
@@ -271,42 +254,24 @@ class _Test(NamedTuple):
 
 @dataclass(frozen=True)
 class SessionTests:
-    """Tests of a session.
+    """Tests of a session."""
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        The numbers that the fit lacks, the most certain first.
-    least_slips : dict
-        The least changes of encoders that would show half of the time, by motor [m or rad];
-        motors of which no change can be seen are not in it.
-    overstated : dict
-        By unit how much readings scatter and what is stated, where that is five times as much.
-    periods : dict
-        The outlines of the fit (n,) in each quarter of the images in order, by its images.
-    """
-
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  # the numbers that the fit lacks, the most certain first
+    # the least changes of encoders that would show half of the time, by motor [m or rad]; motors of
+    # which no change can be seen are not in it
     least_slips: Mapping[str, float] = field(default_factory=dict)
+    # by unit how much readings scatter and what is stated, where that is five times as much
     overstated: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    # the outlines of the fit (n,) in each quarter of the images in order, by its images
     periods: Mapping[str, BoolArray] = field(default_factory=dict)
 
 
 def session_tests(
-    posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
+    posterior: Posterior,
+    measurements: Measurements,  # the rows that were fitted
+    sequences: Sequence[IntArray],  # rows in the order of their images (image_sequences)
 ) -> SessionTests:
-    """Test a fit for numbers that it lacks.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        The fit.
-    measurements : Measurements
-        The rows that were fitted.
-    sequences : sequence of (n,) array
-        Rows in the order of their images, see
-        :func:`legcal.data.image_choice.image_sequences`.
-    """
+    """Test a fit for numbers that it lacks."""
     if not len(posterior.problem.outlines):
         return SessionTests()
     left_out = _left_out(posterior.problem)

@@ -119,12 +119,7 @@ class Clusters:
 def clustered(normal: NormalEquations[Any, Any], loss: Loss = LEAST_SQUARES) -> Clusters:
     """Compute the score and the information that each eliminated element has of the kept unknowns.
 
-    Parameters
-    ----------
-    normal : NormalEquations
-        Where every element is at its minimum, of the same loss.
-    loss : Loss
-        Loss of the robust factors.
+    Every element is at its minimum, of the same loss.
     """
     problem, linear = normal.problem, normal.linear
     n, k = problem.n_elements, problem.n_kept

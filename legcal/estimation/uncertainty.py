@@ -409,24 +409,14 @@ def _ranks(matrices: Array) -> IntArray:
 
 
 def scores_of_block(linear: Linearization[Any, Any], name: str) -> tuple[Array, Array]:
-    """Return the scores of a block of random effects at zero effects.
+    """Return the scores z of a block of random effects at zero effects, and their covariance K.
 
-    Parameters
-    ----------
-    linear : Linearization
-        Of a problem with the block as the last named one, each of its unknowns with a prior of mean
-        zero; near a minimum with some of the effects or none: the Gauss-Newton step from there is
-        taken into account.
-    name : str
-        Name of the block.
+    z (b,) is B^T M r with B the whitened effects, r the residuals without any effect and M the
+    projector onto the residuals of the fit; K (b, b) is B^T M B, the covariance for zero effects.
 
-    Returns
-    -------
-    z : (b,) array
-        B^T M r with B the whitened effects, r the residuals without any effect and M the projector
-        onto the residuals of the fit.
-    K : (b, b) array
-        B^T M B: the covariance of z for zero effects.
+    The problem has the block as the last named one, each of its unknowns with a prior of mean zero;
+    near a minimum with some of the effects or none: the Gauss-Newton step from there is taken into
+    account.
     """
     problem, normal = linear.problem, normal_equations(linear)
     R = normal.reduced()

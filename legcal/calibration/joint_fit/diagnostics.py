@@ -140,11 +140,11 @@ def _contradicted(
 
 
 def refuse_contradicted_values(
-    problem: FitProblem,
+    problem: FitProblem,  # without held directions and edge biases
     start: Start,
-    state: State,
+    state: State,  # the minimum or the last state, with the values fixed
     *,
-    with_priors: bool = False,
+    with_priors: bool = False,  # also test stated priors
 ) -> None:
     """Refuse fixed values that contradict the measurements.
 
@@ -152,19 +152,7 @@ def refuse_contradicted_values(
     claimed covariances do not refuse a right value. It starts from *start*, and from *state* if
     that fails; if both fail, nothing is refused.
 
-    Parameters
-    ----------
-    problem : FitProblem
-        Without held directions and edge biases.
-    start, state
-        Start of the fit, and its minimum or last state with the values fixed.
-    with_priors : bool
-        Also test stated priors.
-
-    Raises
-    ------
-    DidNotConverge
-        One sentence for each value.
+    Raises DidNotConverge, one sentence for each value.
     """
     if not problem.settings.judges_stated_values:
         return

@@ -167,26 +167,15 @@ _NEARLY = 1.0  # decrease of the cost, in squared sigmas, at which these end
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """How well blocks of images are predicted that did not take part.
+    """How well blocks of images are predicted that did not take part."""
 
-    Attributes
-    ----------
-    squares : Array
-        (n_blocks,) squared Mahalanobis distances of the innovations.
-    dof : IntArray
-        (n_blocks,) their expectations.
-    gain : float or None
-        By how much the squares of the nominal model are larger, cameras and poses fitted again,
-        over what they would be with the measurements that the fit predicts; None where that could
-        not be fitted.
-    gain_sigma : float
-        Its standard deviation about one, if the claim is right.
-    """
-
-    squares: Array
-    dof: IntArray
+    squares: Array  # (n_blocks,) squared Mahalanobis distances of the innovations
+    dof: IntArray  # (n_blocks,) their expectations
+    # by how much the squares of the nominal model are larger, cameras and poses fitted again, over
+    # what they would be with the measurements that the fit predicts; None where that could not be
+    # fitted
     gain: float | None
-    gain_sigma: float = 0.0
+    gain_sigma: float = 0.0  # its standard deviation about one, if the claim is right
 
     @property
     def ratio(self) -> float:

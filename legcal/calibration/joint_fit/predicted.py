@@ -460,30 +460,17 @@ class PredictedNoise:
 
     By default shared errors are about the largest of a simulated machine
     (``benchmarks/shared_errors.py``): plans that count on less rely on it.
-
-    Attributes
-    ----------
-    sigma_px : float
-        Standard deviation of an edge in one pixel of length; that of an outline at both of its
-        ends falls with the root of its length [px].
-    correlation : float
-        Of the errors at both ends: -0.5 where errors of pixels are independent.
-    common_px : tuple of float
-        Standard deviations of the common-mode edge biases, in the order of their kinds [px].
-    places_px : tuple of float
-        Standard deviations of bias and tilt of an edge at a place [px].
-    gamma_px : float
-        How far an outline moves with the logarithm of the gamma, which counts as not known [px].
-    source : str
-        Where it is from, in words.
     """
 
+    # Standard deviation of an edge in one pixel of length [px]; that of an outline at both of its
+    # ends falls with the root of its length
     sigma_px: float = 0.35
-    correlation: float = 0.0
+    correlation: float = 0.0  # of errors at both ends: -0.5 where those of pixels are independent
+    # standard deviations of the common-mode edge biases, in the order of their kinds [px]
     common_px: tuple[float, ...] = (0.045, 0.003, 0.033, 0.009, 0.014, 0.005)
-    places_px: tuple[float, ...] = (0.024, 0.023)
-    gamma_px: float = 0.1
-    source: str = "what photographs of simulated machines show"
+    places_px: tuple[float, ...] = (0.024, 0.023)  # of bias and tilt of an edge at a place [px]
+    gamma_px: float = 0.1  # motion of an outline with ln gamma, which counts as not known [px]
+    source: str = "what photographs of simulated machines show"  # where it is from, in words
 
     def of(self, outlines: Outlines) -> Outlines:
         """Return outlines with the covariance and the dependence on gamma that are predicted."""

@@ -179,21 +179,11 @@ def single_witness(problem: FitProblem) -> str:
 
 @dataclass(frozen=True)
 class NominalSize:
-    """What the nominal model says of the size of the machine.
+    """What the nominal model says of the size of the machine."""
 
-    Attributes
-    ----------
-    by_parameter : Array
-        (p,) relative size of the machine by changes of parameters, those of the problem.
-    excess : float
-        By how much the fitted machine is larger than the nominal one, relatively.
-    sigma : float
-        Standard deviation of the size of a machine built to its model, relative.
-    """
-
-    by_parameter: Array
-    excess: float
-    sigma: float
+    by_parameter: Array  # (p,) relative size by changes of parameters, those of the problem
+    excess: float  # by how much the fitted machine is larger than the nominal one, relatively
+    sigma: float  # standard deviation of the size of a machine built to its model, relative
 
 
 @dataclass(frozen=True)
@@ -208,23 +198,12 @@ class Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class ScaleComparison:
-    """How large the machine is by each witness, the radii and the nominal model.
+    """How large the machine is by each witness, the radii and the nominal model."""
 
-    Attributes
-    ----------
-    witnesses : tuple of str
-        In words.
-    size : Array
-        (n,) relative sizes, up to a common one.
-    covariance : Array
-        (n, n) of their differences.
-    steps : Array
-        (p, n) error of the fitted kinematic parameters by a witness that is too large by one unit.
-    """
-
-    witnesses: tuple[str, ...]
-    size: Array
-    covariance: Array
+    witnesses: tuple[str, ...]  # in words
+    size: Array  # (n,) relative sizes, up to a common one
+    covariance: Array  # (n, n) of their differences
+    # (p, n) error of the fitted kinematic parameters by a witness that is too large by one unit
     steps: Array
 
     @property

@@ -444,21 +444,9 @@ def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:
 
 
 def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solution:
-    """Reorder a solution from the order of work to the order of the dataset's files.
+    """Reorder a solution from an order of work to that of the files, in which the dataset is.
 
-    Parameters
-    ----------
-    solution : Solution
-        In the order of work.
-    order : Order
-        The order of work.
-    dataset : Dataset
-        In the order of the files.
-
-    Returns
-    -------
-    Solution
-        B of legs fixed to the platform is at the point that model files use.
+    B of legs fixed to the platform is then at the point that model files use.
     """
     machine = dataset.machine
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
