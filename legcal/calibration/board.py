@@ -193,13 +193,9 @@ def _agreed(poses: Sequence[RigidTransform], size: float) -> RigidTransform | No
 def observe_board(data: OrderedDataset) -> BoardViews | None:
     """Return the boards of a dataset as seen in its images; None without boards.
 
-    Raises
-    ------
-    NotVisible
-        If no image shows a board, or most of the hand-held views do not show the board on the base;
-        other views are placed by the legs or left out.
-    DatasetError
-        If the images contradict the description of the board, or it has moved.
+    Raises NotVisible if no image shows a board, or most of the hand-held views do not show the
+    board on the base (other views are placed by the legs or left out); DatasetError if the images
+    contradict the description of the board, or it has moved.
     """
     dataset, measurements = data.dataset, data.measurements
     if not dataset.boards:
@@ -257,10 +253,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:
     """Return a rough T_base_board: as stated, or from the rough T_base_camera of views.
 
-    Raises
-    ------
-    DatasetError
-        If none of these cameras agrees with the stated pose of the board.
+    Raises DatasetError if none of these cameras agrees with the stated pose of the board.
     """
     fixed, by_cameras = dataset.board_on("base"), board.pose_by_cameras(hints)
     stated = None if fixed is None else fixed.T_link_board
@@ -371,13 +364,9 @@ def needs_rough_cameras(data: OrderedDataset) -> bool:
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
     """Return the placement by the nominal model and rough cameras, and the boards in the images.
 
-    Raises
-    ------
-    NotIdentifiable
-        If images are to be searched whose pose the readings do not determine, and a view of them
-        has no rough camera pose or joints at A move.
-    NotVisible
-        If images are to be searched and no leg is visible.
+    Raises NotIdentifiable if images are to be searched whose pose the readings do not determine,
+    and a view of them has no rough camera pose or joints at A move; NotVisible if images are to be
+    searched and no leg is visible.
     """
     if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
         raise NotVisible(

@@ -145,12 +145,8 @@ def fit_outlines(
     ``steps`` is the result of the four steps from an earlier measurement; it is not recomputed.
     ``edges`` are those of bodies.
 
-    Raises
-    ------
-    NotVisible
-        If no image shows a leg that its view should show.
-    NotIdentifiable, DidNotConverge
-        As the joint fit.
+    Raises NotVisible if no image shows a leg that its view should show; NotIdentifiable or
+    DidNotConverge, as the joint fit.
     """
     fitted_outlines = fitted.of_used_legs(outlines)
     unseen = unseen_legs(fitted.machine, fitted.measurements, fitted_outlines)

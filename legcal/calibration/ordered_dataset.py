@@ -254,11 +254,9 @@ def nominal_poses(
     legs. The pose with the least squared residuals of leg lengths is used then. If motors do not
     determine the pose, all poses are least-squares poses from home.
 
-    Raises
-    ------
-    DatasetError
-        If residuals of images exceed 3 % of the mean leg length, or readings of redundant motors
-        contradict each other as much without showing which is wrong. Not for *unused* rows.
+    Raises DatasetError if residuals of images exceed 3 % of the mean leg length, or readings of
+    redundant motors contradict each other as much without showing which is wrong. Not for *unused*
+    rows.
     """
     q = measurements.q_of_poses
     if not machine.is_determined:

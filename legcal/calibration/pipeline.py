@@ -342,10 +342,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     A refusal names the likely mistakes of the session before their consequences, and has the notes
     on odd readings and files of photographs that contradict their camera: they may be the cause.
 
-    Raises
-    ------
-    NotVisible, NotIdentifiable, DidNotConverge
-        As the phases.
+    Raises NotVisible, NotIdentifiable or DidNotConverge, as the phases.
     """
     rows, diagnosed = data.rows_of(file_rows), cache(diagnose)
     try:

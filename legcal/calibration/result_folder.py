@@ -91,12 +91,8 @@ def write_result(
     this test, and overlays if they cannot be drawn. *beside* may write further files into the
     folder.
 
-    Raises
-    ------
-    UsageError
-        If the destination is not an earlier result.
-    DidNotConverge
-        If the written model does not load with the computed parameters.
+    Raises UsageError if the destination is not an earlier result; DidNotConverge if the written
+    model does not load with the computed parameters.
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine

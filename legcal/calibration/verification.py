@@ -106,10 +106,7 @@ def difference(
 
     Directions are derivatives by the parameters, each in sigmas of its prior.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the new images determine nothing.
+    Raises NotIdentifiable if the new images determine nothing.
     """
     # In units of the priors, S is the information of the new images.
     scaled = covariance / np.outer(prior, prior)

@@ -69,11 +69,15 @@ def minimise(
     state: S,
     loss: Loss = LEAST_SQUARES,
     *,
-    max_iterations: int = 200,
-    is_near: bool = False,
-    tolerance: float = COST_TOLERANCE,
+    max_iterations: int = 200,  # attempted steps
+    is_near: bool = False,  # the start is the minimum for other weights: no damping of a first step
+    tolerance: float = COST_TOLERANCE,  # predicted decrease at convergence, in squared sigmas
+    # relative decrease at convergence, after the first 30 steps: outliers make the cost nearly
+    # linear, and its last decreases slow
     relative_tolerance: float = 0.0,
-    must_converge: bool = True,
+    must_converge: bool = True,  # raise if the steps do not; otherwise return the best state
+    # that of a minimum nearby: it predicts the decrease after the first step, which may then be the
+    # only one
     rate: float = 1.0,
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
@@ -83,30 +87,8 @@ def minimise(
     cost is at rounding, it is below *tolerance*, or, after the first 30 steps, it is below
     *relative_tolerance* times the cost.
 
-    Parameters
-    ----------
-    problem, state, loss
-        EstimationProblem, starting values and robust loss.
-    max_iterations : int
-        Attempted steps.
-    is_near : bool
-        The start is the minimum for other weights: the first step is not damped.
-    tolerance : float
-        Predicted decrease of the cost at convergence, in squared sigmas.
-    relative_tolerance : float
-        Relative decrease at convergence, after the first 30 steps: outliers make the cost nearly
-        linear, and its last decreases slow.
-    must_converge : bool
-        Raise if the steps do not converge; otherwise return the best state.
-    rate : float
-        ``Minimum.rate`` of a minimum nearby: it predicts the decrease after the first step, which
-        may then be the only one.
-
-    Raises
-    ------
-    DidNotConverge
-        If no step decreases the cost before convergence, or if the cost still falls by more than
-        1e-6 a step after *max_iterations* steps.
+    Raises DidNotConverge if no step decreases the cost before convergence, or if the cost still
+    falls by more than 1e-6 a step after *max_iterations* steps.
     """
     linear = linearize(problem, problem.projected(state))
     current_loss = _loss_for(linear, loss, np.inf)

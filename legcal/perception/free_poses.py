@@ -212,10 +212,7 @@ def find_free_poses(
 
     Where clicks have the platform at a pose, T_base_platform, it is looked for there alone.
 
-    Raises
-    ------
-    NotIdentifiable
-        If a view has no rough camera pose, or joints at A move.
+    Raises NotIdentifiable if a view has no rough camera pose, or joints at A move.
     """
     m = search.measurements
     require_standing_joints(machine)

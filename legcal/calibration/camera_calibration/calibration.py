@@ -218,10 +218,7 @@ def _shown_in(
 ) -> _ShownBoard:
     """Return the board with its corners in the images.
 
-    Raises
-    ------
-    NotVisible, NotIdentifiable
-        If no image shows the board, or too few do.
+    Raises NotVisible or NotIdentifiable if no image shows the board, or too few do.
     """
     paths = photographs.paths
     board, note = shown_board(stated, board_images)

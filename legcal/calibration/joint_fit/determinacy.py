@@ -46,10 +46,8 @@ def undetermined_directions(normal: FitNormal) -> HeldDirections:
     *normal* is the information of a problem without held directions yet. Intrinsics with the
     covariance of a camera file are not tested.
 
-    Raises
-    ------
-    NotIdentifiable
-        If an open direction moves the platform, or includes a camera or a radius.
+    Raises NotIdentifiable if an open direction moves the platform, or includes a camera or a
+    radius.
     """
     problem, state = normal.problem, normal.state
     every_unit, length = named_units(problem, state), state.mean_length
@@ -105,10 +103,7 @@ def refuse_undetermined_inliers(
 
     *accepted* (n_outlines,) are the inliers.
 
-    Raises
-    ------
-    NotIdentifiable
-        Naming one of the directions.
+    Raises NotIdentifiable naming one of the directions.
     """
     problem, length = normal.problem, normal.state.mean_length
     excluded = np.concatenate([problem.where("biases"), problem.calibrated])

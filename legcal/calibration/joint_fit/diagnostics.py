@@ -54,10 +54,7 @@ def refuse_contradicted_priors(normal: FitNormal) -> None:
 
     *normal* is the information at a minimum.
 
-    Raises
-    ------
-    DidNotConverge
-        With one sentence for each prior.
+    Raises DidNotConverge with one sentence for each prior.
     """
     problem = normal.problem
     if not problem.settings.judges_stated_values:

@@ -81,10 +81,7 @@ def observed_arrays(
 ) -> Observed:
     """Return measurements as arrays; *cameras* override the cameras of the views.
 
-    Raises
-    ------
-    DatasetError
-        If an outline cannot be used.
+    Raises DatasetError if an outline cannot be used.
     """
     observed, given = observed_outlines(outlines, measurements, legs), measurements.cameras
     cameras = given if cameras is None else cameras
@@ -271,11 +268,8 @@ def observed_outlines(
 ) -> ObservedOutlines:
     """Return the used outlines as arrays.
 
-    Raises
-    ------
-    DatasetError
-        If the covariance of an outline is not positive definite, its part does not exist in the
-        mechanism, or outlines of a camera were measured with several gammas.
+    Raises DatasetError if the covariance of an outline is not positive definite, its part does not
+    exist in the mechanism, or outlines of a camera were measured with several gammas.
     """
     index = np.flatnonzero(outlines.used)
     row, leg = outlines.row[index], outlines.leg[index]
@@ -511,10 +505,7 @@ def observed_edges(
 ) -> ObservedEdges:
     """Return the used edges of bodies as arrays.
 
-    Raises
-    ------
-    DatasetError
-        If the covariance of an edge is not positive definite.
+    Raises DatasetError if the covariance of an edge is not positive definite.
     """
     edges = no_outlines() if edges is None else edges
     index = np.flatnonzero(edges.used)

@@ -78,50 +78,22 @@ _ENOUGH_STARTS = 3  # reaching the same minimum: no better one is near
 def refine(
     legs: FittedLegs,
     measurements: Measurements,
-    outlines: Outlines,
+    outlines: Outlines,  # in pixels; only the used ones enter
     start: Start | Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
-    board: BoardCorners | None = None,
+    board: BoardCorners | None = None,  # boards fixed to base and platform, and their corners
     choices: Choices = NO_CHOICES,
-    edges: Outlines | None = None,
+    edges: Outlines | None = None,  # of bodies, parallel to their legs; only the used ones enter
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii jointly to all data.
 
     From several starts, the lowest first minimum is refined; if that fails, the next one. A start
     that fails is skipped with a note; between equal costs the earlier start wins.
 
-    Parameters
-    ----------
-    legs : FittedLegs
-        The mechanism (:func:`fitted_legs`).
-    measurements : Measurements
-        Views, poses and readings [m].
-    outlines : Outlines
-        Outlines in pixels; only the used ones enter.
-    start : Start or sequence of Start
-        Starting values.
-    settings : RefinementSettings
-        Settings of the fit.
-    board : BoardCorners, optional
-        Calibration boards fixed to base and platform, and their corners in images.
-    choices : Choices
-        Fixed and freed parameters, and priors.
-    edges : Outlines, optional
-        Straight edges of bodies, parallel to their legs; only the used ones enter.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    NotIdentifiable
-        If the data do not determine the parameters, from any start.
-    DidNotConverge
-        If the solver does not converge from any start, or most outlines are outliers of the fit.
-    DatasetError
-        If an outline cannot be used.
+    Raises NotIdentifiable if the data do not determine the parameters, from any start;
+    DidNotConverge if the solver does not converge from any start, or most outlines are outliers of
+    the fit; DatasetError if an outline cannot be used.
     """
     starts = [start] if isinstance(start, Start) else start
 

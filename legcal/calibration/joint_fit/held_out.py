@@ -108,12 +108,8 @@ def compare_held_out(
     The used *outlines* of the held-out *measurements* are compared, at the poses *T_Rb_Re*
     computed from the fit and the readings.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the readings do not determine the poses.
-    NotVisible
-        If a camera is inside a leg.
+    Raises NotIdentifiable if the readings do not determine the poses; NotVisible if a camera is
+    inside a leg.
     """
     predicted = posterior.of_images(measurements, outlines, T_Rb_Re)
     problem, state = predicted.problem.weighted(posterior.noise), predicted.state

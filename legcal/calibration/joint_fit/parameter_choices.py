@@ -75,10 +75,7 @@ class Choices:
     def by_tolerances(cls, machine: Machine, only: Group | None) -> Choices:
         """Return the choices of ``--only``; no choices without it.
 
-        Raises
-        ------
-        UsageError
-            If neither the model nor the dataset states tolerances.
+        Raises UsageError if neither the model nor the dataset states tolerances.
         """
         if only is None:
             return NO_CHOICES
@@ -303,10 +300,8 @@ def choices_of(
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
     """Resolve overrides to choices.
 
-    Raises
-    ------
-    UsageError, DatasetError
-        One sentence for each unknown name, implausible value, and pair of contradictory overrides.
+    Raises UsageError or DatasetError, one sentence for each unknown name, implausible value, and
+    pair of contradictory overrides.
     """
     from_file, problems_of_file = _decisions([w for w in overrides if w.in_file], known)
     from_call, problems = _decisions([w for w in overrides if not w.in_file], known)

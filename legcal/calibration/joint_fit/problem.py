@@ -291,10 +291,7 @@ def build_fit(
     The images need not determine the parameters (:meth:`FitProblem.require_determined`); more may
     follow.
 
-    Raises
-    ------
-    DatasetError
-        If an outline cannot be used.
+    Raises DatasetError if an outline cannot be used.
     """
     cameras = tuple(
         _with_values(camera, owner, choices)

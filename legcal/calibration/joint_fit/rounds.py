@@ -168,10 +168,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], held: HeldDirectio
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
 
-    Raises
-    ------
-    DidNotConverge
-        If a minimisation fails, most outlines are outliers, or the rounds do not converge.
+    Raises DidNotConverge if a minimisation fails, most outlines are outliers, or the rounds do not
+    converge.
     """
     if len(held.basis):
         problem, state = held_at_nominal(problem, first.state, held)
@@ -529,10 +527,7 @@ def check_convergence(
 
     *claimed* are the covariances (n, 2, 2) of the outlines [px^2].
 
-    Raises
-    ------
-    DidNotConverge
-        If these changes are large.
+    Raises DidNotConverge if these changes are large.
     """
     if changes.converged(settings):
         return ()

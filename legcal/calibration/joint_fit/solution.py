@@ -262,10 +262,7 @@ def assemble_solution(
 ) -> Solution:
     """Assemble the solution; *normal* is the information at the minimum.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the inliers do not determine the parameters.
+    Raises NotIdentifiable if the inliers do not determine the parameters.
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     kept = normal.kept_covariance()
