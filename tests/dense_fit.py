@@ -24,7 +24,7 @@ def residuals(problem: EstimationProblem[Any], state: Any) -> Array:
     return np.concatenate([*of_factors, linear.prior_r])
 
 
-def jacobians(problem: EstimationProblem[Any], linear: Linearization) -> dict[str, Array]:
+def jacobians(problem: EstimationProblem[Any], linear: Linearization[Any, Any]) -> dict[str, Array]:
     """Return the derivatives (n, size) of each factor's residuals by all unknowns, and priors'."""
     found = {}
     for factor in problem.factors:
@@ -44,7 +44,7 @@ def jacobians(problem: EstimationProblem[Any], linear: Linearization) -> dict[st
     return found | {"priors": priors}
 
 
-def jacobian(problem: EstimationProblem[Any], linear: Linearization) -> Array:
+def jacobian(problem: EstimationProblem[Any], linear: Linearization[Any, Any]) -> Array:
     """Return the derivatives of all residuals by all unknowns as the solver has them, (n, size)."""
     return np.concatenate(list(jacobians(problem, linear).values()))
 

@@ -231,7 +231,7 @@ def test_priors_that_data_dominate_are_no_degrees_of_freedom() -> None:
 def test_what_changes_at_a_motor_that_moves_joints_at_A_is_named() -> None:
     machine, joint = load_mechanism("hexaglide"), "rail4"
     legs, found = geometries(machine), parametrization_of(machine)
-    changes = single, joints, whole = possible_changes(machine, found)
+    changes = single, joints, whole = possible_changes(machine, found.names)
     everything = np.concatenate([change.columns for change in whole], axis=1)
     n_gains = sum(name.endswith(".gain") for name in found.names)
     assert np.linalg.matrix_rank(everything, tol=1e-6) == len(found) - n_gains

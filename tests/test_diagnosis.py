@@ -37,7 +37,7 @@ def test_a_fit_with_exchanged_columns_is_not_trusted_and_they_are_named(tmp_path
     calibration = calibrate(session.write())
     (found,) = calibration.diagnosis
     assert found.what == "columns leg2_prismatic and leg3_prismatic appear to be swapped"
-    assert found.after == found.images == 10
+    assert found.images_after == found.images == 10
     assert not calibration.verdict.trustworthy
     assert found.sentence in calibration.verdict.sentence
     assert "known to" in calibration.verdict.sentence
@@ -174,7 +174,7 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     found = _diagnosed(changed, lambda one: one.what.startswith(alike), monkeypatch)
     assert found.what.startswith(what)
     assert found.images == 12
-    assert found.after >= 11 > found.before
+    assert found.images_after >= 11 > found.images_before
     assert any(one.startswith(other) for one in found.same_as) or not other
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
 
@@ -200,7 +200,7 @@ def test_outlines_under_the_names_of_other_legs_in_a_view_are_named(
     renamed = _misnamed(d, names)
     (mistake,) = diagnose(order_dataset(renamed, in_turn, no_progress))
     assert mistake.what == f"the outlines of {what} in view c2"
-    assert (mistake.images, mistake.before, mistake.after) == (6, 0, 6)
+    assert (mistake.images, mistake.images_before, mistake.images_after) == (6, 0, 6)
     with pytest.raises(DidNotConverge, match=re.escape(mistake.sentence)):
         calibrate(renamed)
 
@@ -256,7 +256,7 @@ def test_a_view_whose_camera_was_moved_is_named(
         "the outlines of view c1 appear to be taken from 2 camera positions "
         f"({first[0]} and 5 others from position 1, {first[1]} and 4 others from position 2)"
     )
-    assert (found.images, found.before, found.after, found.same_as) == (11, 6, 11, ())
+    assert (found.images, found.images_before, found.images_after, found.same_as) == (11, 6, 11, ())
 
 
 def _mirrored(d: Dataset) -> Dataset:
@@ -300,7 +300,7 @@ def test_a_row_from_which_on_readings_are_late_is_named(
     assert found.what.startswith(
         f"from {row} on, the readings of view c2 appear to be one row late"
     )
-    assert found.after > found.before
+    assert found.images_after > found.images_before
 
 
 def _base_joints_exchanged(d: Dataset) -> Dataset:
@@ -342,8 +342,8 @@ def test_readings_in_the_order_of_text_are_named(
         q[rows[sorted(range(len(rows)), key=lambda k: str(k + 1))]] = q[rows]
     kinds = {"order of text", "readings shifted"}
     found = _diagnosed(_with_readings(session, q), lambda one: one.kind in kinds, monkeypatch)
-    assert (found.kind, found.after) == ("order of text", found.images)
-    assert found.before < found.after
+    assert (found.kind, found.images_after) == ("order of text", found.images)
+    assert found.images_before < found.images_after
 
 
 def test_an_encoder_that_never_moves_is_named_before_what_it_leaves_open(tmp_path: Path) -> None:
@@ -376,5 +376,5 @@ def test_readings_that_are_wrong_from_an_image_on_are_named_with_that_image(
     name = row_names(session.measurements)[first]
     assert found.kind == kind
     assert found.what.startswith(f"from {name} of view c1 on, column")
-    assert found.before < found.after
-    assert found.after >= found.images - 1
+    assert found.images_before < found.images_after
+    assert found.images_after >= found.images - 1

@@ -118,8 +118,9 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mistake = Diagnosis(
-        "columns exchanged", "columns a and b look exchanged", (), "with them exchanged", 6, 1, 6,
-        0.9, "exchange their headers",
+        kind="columns exchanged", what="columns a and b look exchanged", same_as=(), score=0.9,
+        remedy="exchange their headers", mended="with them exchanged",
+        images=6, images_before=1, images_after=6,
     )  # fmt: skip
     monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: (mistake,))
     session = spoiled(tmp_path / "set", 2, ("c1", "c3"))
@@ -134,7 +135,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     assert said[0] == mistake.sentence
     assert any(what.startswith("1 further problem may have the same cause") for what in said)
     assert not any("T_base_camera is wrong" in what for what in said)
-    assert document["diagnosis"] == [mistake.document().document()]
+    assert document["diagnosis"] == [mistake.model_dump(mode="json")]
     assert not document["ready"]
     assert document["usable"]
     rough["xyz"] = right

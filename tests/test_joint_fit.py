@@ -189,9 +189,9 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
     R = np.asarray(np.linalg.qr(J / unit, mode="r"))
     root = np.linalg.solve(np.swapaxes(R, 0, 1), (values / unit).T)
     expected = root.T @ root
-    normal = information(problem, state, linearize(problem, state))
-    undetermined_directions(problem, state, normal)
-    return named_covariance(problem, state, normal.kept_covariance()), expected
+    normal = information(linearize(problem, state))
+    undetermined_directions(normal)
+    return named_covariance(normal.linear, normal.kept_covariance()), expected
 
 
 @pytest.mark.parametrize(

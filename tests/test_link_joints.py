@@ -123,7 +123,7 @@ def test_what_may_have_moved_counts_along_the_links(model: str) -> None:
     machine = load_mechanism(model)
     found, legs = parametrization_of(machine), geometries(machine)
     before, step = vector_of(found, legs, legs), 1e-5
-    changes = {change.what: change for change in possible_changes(machine, found)[1]}
+    changes = {change.what: change for change in possible_changes(machine, found.names)[1]}
     for side in ("base", "platform"):
         for j, name in enumerate(machine.leg_names):
             change = changes[f"{side} joint of {name}"]

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from fit_sessions import PINHOLE
 from hexapod_example import Picture, Spoiled, spoiled
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -19,6 +20,7 @@ from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
 from legcal.calibration.estimate import outlier_images
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
+from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import BoolArray
@@ -241,9 +243,10 @@ def test_a_rough_pose_in_another_convention_is_called_so(
 ) -> None:
     near = _pose(np.array([0.01, -0.01, 0.0]), Rotation.from_rotvec([1.0, -1.0, 0.5], degrees=True))
     T = _pose(np.array([0.3, -0.9, 0.5]), Rotation.from_quat([0.68, 0.17, -0.2, 0.68]))
-    (note,) = hint_notes(["c1"], [written(T * near)], [T])
+    views = [View(name, PINHOLE, written(T * near)) for name in ("c1", "c2")]
+    (note,) = hint_notes(views[:1], [T])
     assert words in note
-    notes = hint_notes(["c1", "c2"], [written(T * near)] * 2, [T] * 2)
+    notes = hint_notes(views, [T] * 2)
     assert len(notes) == 1 + words.startswith(";")  # one cause, one note
     assert ("views c1, c2:" in notes[0]) == (len(notes) == 1)
 

@@ -193,18 +193,15 @@ def _agreed(poses: Sequence[RigidTransform], size: float) -> RigidTransform | No
 def observe_board(data: OrderedDataset) -> BoardViews | None:
     """Return the boards of a dataset as seen in its images; None without boards.
 
-    Raises
-    ------
-    NotVisible
-        If no image shows a board, or most of the hand-held views do not show the board on the base;
-        other views are placed by the legs or left out.
-    DatasetError
-        If the images contradict the description of the board, or it has moved.
+    Raises NotVisible if no image shows a board, or most of the hand-held views do not show the
+    board on the base (other views are placed by the legs or left out); DatasetError if the images
+    contradict the description of the board, or it has moved.
     """
     dataset, measurements = data.dataset, data.measurements
     if not dataset.boards:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
+    view_of_row = np.array(measurements.view_names)[measurements.view]
     hand_held = {view.name for view in used if view.hand_held}
     corners_in_table = None if dataset.corners is None else data.order.reorder(dataset.corners)
     T_board_camera: tuple[RigidTransform | None, ...] = (None,) * len(measurements.views)
@@ -222,9 +219,7 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
             corners_of_board = detect_corners(
                 fixed.board, data.photographs.load, rows, data.pool, data.progress
             )
-        shown_in = {
-            measurements.views[v].name for v in measurements.view[corners_of_board.row].tolist()
-        }
+        shown_in = set(view_of_row[corners_of_board.row].tolist())
         is_rarely_shown = on_base and 2 * len(hand_held & shown_in) < len(hand_held)
         needed = hand_held if is_rarely_shown else set[str]()
         if corners_in_table is None:
@@ -251,18 +246,14 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
             )
         tables.append(replace(corners_of_board, corner=corners_of_board.corner + fixed.first))
     corners = join_corners(tables).sort()
-    names = tuple(measurements.views[v].name for v in measurements.view.tolist())
-    size = dataset.machine.size
+    names, size = tuple(view_of_row.tolist()), dataset.machine.size
     return BoardViews(dataset.boards, corners, T_board_camera, T_camera_board, names, size)
 
 
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:
     """Return a rough T_base_board: as stated, or from the rough T_base_camera of views.
 
-    Raises
-    ------
-    DatasetError
-        If none of these cameras agrees with the stated pose of the board.
+    Raises DatasetError if none of these cameras agrees with the stated pose of the board.
     """
     fixed, by_cameras = dataset.board_on("base"), board.pose_by_cameras(hints)
     stated = None if fixed is None else fixed.T_link_board
@@ -292,11 +283,8 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
         return _misplaced(dataset, solution)
     on_base = corners.used & fixed.has(corners.corner)
     shown_views = set(measurements.view[corners.row[on_base]].tolist())
-    without = [
-        measurements.views[v].name
-        for v in np.unique(measurements.view).tolist()
-        if v not in shown_views
-    ]
+    used = np.unique(measurements.view).tolist()
+    without = [measurements.view_names[v] for v in used if v not in shown_views]
     if without:
         others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
         notes.append(
@@ -376,13 +364,9 @@ def needs_rough_cameras(data: OrderedDataset) -> bool:
 def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
     """Return the placement by the nominal model and rough cameras, and the boards in the images.
 
-    Raises
-    ------
-    NotIdentifiable
-        If images are to be searched whose pose the readings do not determine, and a view of them
-        has no rough camera pose or joints at A move.
-    NotVisible
-        If images are to be searched and no leg is visible.
+    Raises NotIdentifiable if images are to be searched whose pose the readings do not determine,
+    and a view of them has no rough camera pose or joints at A move; NotVisible if images are to be
+    searched and no leg is visible.
     """
     if len(data.photographs.detect) and not any(leg.cylinders for leg in data.machine.legs):
         raise NotVisible(

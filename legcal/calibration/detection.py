@@ -179,7 +179,7 @@ class Detection:
     def overlay_files(self) -> dict[int, str]:
         """The overlay of each row, relative to the folder: by view and image."""
         measurements = self.dataset.measurements
-        folders = unique_names(view.name for view in measurements.views)
+        folders = unique_names(measurements.view_names)
         files: dict[int, str] = {}
         for v, folder in enumerate(folders):
             rows = [row for row in self.rows.tolist() if measurements.view[row] == v]
@@ -251,13 +251,8 @@ def detected(data: OrderedDataset, images: IntArray) -> Detection:
         if arms:
             outlines = join_outlines([outlines, _of_arms(data, measured, arms)])
         of_views = data.measurements.views
-        hints = hint_notes(
-            [view.name for view in of_views],
-            [view.T_base_camera for view in of_views],
-            cameras,
-            BEFORE_FIT,
-            by_landmarks=data.measurements.clicked_views,
-        )
+        clicked = data.measurements.clicked_views
+        hints = hint_notes(of_views, cameras, BEFORE_FIT, by_landmarks=clicked)
         barely = image_notes(data.measurements, measured.placement.barely)
         notes_on_images = [*hints, *measured.placement.notes, *barely]
         if without_gamma := [v.name for v in of_views if not v.camera.gamma_is_given]:
@@ -501,7 +496,6 @@ class Examination:
             used=self.n_used,
             left_out=left_out,
             overlays=overlays,
-            diagnosis=[diagnosis.document() for diagnosis in self.diagnosis],
         ).document()
 
 
@@ -943,10 +937,8 @@ def _expected(detection: Detection, row: int) -> dict[str, list[list[float]]]:
 def _ends(camera: Camera, leg: PredictedLeg, part: str, edge: int, n: int = 2) -> Array | None:
     """Return points (n, 2) of a predicted outline [px], from its end nearer to the base."""
     for i, segment in enumerate(leg.segments):
-        band = leg.bands[i]
-        if segment.link == part and band is not None:
-            h, t = leg.outlines[i][edge - 1], np.linspace(0.0, band.length, n)
-            xy = band.points(t, band.offsets(h, t))
+        if segment.link == part and (xy := leg.points_of(i, edge, n)) is not None:
+            h = leg.outlines[i, edge - 1]
             rays = np.column_stack([xy[[0, -1]], np.ones(2)])
             return camera.distort(xy if cross(rays[1], rays[0]) @ h > 0.0 else xy[::-1])
     return None

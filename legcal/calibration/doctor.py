@@ -534,7 +534,7 @@ def _look_at_legs(
 def _check_remaining_images(checklist: _Checklist, detection: Detection, choices: Choices) -> None:
     """Check whether the images with recognised legs determine the parameters."""
     dataset, m = detection.dataset, detection.dataset.measurements
-    names = np.array([view.name for view in m.views])
+    names = np.array(m.view_names)
     out = np.isin(np.arange(m.n_rows), list(detection.left_out)) | np.isin(
         names[m.view], list(detection.unplaced)
     )

@@ -213,7 +213,7 @@ class WrongReadingBlock(Document):
     image: str
     off: Number  # how far it is above what all else shows
     unit: Literal["m", "rad"]
-    alike: list[str]  # other motors one of which may be meant as well
+    alike: tuple[str, ...]  # other motors one of which may be meant as well
 
 
 class ReadingResiduals(Document):
@@ -227,7 +227,7 @@ class ReadingResiduals(Document):
 class RedundantReadings(ReadingResiduals):
     """The same of a fit, which also leaves out wrong ones."""
 
-    wrong: list[WrongReadingBlock]
+    wrong: tuple[WrongReadingBlock, ...]
 
 
 class ResidualsBlock(FitQuality, SparseDocument):
@@ -369,13 +369,13 @@ class Holdout(Document):
 class DiagnosisBlock(Document):
     """What looks wrong with a session."""
 
-    kind: str
-    what: str
-    same_as: list[str]
-    images_before: int
-    images_after: int
-    score: Number
-    remedy: str
+    kind: str  # in a few words: ``columns exchanged``, ``handedness``, ...
+    what: str  # the same as a clause that names columns, views and legs
+    same_as: tuple[str, ...]  # mistakes that images cannot tell from it, the commoner first
+    images_before: int  # that agree as things are
+    images_after: int  # that agree with the correction
+    score: Number  # fraction of the predicted legs that images show with the correction
+    remedy: str  # as an imperative
 
 
 @dataclass(frozen=True)

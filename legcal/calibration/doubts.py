@@ -18,7 +18,7 @@ from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import CrossValidation, cross_validate
-from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
 from legcal.calibration.joint_fit.platform import (
     PlatformAccuracy,
     PlatformError,
@@ -197,11 +197,9 @@ def _strayed_cameras(dataset: Dataset, solution: Solution) -> list[Doubt]:
     It is grave where platform poses were looked for near the stated cameras.
     """
     m, machine = dataset.measurements, dataset.machine
-    shown = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
-    places = solution.cameras_in_base(machine.T_base_Rb)
     strayed = far_from_hints(
         [None if view.name in m.clicked_views else view.T_base_camera for view in m.views],
-        [T if v in shown else None for v, T in enumerate(places)],
+        solution.shown_cameras(m, machine.T_base_Rb),
     )
     if not strayed:
         return []
@@ -642,7 +640,7 @@ class _Evidence:
 
 def nominal_lengths(dataset: Dataset, solution: Solution) -> list[str]:
     """Return stated lengths that are the nominal ones to all digits, as nobody measures them."""
-    known = known_parameters(dataset.machine, dataset.measurements.views, boards=dataset.boards)
+    known = dataset_parameters(dataset)
     return [
         name
         for name, value in stated_lengths(solution.posterior.problem).items()

@@ -43,8 +43,6 @@ from legcal.data.outlines import (
     along_legs,
     join_outlines,
     no_outlines,
-    polished_parts,
-    reject_unused_legs,
     through_cameras,
 )
 from legcal.data.photograph_notes import compression_notes
@@ -53,10 +51,8 @@ from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.solver import minimise
 from legcal.estimation.uncertainty import restricted_log_likelihood
 from legcal.files.schema import few
-from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
-from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.perception.body_edges import has_bodies, measure_body_edges
 from legcal.perception.diagnostics import is_visible, reject_images
 from legcal.perception.outline import measure_in_brief, used_as_before
@@ -67,7 +63,7 @@ from legcal.perception.photographs import (
     place_and_measure,
     with_measured_radii,
 )
-from legcal.perception.placement import Joined, Placement, placed_arms
+from legcal.perception.placement import Joined, Placement
 
 # Least common bias of all outlines in photographs [px]: limb shading outside of the model acts like
 # a change of the radii, so that residuals never show it.
@@ -149,17 +145,10 @@ def fit_outlines(
     ``steps`` is the result of the four steps from an earlier measurement; it is not recomputed.
     ``edges`` are those of bodies.
 
-    Raises
-    ------
-    NotVisible
-        If no image shows a leg that its view should show.
-    NotIdentifiable, DidNotConverge
-        As the joint fit.
+    Raises NotVisible if no image shows a leg that its view should show; NotIdentifiable or
+    DidNotConverge, as the joint fit.
     """
-    fitted_outlines = outlines.at(fitted.rows)
-    fitted_outlines = reject_unused_legs(
-        fitted_outlines, fitted.measurements, fitted.machine.leg_names
-    )
+    fitted_outlines = fitted.of_used_legs(outlines)
     unseen = unseen_legs(fitted.machine, fitted.measurements, fitted_outlines)
     if options.every_leg and unseen:
         raise NotVisible(
@@ -169,10 +158,6 @@ def fit_outlines(
         )
     if steps is None:
         steps = four_steps(fitted, fitted_outlines, board, options)
-    fitted_edges = None if edges is None else edges.at(fitted.rows)
-    if fitted_edges is not None:
-        names = fitted.machine.leg_names
-        fitted_edges = reject_unused_legs(fitted_edges, fitted.measurements, names)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in fitted_outlines.source:
@@ -186,7 +171,7 @@ def fit_outlines(
         settings,
         board=None if board is None else board.at(fitted.rows),
         choices=choices,
-        edges=fitted_edges,
+        edges=None if edges is None else fitted.of_used_legs(edges),
     )
     fitted.progress("Joint fit", 1, 1)
     corners = None if board is None else board.reject_outliers(solution, fitted)
@@ -293,7 +278,9 @@ def measure_again(
     last, refused = first, trials.found()
     if refused:
         with_gammas = search.fitted(best, refused)
-        if not loses_outlines(first.outlines, with_gammas.outlines):
+        used, still = (one.outlines.used_keys() for one in (first, with_gammas))
+        lost, gained = len(used - still), len(still - used)
+        if lost - gained <= SIGNIFICANCE * np.sqrt(lost + gained):  # McNemar's test
             last, refused = with_gammas, {}
     measured = {data.measurements.image[row] for row in photographs.detect.tolist()}
     facts = {image: fact for image, fact in data.dataset.facts.items() if image in measured}
@@ -403,21 +390,11 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
 
 
 def _fitted_placement(data: OrderedDataset, solution: Solution, seen: MeasuredImages) -> Placement:
-    """Return the legs and cameras of a fit, with R_b on the nominal one."""
-    T_base_Rb, poses = data.machine.T_base_Rb, components(data.poses_by(solution.legs))
-    m = data.measurements
-    q = measured_readings(solution.legs, *poses, m.q_of_poses)
-    A, B = ends_in_base(solution.legs, T_base_Rb, *poses, q)
-    pose = data.measurements.pose
-    cameras = tuple(
-        None if known is None else T
-        for known, T in zip(
-            seen.placement.T_base_camera, solution.cameras_in_base(T_base_Rb), strict=True
-        )
-    )
-    arms = placed_arms(solution.legs, q, pose, T_base=T_base_Rb, radii=solution.radii)
-    polished = polished_parts(solution.outlines)
-    return Placement.of_fit(A[pose], B[pose], cameras, seen.blur, arms, polished)
+    """Return the legs and cameras of a fit in all images; none of views without any before it."""
+    poses = data.poses_by(solution.legs)
+    placed = solution.placement(data.machine, data.measurements, poses, seen.blur)
+    both = zip(seen.placement.T_base_camera, placed.T_base_camera, strict=True)
+    return replace(placed, T_base_camera=tuple(None if known is None else T for known, T in both))
 
 
 def shown_near(estimate: Estimate, placement: Placement) -> Placement:
@@ -457,21 +434,11 @@ Views = tuple[str, ...]  # of one camera
 
 @dataclass(frozen=True, eq=False)
 class GammaTrials:
-    """Fits to outlines measured with several gammas, in the order of trials.
+    """Fits to outlines measured with several gammas, in the order of trials."""
 
-    Attributes
-    ----------
-    cameras : tuple of tuple of str
-        Views of each camera with an unknown gamma.
-    solutions : tuple of Solution or None
-        The fit of each trial; None where it failed.
-    log_gamma : (n_trials, n_cameras) array
-        Logarithms of the gammas.
-    """
-
-    cameras: tuple[Views, ...]
-    solutions: tuple[Solution | None, ...]
-    log_gamma: Array
+    cameras: tuple[Views, ...]  # views of each camera with an unknown gamma
+    solutions: tuple[Solution | None, ...]  # the fit of each trial; None where it failed
+    log_gamma: Array  # (n_trials, n_cameras)
 
     @classmethod
     def begun(cls, first: Solution, given: Mapping[str, float]) -> GammaTrials:
@@ -632,16 +599,9 @@ def log_likelihoods(solutions: Sequence[Solution], cameras: Sequence[Views]) -> 
         norms = minimum.linear["outlines"].squared_norms
         log_determinants = np.linalg.slogdet(fit.noise.covariance(o.covariance))[1]
         log_densities = -0.5 * (norms + log_determinants) * kept
-        shared = restricted_log_likelihood(problem, minimum) + 0.5 * float(norms.sum())
+        shared = restricted_log_likelihood(minimum) + 0.5 * float(norms.sum())
         for c, views in enumerate(cameras):
             of_camera = np.array([name in views for name in o.views], dtype=np.bool_)[o.view]
             share = float(np.sum(of_camera & kept)) / max(float(np.sum(kept)), 1.0)
             log_likelihood[i, c] = log_densities[of_camera].sum() + share * shared
     return log_likelihood
-
-
-def loses_outlines(before: Outlines, after: Outlines) -> bool:
-    """Whether significantly fewer outlines are used than before (McNemar's test)."""
-    used, still = before.used_keys(), after.used_keys()
-    lost, gained = len(used - still), len(still - used)
-    return bool(lost - gained > SIGNIFICANCE * np.sqrt(lost + gained))

@@ -104,10 +104,7 @@ def starts(
 ) -> list[Start]:
     """Return the starts of the joint fit: nominal, and the result of the four steps if any.
 
-    Raises
-    ------
-    NotIdentifiable
-        If neither placement nor steps locate a camera that is needed.
+    Raises NotIdentifiable if neither placement nor steps locate a camera that is needed.
     """
     machine = data.machine
     rough = [None if T is None else T.inv() * machine.T_base_Rb for T in placement.T_base_camera]

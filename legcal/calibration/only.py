@@ -50,15 +50,7 @@ _SURE = 2.5  # standard deviations within which an offset is a whole number of t
 
 @dataclass(frozen=True, eq=False)
 class GroupEstimate:
-    """The posterior of the parts of a machine, and the model with one group of them.
-
-    Attributes
-    ----------
-    solution : Solution
-        The fit with the parameters that are written, and their uncertainty.
-    written : tuple of Leg
-        The legs in R_b and R_e of the nominal model, in which only the group has moved.
-    """
+    """The posterior of the parts of a machine, and the model with one group of them."""
 
     group: Group
     machine: Machine  # the nominal model
@@ -67,8 +59,8 @@ class GroupEstimate:
     value: Array  # (m,) posterior mean of these errors [m, rad], beside what is turned
     sigma: Array  # (m,) their standard deviations
     held: Array  # (m,) what the written model has of them
-    solution: Solution
-    written: tuple[Leg, ...]
+    solution: Solution  # with the parameters that are written, and their uncertainty
+    written: tuple[Leg, ...]  # in R_b and R_e of the nominal model, only the group having moved
 
     @property
     def zeros(self) -> list[MotorZero]:

@@ -29,7 +29,7 @@ from legcal.data.image_tables import (
 )
 from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, images_in_words, row_names
-from legcal.data.outlines import Outlines
+from legcal.data.outlines import Outlines, reject_unused_legs
 from legcal.data.photograph_notes import notes_on_moves
 from legcal.errors import DatasetError
 from legcal.files.schema import few
@@ -151,7 +151,9 @@ class OrderedDataset:
         unreached = np.flatnonzero(residual > 0.0).tolist()
         if not unreached:
             return []
-        names = few([_image_of(self.measurements, pose) for pose in unreached])
+        m, images = self.measurements, row_names(self.measurements)
+        first = m.first_rows[unreached].tolist()
+        names = few([f"view {m.views[m.view[row]].name}, {images[row]}" for row in first])
         return [
             f"The nominal model cannot reach the readings of {names}: residuals of up to "
             f"{1e3 * float(residual.max()):.2f} mm remain at the nearest pose, from which the fit "
@@ -205,6 +207,11 @@ class OrderedDataset:
             measurements=measurements_at(self.measurements, rows),
             rows=self.rows[rows],
         )
+
+    def of_used_legs(self, outlines: Outlines) -> Outlines:
+        """Return the outlines in these images of all, those of legs not named in views rejected."""
+        own = outlines.at(self.rows)
+        return reject_unused_legs(own, self.measurements, self.machine.leg_names)
 
     def in_file_order(self) -> tuple[Dataset, Order]:
         """Return the dataset of these images in the order of the files, and that order."""
@@ -260,11 +267,9 @@ def nominal_poses(
     legs. The pose with the least squared residuals of leg lengths is used then. If motors do not
     determine the pose, all poses are least-squares poses from home.
 
-    Raises
-    ------
-    DatasetError
-        If residuals of images exceed 3 % of the mean leg length, or readings of redundant motors
-        contradict each other as much without showing which is wrong. Not for *unused* rows.
+    Raises DatasetError if residuals of images exceed 3 % of the mean leg length, or readings of
+    redundant motors contradict each other as much without showing which is wrong. Not for *unused*
+    rows.
     """
     q = measurements.q_of_poses
     if not machine.is_determined:
@@ -390,10 +395,3 @@ def _least_squares(
     solved = solve_poses(geometries(machine), machine.frame_legs, R, t, machine.sign * q)
     poses = RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
     return tuple(poses), solved.missed
-
-
-def _image_of(measurements: Measurements, pose: int) -> str:
-    """Return the name of the first image of a pose in messages."""
-    row = int(measurements.first_rows[pose])
-    view = measurements.views[measurements.view[row]]
-    return f"view {view.name}, {row_names(measurements)[row]}"

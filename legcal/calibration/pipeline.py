@@ -48,8 +48,8 @@ from legcal.calibration.joint_fit.parameter_choices import (
     Choices,
     Group,
     Prior,
-    known_parameters,
-    resolve,
+    choices_of,
+    dataset_parameters,
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
@@ -69,7 +69,6 @@ from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import Override, listed, overrides_of_call
 from legcal.data.image_choice import chosen_images, dataset_at, own_zeros, split_images
 from legcal.data.measurements import few_views, image_notes, still_encoders
-from legcal.data.outlines import reject_unused_legs
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import (
     DatasetError,
@@ -82,10 +81,8 @@ from legcal.errors import (
 )
 from legcal.files.folder import check_destination, output_path
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.motions import components
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.machine.leg import ParameterId
-from legcal.machine.rods import ends_at_poses
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
 from legcal.perception.outline import measure_in_brief
@@ -96,7 +93,7 @@ from legcal.perception.photographs import (
     place_and_measure,
 )
 from legcal.progress import Progress, shown_progress
-from legcal.vision.camera import shared_cameras, stated_covariances
+from legcal.vision.camera import stated_covariances
 from legcal.workers import Workers, worker_pool
 
 _TEETH, _UNLIKELY = 5, 60.0  # hypotheses that are fitted, and evidence against them at most
@@ -197,9 +194,7 @@ def calibrate(
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
-    choices = chosen_parameters(dataset, overrides)
-    by_parts = Choices.by_tolerances(dataset.machine, only)
-    choices = replace(choices, built=by_parts.built, only=by_parts.only)
+    choices = chosen_parameters(dataset, overrides, only)
     leave_out = ",".join(listed(leave_out))
     left_out = chosen_images(dataset, leave_out) if leave_out else None
     if zeros := own_zeros(dataset, listed(split), left_out):
@@ -348,10 +343,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
     A refusal names the likely mistakes of the session before their consequences, and has the notes
     on odd readings and files of photographs that contradict their camera: they may be the cause.
 
-    Raises
-    ------
-    NotVisible, NotIdentifiable, DidNotConverge
-        As the phases.
+    Raises NotVisible, NotIdentifiable or DidNotConverge, as the phases.
     """
     rows, diagnosed = data.rows_of(file_rows), cache(diagnose)
     try:
@@ -374,7 +366,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         said = [*(one.sentence for one in diagnosis), *refused]
         refusal = _with_notes(error, said, data.dataset, notes)
         if diagnosis:
-            refusal.diagnosis = tuple(mistake.document().document() for mistake in diagnosis)
+            refusal.diagnosis = tuple(mistake.document() for mistake in diagnosis)
             refusal.consequences = error.facts
         raise refusal from error
 
@@ -471,12 +463,11 @@ def _estimate(
 
 def _wrong_names(estimate: Estimate) -> tuple[Diagnosis, ...]:
     """Return given outlines that the fit has at the place of other legs."""
-    solution, m = estimate.solution, estimate.fitted.measurements
-    ends = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
-    seen = set(m.view[solution.outlines.row[solution.outlines.used]].tolist())
-    cameras = [T.inv() if v in seen else None for v, T in enumerate(solution.T_camera_Rb)]
-    A, B = (joints[m.pose] for joints in ends)
-    return exchanged_legs(solution.outlines, m, solution.legs, (A, B), cameras)
+    solution, m, machine = estimate.solution, estimate.fitted.measurements, estimate.fitted.machine
+    placed = solution.placement(machine, m)
+    cameras = solution.shown_cameras(m, machine.T_base_Rb)
+    ends = placed.A_base, placed.B_base
+    return exchanged_legs(solution.outlines, m, solution.legs, ends, cameras)
 
 
 def _leaves_out_many(estimate: Estimate) -> bool:
@@ -497,20 +488,10 @@ def _leaves_out_many(estimate: Estimate) -> bool:
 
 
 def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
-    fitted, o = estimate.fitted, estimate.solution.outlines
-    shown = set(fitted.measurements.view[o.row[o.used]].tolist())
-    views = fitted.measurements.views
-    cameras = [
-        T if v in shown else None
-        for v, T in enumerate(estimate.solution.cameras_in_base(fitted.machine.T_base_Rb))
-    ]
-    hints = hint_notes(
-        [view.name for view in views],
-        [view.T_base_camera for view in views],
-        cameras,
-        by_landmarks=fitted.measurements.clicked_views,
-    )
-    return (*hints, *image_notes(fitted.measurements, estimate.outliers))
+    m = estimate.fitted.measurements
+    cameras = estimate.solution.shown_cameras(m, estimate.fitted.machine.T_base_Rb)
+    hints = hint_notes(m.views, cameras, by_landmarks=m.clicked_views)
+    return (*hints, *image_notes(m, estimate.outliers))
 
 
 def _refuse_too_few(
@@ -547,21 +528,18 @@ def _store_outlines(data: OrderedDataset, estimate: Estimate, key: str) -> list[
     return [note] if note else []
 
 
-def chosen_parameters(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
+def chosen_parameters(
+    dataset: Dataset, overrides: Sequence[Override], only: Group | None = None
+) -> Choices:
     """Return the choices of dataset and call for the parameters.
 
     Twists without an explicit choice get a prior: every leg has an error of its twist, and a twist
     fixed at nominal would bias the others.
     """
-    known = known_parameters(
-        dataset.machine,
-        dataset.measurements.views,
-        boards=dataset.boards,
-    )
-    choices = resolve([*dataset.overrides, *overrides], known)
+    choices = choices_of(dataset, overrides, only)
     twists = {
         name: Prior(parameter.nominal, float(np.radians(TWIST_SIGMA_DEG)))
-        for name, parameter in known.by_name.items()
+        for name, parameter in dataset_parameters(dataset).by_name.items()
         if ParameterId.parse(name).kind == "twist"
         and choices.holds(name, by_default=True)
         and name not in choices.fixed
@@ -589,9 +567,7 @@ def _fitted_and_held_out(
 
 def _compare_held_out(data: OrderedDataset, estimate: Estimate, file_rows: IntArray) -> Holdout:
     held_out, solution = data.at(data.rows_of(file_rows)), estimate.solution
-    outlines = estimate.outlines.at(held_out.rows)
-    outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
-    poses = held_out.poses_by(solution.legs)
+    outlines, poses = held_out.of_used_legs(estimate.outlines), held_out.poses_by(solution.legs)
     return compare_held_out(solution.posterior, held_out.measurements, outlines, poses)
 
 
@@ -617,12 +593,11 @@ def _own_zero_notes(dataset: Dataset, solution: Solution) -> list[str]:
 
 def exact_cameras(dataset: Dataset, choices: Choices) -> list[str]:
     """Return a note on cameras taken as exact because no covariance is stated."""
-    views = dataset.measurements.views
-    names, cameras = [view.name for view in views], [view.camera for view in views]
+    m = dataset.measurements
     stated = (*choices.free, *choices.priors, *choices.fixed)
     chosen = {ParameterId.parse(name).owner for name in stated}
-    known = {*chosen, *stated_covariances(names, cameras)}
-    owner_of = dict(zip(names, shared_cameras(names, cameras), strict=True))
+    known = {*chosen, *stated_covariances(m.view_names, m.cameras)}
+    owner_of = dict(zip(m.view_names, m.owners, strict=True))
     exact = {name: owner for name, owner in owner_of.items() if owner not in known}
     if not exact:
         return []

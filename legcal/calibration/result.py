@@ -44,8 +44,7 @@ from legcal.calibration.documents import (
     overlay_blocks,
 )
 from legcal.calibration.four_steps import Steps
-from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.calibration.joint_fit.parameter_choices import board_scale, known_parameters
+from legcal.calibration.joint_fit.parameter_choices import board_scale, dataset_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
@@ -55,7 +54,6 @@ from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import places
-from legcal.data.outlines import Outlines
 from legcal.files.motions import Pose
 from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.types import Array, IntArray
@@ -73,7 +71,7 @@ from legcal.machine.parameters import (
 )
 from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
-from legcal.vision.camera import camera_numbers, shared_cameras
+from legcal.vision.camera import camera_numbers
 
 REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
 
@@ -109,24 +107,6 @@ class OutlineResiduals:
 
     def __len__(self) -> int:
         return len(self.index)
-
-
-def outline_residuals(
-    posterior: Posterior, dataset: Dataset, outlines: Outlines
-) -> OutlineResiduals:
-    """Return the residuals of a fit to *outlines* of a *dataset*, in file order."""
-    problem = posterior.problem
-    offset = problem.offsets(posterior.state)
-    covariance = posterior.noise.covariance(problem.outlines.covariance)
-    L = np.linalg.cholesky(covariance) if len(offset) else covariance
-    whitened = np.linalg.solve(L, offset[..., None])[..., 0]
-    # The fit numbers outlines as they stand in canonical order.
-    order = canonical_order(dataset.measurements, dataset.machine.leg_names)
-    numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
-    number = order.reorder(numbered).contrast.astype(np.intp)
-    index = number[problem.outlines.index]
-    back = np.argsort(index, kind="stable")
-    return OutlineResiduals(index[back], offset[back], whitened[back])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +164,19 @@ class Calibration(Summarised):
 
     @cached_property
     def residuals(self) -> OutlineResiduals:
-        """How far each outline is from the fit."""
-        solution = self.solution
-        return outline_residuals(solution.posterior, self.dataset, solution.outlines)
+        """How far each outline is from the fit, in the order of the table."""
+        posterior, outlines = self.solution.posterior, self.solution.outlines
+        problem = posterior.problem
+        offset = problem.offsets(posterior.state)
+        covariance = posterior.noise.covariance(problem.outlines.covariance)
+        L = np.linalg.cholesky(covariance) if len(offset) else covariance
+        whitened = np.linalg.solve(L, offset[..., None])[..., 0]
+        # The fit numbers outlines as they stand in canonical order
+        order = canonical_order(self.dataset.measurements, self.dataset.machine.leg_names)
+        numbered = replace(outlines, contrast=np.arange(len(outlines), dtype=np.float64))
+        index = order.reorder(numbered).contrast.astype(np.intp)[problem.outlines.index]
+        back = np.argsort(index, kind="stable")
+        return OutlineResiduals(index[back], offset[back], whitened[back])
 
     def __repr__(self) -> str:
         return few_lines(f"Calibration of '{self.dataset.machine.name}'", self.result)
@@ -197,7 +187,7 @@ def _result_of(calibration: Calibration) -> Result:
     solution, dataset = calibration.solution, calibration.dataset
     machine, measurements = dataset.machine, dataset.measurements
     names, views = machine.leg_names, measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
+    owners = measurements.owners
     rows, corners = solution.outlines.row[solution.outlines.used], calibration.corners
     if corners is not None:
         rows = np.concatenate([rows, corners.row[corners.used]])
@@ -255,7 +245,7 @@ def _result_of(calibration: Calibration) -> Result:
         holdout=calibration.held_out,
         notes=list(calibration.notes),
         details=list(filter(None, [witness, *calibration.solution.details])),
-        diagnosis=[one.document() for one in calibration.diagnosis] or None,
+        diagnosis=list(calibration.diagnosis) or None,
         only=None if calibration.group is None else calibration.group.group,
         zeros=None if calibration.group is None else calibration.group.zeros,
         overlays=overlay_blocks(places(measurements), calibration.overlays) or None,
@@ -292,7 +282,6 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
     numbers = vector_of(kinematic, calibration.solution.legs, geometries(machine)).tolist()
     values = {**found.values, **dict(zip(kinematic.names, numbers, strict=True))}
     sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
-    known = known_parameters(machine, dataset.measurements.views, boards=dataset.boards).by_name
     return [
         ParameterRow(
             name=name,
@@ -303,7 +292,7 @@ def _parameters(calibration: Calibration) -> list[ParameterRow]:
             unit=parameter.unit,
             status=found.status.get(name, "fixed"),
         )
-        for name, parameter in known.items()
+        for name, parameter in dataset_parameters(dataset).by_name.items()
         if name in values
     ]
 
@@ -448,7 +437,8 @@ class _LinkVector:
 
 def _in_link(machine: Machine, side: Link) -> Iterator[_LinkVector]:
     """Yield the joint centre of each leg and, if it has one, its axis."""
-    parametrization, R = parametrization_of(machine, twists=True), _rotation(machine, side)
+    parametrization = parametrization_of(machine, twists=True)
+    R = machine.T_link_frame(side).rotation.as_matrix()  # from R_b or R_e to the link
     centre, axis = LegColumns.A, LegColumns.BASE_AXIS
     if side == "platform":
         centre, axis = LegColumns.B, LegColumns.PLATFORM_AXIS
@@ -461,30 +451,12 @@ def _in_link(machine: Machine, side: Link) -> Iterator[_LinkVector]:
             yield _LinkVector(j, direction, True, tuple(named[k] for k in place[axis]), by_turns)
 
 
-def _rotation(machine: Machine, side: Link) -> Array:
-    """Return the rotation (3, 3) from R_b or R_e to the link."""
-    return np.asarray(machine.T_link_frame(side).rotation.as_matrix())
-
-
 def joints_in_links(
-    machine: Machine, parameters: Sequence[ParameterRow], kinematic: Kinematic
+    machine: Machine,  # the nominal model
+    parameters: Sequence[ParameterRow],  # in R_b and R_e [m]
+    kinematic: Kinematic,  # with the covariance of all, zero for fixed or held ones
 ) -> dict[Link, LinkBlock]:
-    """Return the joints of a calibration in the links of base and platform.
-
-    Parameters
-    ----------
-    machine : Machine
-        The nominal model.
-    parameters : sequence of ParameterRow
-        Parameters of ``result.json``, in R_b and R_e [m].
-    kinematic : Kinematic
-        The covariance of all kinematic parameters by name, zero for fixed or held ones.
-
-    Returns
-    -------
-    dict
-        A :class:`LinkBlock` for ``base`` and ``platform`` [m]; joints in the order of the legs.
-    """
+    """Return the joints of a calibration in the links of base and platform, in leg order [m]."""
     rows = {row.name: row for row in parameters}
     number = {name: k for k, name in enumerate(kinematic.names)}
     everything = np.array(kinematic.covariance)

@@ -46,7 +46,6 @@ from legcal.errors import (
 )
 from legcal.files.folder import RESULT, in_the_way, path_problem, result_folder
 from legcal.files.reading import read_json
-from legcal.geometry.motions import components
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.home import home_of_legs
@@ -63,9 +62,7 @@ from legcal.machine.parameters import (
     turns_between,
     vector_of,
 )
-from legcal.machine.rods import ends_in_base, measured_readings
 from legcal.pages.document import PAGE
-from legcal.perception.placement import placed_arms
 from legcal.progress import Report, no_progress
 from legcal.vision.camera import Camera, camera_numbers, intrinsic_names, intrinsic_values
 from legcal.workers import Run, in_turn
@@ -94,12 +91,8 @@ def write_result(
     this test, and overlays if they cannot be drawn. *beside* may write further files into the
     folder.
 
-    Raises
-    ------
-    UsageError
-        If the destination is not an earlier result.
-    DidNotConverge
-        If the written model does not load with the computed parameters.
+    Raises UsageError if the destination is not an earlier result; DidNotConverge if the written
+    model does not load with the computed parameters.
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
@@ -125,7 +118,13 @@ def write_result(
                     path.unlink(missing_ok=True)
         if calibration.overlays:
             try:
-                draw_overlays(calibration, folder, run, progress)
+                detection = replace(
+                    _as_detection(dataset, solution),
+                    outlines=with_body_edges(solution.outlines, solution.edges),
+                    rows=np.array(list(calibration.overlays), dtype=np.intp),
+                    corners=calibration.corners,
+                )
+                draw_images(detection, folder, run, progress)
             except (DatasetError, OutOfResources) as failure:
                 note = f"There are no overlays. {' '.join(failure.problems)}"
                 notes = (*calibration.notes, note)
@@ -416,21 +415,6 @@ def with_overlays(calibration: Calibration) -> Calibration:
     return replace(calibration, overlays=files)
 
 
-def draw_overlays(calibration: Calibration, folder: Path, run: Run, progress: Report) -> None:
-    """Draw the overlays of a calibration into a folder.
-
-    Raises DatasetError if a photograph cannot be read, and OutOfResources if one cannot be drawn.
-    """
-    solution = calibration.solution
-    detection = replace(
-        _as_detection(calibration.dataset, solution),
-        outlines=with_body_edges(solution.outlines, solution.edges),
-        rows=np.array(list(calibration.overlays), dtype=np.intp),
-        corners=calibration.corners,
-    )
-    draw_images(detection, folder, run, progress)
-
-
 def check_overlays(dataset: Dataset, destination: Path | None) -> None:
     """Refuse overlays without photographs, or over files of another program, before any work."""
     start = f"{dataset.table_path}: the overlays could not be drawn: found"
@@ -462,30 +446,20 @@ def earlier_overlays(destination: Path) -> list[Path]:
 
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines, legs and cameras of a fit as a detection."""
-    machine, measurements = dataset.machine, dataset.measurements
-    poses = components(solution.T_Rb_Re)
-    q = measured_readings(solution.legs, *poses, measurements.q_of_poses)
-    A, B = ends_in_base(solution.legs, machine.T_base_Rb, *poses, q)
-    cylinders = with_radii(
-        [leg.cylinders for leg in machine.legs],
-        lambda j, c: solution.radii.get((j, c.link), c.radius),
-    )
+    placed = solution.placement(dataset.machine, dataset.measurements)
     return Detection(
         dataset=dataset,
         outlines=solution.outlines,
-        A_base=A[measurements.pose],
-        B_base=B[measurements.pose],
-        cylinders=cylinders,
-        T_base_camera=solution.cameras_in_base(machine.T_base_Rb),
+        A_base=placed.A_base,
+        B_base=placed.B_base,
+        cylinders=with_radii(
+            [leg.cylinders for leg in dataset.machine.legs],
+            lambda j, c: solution.radii.get((j, c.link), c.radius),
+        ),
+        T_base_camera=placed.T_base_camera,
         rows=rows_with_image(dataset),
         unplaced={},
         image_notes=(),
         leg_notes=(),
-        arms=placed_arms(
-            solution.legs,
-            q,
-            measurements.pose,
-            T_base=machine.T_base_Rb,
-            radii=solution.radii,
-        ),
+        arms=placed.arms,
     )

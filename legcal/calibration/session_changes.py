@@ -28,14 +28,14 @@ from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
 from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.sensitivity import CameraResiduals, kinematic_steps
-from legcal.calibration.joint_fit.variables import LegConstraints, State
+from legcal.calibration.joint_fit.variables import LegConstraints
 from legcal.calibration.tuning import DOUBT_BY_CHANCE
 from legcal.data.image_choice import images_to_name
 from legcal.data.measurements import Measurements, few_views, row_names
-from legcal.estimation.problem import Linearization, linearize
-from legcal.estimation.solver import NormalEquations, normal_equations
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import normal_equations
 from legcal.estimation.uncertainty import (
     LEAST_SEEN,
     Estimated,
@@ -91,43 +91,26 @@ OF_SCATTER: frozenset[Kind] = frozenset(("reading_noise", "autofocus", "vibratio
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A number that a fit lacks.
+    """A number that a fit lacks."""
 
-    Attributes
-    ----------
-    kind : str
-        What changed, or how readings follow motors.
-    subject : str
-        The motor, the view or the joint; "" where it is all motors. Several motors have commas.
-    unit : str
-        ``m``, ``rad`` or ``1``.
-    amount, sigma : float
-        The number; of a camera the angle or the distance, whichever is surer, of noise the
-        standard deviation of readings.
-    between : (str, str) or None
-        The images, or the views, before and after a change; None where it is of all images.
-    p_value : float
-        Probability of such a score by chance, times the number of tests.
-    steps : (p, c) array
-        The error of the kinematic parameters of the fit without the number, as in the
-        parametrization of its problem; of noise, c independent errors.
-    images : str
-        The images on one side of a change, as options name them: before that of an encoder, the
-        fewer ones beside that of a camera.
-    stated : float
-        The standard deviation of readings that is stated, of noise alone.
-    """
-
-    kind: Kind
+    kind: Kind  # what changed, or how readings follow motors
+    # the motor, the view or the joint; "" where it is all motors. Several motors have commas
     subject: str
-    unit: str
+    unit: str  # ``m``, ``rad`` or ``1``
+    # amount, sigma: the number; of a camera the angle or the distance, whichever is surer, of noise
+    # the standard deviation of readings
     amount: float
     sigma: float
+    # the images, or views, before and after a change; None where it is of all images
     between: tuple[str, str] | None
-    p_value: float
+    p_value: float  # probability of such a score by chance, times the number of tests
+    # (p, c): the error of the kinematic parameters of the fit without the number, as in the
+    # parametrization of its problem; of noise, c independent errors
     steps: Array
+    # the images on one side of a change, as options name them: before that of an encoder, the fewer
+    # ones beside that of a camera
     images: str = ""
-    stated: float = 0.0
+    stated: float = 0.0  # the standard deviation of readings that is stated, of noise alone
 
     @property
     def size(self) -> str:
@@ -271,42 +254,24 @@ class _Test(NamedTuple):
 
 @dataclass(frozen=True)
 class SessionTests:
-    """Tests of a session.
+    """Tests of a session."""
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        The numbers that the fit lacks, the most certain first.
-    least_slips : dict
-        The least changes of encoders that would show half of the time, by motor [m or rad];
-        motors of which no change can be seen are not in it.
-    overstated : dict
-        By unit how much readings scatter and what is stated, where that is five times as much.
-    periods : dict
-        The outlines of the fit (n,) in each quarter of the images in order, by its images.
-    """
-
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  # the numbers that the fit lacks, the most certain first
+    # the least changes of encoders that would show half of the time, by motor [m or rad]; motors of
+    # which no change can be seen are not in it
     least_slips: Mapping[str, float] = field(default_factory=dict)
+    # by unit how much readings scatter and what is stated, where that is five times as much
     overstated: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    # the outlines of the fit (n,) in each quarter of the images in order, by its images
     periods: Mapping[str, BoolArray] = field(default_factory=dict)
 
 
 def session_tests(
-    posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
+    posterior: Posterior,
+    measurements: Measurements,  # the rows that were fitted
+    sequences: Sequence[IntArray],  # rows in the order of their images (image_sequences)
 ) -> SessionTests:
-    """Test a fit for numbers that it lacks.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        The fit.
-    measurements : Measurements
-        The rows that were fitted.
-    sequences : sequence of (n,) array
-        Rows in the order of their images, see
-        :func:`legcal.data.image_choice.image_sequences`.
-    """
+    """Test a fit for numbers that it lacks."""
     if not len(posterior.problem.outlines):
         return SessionTests()
     left_out = _left_out(posterior.problem)
@@ -395,8 +360,7 @@ def _side(measurements: Measurements, course: _Course, test: _Test) -> str:
     elif hypothesis.kind == "joint":
         images, by = list(course.rows_in_order), np.arange(measurements.n_rows)
     else:
-        names = [view.name for view in measurements.views]
-        of_view = measurements.view == names.index(hypothesis.subject)
+        of_view = measurements.view == measurements.view_names.index(hypothesis.subject)
         images = [rows[of_view[rows]] for rows in course.rows_in_order]
         by = np.arange(measurements.n_rows)
     seen = np.append(_blocks_of(hypothesis).any(axis=0), False)
@@ -521,7 +485,7 @@ class _Course:
                 last.append(names[members[-1]])
                 size.append(len(members))
             ordered.append(np.array(numbers, dtype=np.intp))
-        problem, views = posterior.problem, [view.name for view in measurements.views]
+        problem, views = posterior.problem, measurements.view_names
         row_of = {
             (views[v], name): row
             for row, (v, name) in enumerate(zip(measurements.view.tolist(), names, strict=True))
@@ -665,10 +629,7 @@ def _subsets(sequences: Sequence[int], few: Sequence[tuple[int, ...]]) -> Sequen
 class _Fit:
     """A fit at its minimum, and the course of its images: what it may lack, with the scores."""
 
-    problem: FitProblem
-    state: State
-    linear: Linearization
-    normal: NormalEquations
+    normal: FitNormal
     course: _Course
 
     @classmethod
@@ -676,26 +637,34 @@ class _Fit:
         cls, posterior: Posterior, measurements: Measurements, sequences: Sequence[IntArray]
     ) -> _Fit:
         """Linearise a fit."""
-        problem, state = posterior.problem, posterior.state
-        linear = linearize(problem, state)
-        normal = normal_equations(problem, state, linear)
-        course = _Course.of(posterior, measurements, sequences)
-        return cls(problem, state, linear, normal, course)
+        normal = normal_equations(linearize(posterior.problem, posterior.state))
+        return cls(normal, _Course.of(posterior, measurements, sequences))
+
+    @property
+    def problem(self) -> FitProblem:
+        """The joint fit."""
+        return self.normal.problem
+
+    def _wrong_readings(
+        self, kind: Kind, subject: str, unit: str, by: Array, groups: Array | None = None
+    ) -> _Hypothesis:
+        """Return the hypothesis that readings are wrong by multiples of *by* (n, d).
+
+        In blocks of images, or in *groups* of these (n_blocks, n_groups).
+        """
+        problem, readings = self.problem, self.problem.readings
+        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
+        columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
+        share = self.course.of_poses(readings.pose)
+        share = share if groups is None else share @ groups
+        return _Hypothesis(kind, subject, unit, columns, {"readings": share}, kind == "encoder")
 
     def of_motors(self) -> Iterator[_Hypothesis]:
         """Yield what may be wrong with the readings of motors."""
-        problem, course, legs = self.problem, self.course, self.problem.legs.nominal
-        readings, reading = problem.readings, problem.readings.reading
+        course, legs, wrong_by = self.course, self.problem.legs.nominal, self._wrong_readings
+        readings, reading = self.problem.readings, self.problem.readings.reading
         row = course.row_of_pose[readings.pose]
-        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
-        share = {"readings": course.of_poses(readings.pose)}
         last_move = _last_moves(reading, readings.leg, row, course.before)
-
-        def wrong_by(kind: Kind, subject: str, unit: str, by: Array) -> _Hypothesis:
-            """Return the hypothesis that readings are wrong by multiples of *by* (n, d)."""
-            columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
-            return _Hypothesis(kind, subject, unit, columns, share, kind == "encoder")
-
         motors = np.unique(readings.leg)
         if len(motors) > 1 and len(units := {legs[j].reading_unit for j in motors.tolist()}) == 1:
             of_each = np.equal(readings.leg[:, None], motors)
@@ -709,8 +678,7 @@ class _Fit:
             yield wrong_by("backlash", subject, unit, of_motor * 0.5 * np.sign(last_move)[:, None])
             turned = math.tau if leg.reads_angle else math.inf
             if np.ptp(reading[of_motor[:, 0]]) > _GOOD_PART * turned:
-                once_a_turn = np.column_stack([np.cos(reading), np.sin(reading)])
-                yield wrong_by("eccentricity", subject, unit, of_motor * once_a_turn)
+                yield wrong_by("eccentricity", subject, unit, of_motor * _once_a_turn(reading))
         yield wrong_by("lag", "", "1", last_move[:, None])
         yield wrong_by("pitch", ALL_MOTORS, "1", reading[:, None])
 
@@ -720,7 +688,7 @@ class _Fit:
         A file may be wrong in all views that have it, or in one. Corners of a board on the base are
         means over the images of a view, changed by the share of those after a change.
         """
-        problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        problem, linear, course = self.problem, self.normal.linear, self.course
         owners = np.array(shared_cameras(problem.outlines.views, problem.first_cameras))
         of_files = [owners == owner for owner in owners]
         boards = {corners.name: corners for corners in problem.boards if len(corners)}
@@ -728,7 +696,7 @@ class _Fit:
             name: course.of_images(table.view, table.pose)
             for name, table in ({"outlines": problem.outlines} | boards).items()
         }
-        residuals = CameraResiduals(problem, state, linear)
+        residuals = CameraResiduals(linear)
         for v, view in enumerate(problem.outlines.views):
             if sum(of == v for of, _ in course.rows) < 2 * MIN_IMAGES:
                 continue
@@ -736,8 +704,8 @@ class _Fit:
             moved = []
             for turn, shift in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
                 error = np.zeros((len(problem.outlines.views), 6))
-                error[v] = np.append(turn, np.cross(turn, state.camera_pose.t[v]) - shift)
-                moved.append(residual_changes(problem, linear, "camera_pose", error))
+                error[v] = np.append(turn, np.cross(turn, linear.state.camera_pose.t[v]) - shift)
+                moved.append(residual_changes(linear, "camera_pose", error))
             camera = {
                 name: np.stack([change[name] for change in moved], axis=-1) for name in shares
             }
@@ -753,7 +721,7 @@ class _Fit:
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""
-        problem, state, linear, course = self.problem, self.state, self.linear, self.course
+        problem, linear, course = self.problem, self.normal.linear, self.course
         constraints, legs = LegConstraints(problem.parameters), problem.legs
         readings, outlines = problem.readings, problem.outlines
         share = {
@@ -767,8 +735,8 @@ class _Fit:
                 for column in range(columns.start, columns.stop):
                     error = np.zeros((len(legs.names), LegColumns.COUNT))
                     error[j, column] = 1.0
-                    change = residual_changes(problem, linear, "legs", error)
-                    motion = constraints.following(state, j, column)
+                    change = residual_changes(linear, "legs", error)
+                    motion = constraints.following(linear.state, j, column)
                     moved.append(
                         {
                             of: change[of]
@@ -786,32 +754,19 @@ class _Fit:
 
     def of_screws(self) -> Iterator[list[_Hypothesis]]:
         """Yield errors once a turn of the screws of each motor that slides, of usual leads."""
-        problem, course = self.problem, self.course
-        readings, reading = problem.readings, problem.readings.reading
-        whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
-        group = (
-            np.arange(course.n_blocks) * min(_COARSE, course.n_blocks) // max(course.n_blocks, 1)
-        )
-        coarse = np.equal(group[:, None], np.unique(group)).astype(np.float64)
-        share = {"readings": course.of_poses(readings.pose) @ coarse}
+        readings, n = self.problem.readings, self.course.n_blocks
+        group = np.arange(n) * min(_COARSE, n) // max(n, 1)
+        groups = np.equal(group[:, None], np.unique(group)).astype(np.float64)
         for j in np.unique(readings.leg).tolist():
-            leg = problem.legs.nominal[j]
-            if leg.reads_angle:
-                continue
-            by_error = -readings.sign * whitening * (readings.leg == j)
-            turns = [math.tau * reading / (1e-3 * lead) for lead in _LEADS]
-            once_a_turn = (np.column_stack([np.cos(turn), np.sin(turn)]) for turn in turns)
-            yield [
-                _Hypothesis(
-                    "eccentricity",
-                    leg.motor_label,
-                    "m",
-                    {"readings": by_error[:, None, None] * by[:, None]},
-                    share,
-                    False,
-                )
-                for by in once_a_turn
-            ]
+            leg, of_motor = self.problem.legs.nominal[j], (readings.leg == j)[:, None]
+            if not leg.reads_angle:
+                turns = (math.tau * readings.reading / (1e-3 * lead) for lead in _LEADS)
+                yield [
+                    self._wrong_readings(
+                        "eccentricity", leg.motor_label, "m", of_motor * _once_a_turn(turn), groups
+                    )
+                    for turn in turns
+                ]
 
     def scores(self, hypotheses: Sequence[_Hypothesis]) -> _Scores:
         """Compute the scores of hypotheses."""
@@ -831,7 +786,7 @@ class _Fit:
                     of_factor[:, :, column[k][blocks]] = (
                         values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
                     )
-        return _Scores(Projected.of(self.problem, self.linear, self.normal, stacked), columns)
+        return _Scores(Projected.of(self.normal, stacked), columns)
 
     def better(self, least: float, by_scatter: float) -> _Solved | None:
         """Return a joint that moved or an error once a turn that explains more than what was found.
@@ -888,7 +843,10 @@ class _Fit:
             )
             for (i, row), sigma in zip(noise.group, noise.sigma, strict=True)
         ]
-        sigma_of_ratio = 0.5 * noise.spread * noise.further**2 / noise.ratio
+        more = noise.further**2 * noise.eigenvalues
+        # Standard deviation of the logarithm of the further variance
+        spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
+        sigma_of_ratio = 0.5 * spread * noise.further**2 / noise.ratio
         return Finding(
             noise.kind,
             noise.subject,
@@ -910,8 +868,12 @@ class _Fit:
             name: (values @ amount) * (hypothesis.share[name] @ holds)[:, None]
             for name, values in hypothesis.columns.items()
         }
-        steps = response(self.problem, self.linear, self.normal, changes)
-        return kinematic_steps(self.problem, steps)
+        return kinematic_steps(self.problem, response(self.normal, changes))
+
+
+def _once_a_turn(angle: Array) -> Array:
+    """Return the numbers (n, 2) of an error that comes again with each turn."""
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def _last_moves(q: Array, leg: IntArray, row: IntArray, before: IntArray) -> Array:
@@ -1008,28 +970,32 @@ class _Solved(NamedTuple):
         return self.estimated.covariance * self.scatter
 
 
+def _encoders(hypotheses: Sequence[_Hypothesis]) -> dict[str, list[tuple[int, int]]]:
+    """Return the hypotheses of the zeros of single encoders, and their number, by unit."""
+    found: dict[str, list[tuple[int, int]]] = {"m": [], "rad": []}
+    for i, h in enumerate(hypotheses):
+        if h.kind == "encoder" and h.subject != ALL_MOTORS:
+            found[h.unit].append((i, 0))
+    return found
+
+
 def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
     """Return what scatters from image to image: readings beyond what is stated, or a camera."""
-    encoders = [
-        i for i, h in enumerate(hypotheses) if h.kind == "encoder" and h.subject != ALL_MOTORS
-    ]
+    encoders = _encoders(hypotheses)
+    single = sorted(one for alike in encoders.values() for one in alike)
     groups: list[tuple[Kind, str, list[tuple[int, int]]]] = [
-        ("reading_noise", hypotheses[i].subject, [(i, 0)]) for i in encoders
+        ("reading_noise", hypotheses[one[0]].subject, [one]) for one in single
     ]
-    for unit in ("m", "rad"):
-        alike = [(i, 0) for i in encoders if hypotheses[i].unit == unit]
+    for unit, alike in encoders.items():
         if len(alike) > 1:
-            subject = ALL_MOTORS if len(alike) == len(encoders) else f"all motors [{unit}]"
+            subject = ALL_MOTORS if len(alike) == len(single) else f"all motors [{unit}]"
             groups.append(("reading_noise", subject, alike))
     for i, hypothesis in enumerate(hypotheses):
         if hypothesis.kind == "focal_length":
             groups.append(("autofocus", hypothesis.subject, [(i, 0)]))
         if hypothesis.kind == "camera":
             groups.append(("vibration", hypothesis.subject, [(i, row) for row in range(3)]))
-    tests = [
-        _Scatter.of(kind, subject, group, hypotheses, scores, len(groups))
-        for kind, subject, group in groups
-    ]
+    tests = [_Scatter.of(*group, hypotheses, scores, len(groups)) for group in groups]
     if all(test.p_value > DOUBT_BY_CHANCE for test in tests):
         return None
     best = max(tests, key=lambda test: test.gain)
@@ -1048,11 +1014,23 @@ class _Scatter:
     kind: Kind
     subject: str
     group: Sequence[tuple[int, int]]  # hypotheses and their numbers that scatter alike
-    p_value: float  # times the number of tests
     sigma: Sequence[Array]  # (n_blocks,) stated, of the mean in each block [m, rad or 1]
     stated: float  # of a reading, in the median of motors, or of a camera that stands still
     eigenvalues: Array  # (c,) of K
     squares: Array  # (c,) of z along the eigenvectors
+    n_tests: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such squares by chance, times the number of tests.
+
+        A weighted sum of squares is nearly chi-squared.
+        """
+        own, least = self.eigenvalues, np.finfo(np.float64).tiny
+        total = max(float(own.sum()), least)
+        dof = total**2 / max(float(own @ own), least)
+        by_chance = float(chdtrc(dof, float(self.squares.sum()) * dof / total))
+        return min(self.n_tests * by_chance, 1.0)
 
     @cached_property
     def _likeliest(self) -> tuple[float, float]:
@@ -1077,12 +1055,6 @@ class _Scatter:
         return math.exp(0.5 * self._likeliest[0])
 
     @property
-    def spread(self) -> float:
-        """Standard deviation of the logarithm of the further variance."""
-        more = self.further**2 * self.eigenvalues
-        return math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
-
-    @property
     def ratio(self) -> float:
         """Standard deviation of readings over the stated one."""
         return math.hypot(1.0, self.further)
@@ -1095,41 +1067,27 @@ class _Scatter:
         group: Sequence[tuple[int, int]],
         hypotheses: Sequence[_Hypothesis],
         scores: _Scores,
-        n_tests: int,
+        n_tests: int = 1,
     ) -> _Scatter:
-        """Test what scatters."""
-        own, squares, sigmas, stated = _spectrum(group, hypotheses, scores)
-        # A weighted sum of squares is nearly chi-squared with these degrees of freedom.
-        total = max(float(own.sum()), np.finfo(np.float64).tiny)
-        dof = total**2 / max(float(own @ own), np.finfo(np.float64).tiny)
-        p_value = min(n_tests * float(chdtrc(dof, float(squares.sum()) * dof / total)), 1.0)
-        return cls(kind, subject, group, p_value, sigmas, stated, own, squares)
-
-
-def _spectrum(
-    group: Sequence[tuple[int, int]], hypotheses: Sequence[_Hypothesis], scores: _Scores
-) -> tuple[Array, Array, list[Array], float]:
-    """Return the eigenvalues of K and the squares of z along its vectors, see :class:`_Scatter`.
-
-    Also what is stated: of single blocks, and in the median of a reading or a camera.
-    """
-    sigmas, stated = list[Array](), list[float]()
-    for i, row in group:
-        hypothesis = hypotheses[i]
-        if steady := _STEADY.get(hypothesis.kind):
-            stated.append(steady)
-            sigmas.append(np.full(scores.column[i].shape[1], steady))
-            continue
-        ((name, wrong),) = hypothesis.columns.items()
-        read = wrong[:, 0, row] != 0.0
-        stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
-        n = hypothesis.share[name][read].sum(axis=0)
-        sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
-    columns, sigma = scores.of_single(group, sigmas)
-    z = sigma * scores.scores.score[columns]
-    K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
-    own, vector = np.linalg.eigh(K)
-    return np.maximum(own, 0.0), (vector.T @ z) ** 2, sigmas, float(np.median(stated))
+        """Return the scatter of a group of numbers."""
+        sigmas, stated = list[Array](), list[float]()
+        for i, row in group:
+            hypothesis = hypotheses[i]
+            if steady := _STEADY.get(hypothesis.kind):
+                stated.append(steady)
+                sigmas.append(np.full(scores.column[i].shape[1], steady))
+                continue
+            ((name, wrong),) = hypothesis.columns.items()
+            read = wrong[:, 0, row] != 0.0
+            stated.append(1.0 / float(np.abs(wrong[read, 0, row]).max()))
+            n = hypothesis.share[name][read].sum(axis=0)
+            sigmas.append(stated[-1] / np.sqrt(np.maximum(n, 1.0)))
+        columns, sigma = scores.of_single(group, sigmas)
+        z = sigma * scores.scores.score[columns]
+        K = sigma[:, None] * scores.scores.information(columns, columns) * sigma
+        own, vector = np.linalg.eigh(K)
+        squares, usual = (vector.T @ z) ** 2, float(np.median(stated))
+        return cls(kind, subject, group, sigmas, usual, np.maximum(own, 0.0), squares, n_tests)
 
 
 def _loss(more: Array, own: Array, squares: Array) -> float:
@@ -1141,17 +1099,13 @@ def _loss(more: Array, own: Array, squares: Array) -> float:
 def _overstated(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> dict[str, tuple[float, ...]]:
     """Return how much readings of a unit scatter, and what is stated, where that is far more."""
     found = dict[str, tuple[float, ...]]()
-    for unit in ("m", "rad"):
-        group = [
-            (i, 0)
-            for i, h in enumerate(hypotheses)
-            if h.kind == "encoder" and h.subject != ALL_MOTORS and h.unit == unit
-        ]
+    for unit, group in _encoders(hypotheses).items():
         if not group:
             continue
-        own, squares, _, stated = _spectrum(group, hypotheses, scores)
+        one = _Scatter.of("reading_noise", unit, group, hypotheses, scores)
+        own, squares = one.eigenvalues, one.squares
         less = np.square(_LESS) - 1.0  # of the variance
         loss = [_loss(v * np.minimum(own, 1.0), own, squares) for v in less]
         if min(loss) < -_SURELY_LESS:
-            found[unit] = float(_LESS[int(np.argmin(loss))]) * stated, stated
+            found[unit] = float(_LESS[int(np.argmin(loss))]) * one.stated, one.stated
     return found

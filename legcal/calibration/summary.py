@@ -15,7 +15,6 @@ from legcal.calibration.documents import (
     FrameMark,
     Holdout,
     NoSteps,
-    Observations,
     PlatformBlock,
     ReadingResiduals,
     Result,
@@ -369,7 +368,8 @@ class Summarised:
 
     def plot_uncertainty(self) -> Figure:
         """Return a figure of the standard deviations of parameters, and of the platform."""
-        return uncertainty_figure(self.result).markup()
+        charts = [*parameter_charts(parameters_of(self.result)), *platform_chart(self.result)]
+        return stacked("How well the parameters are known", charts).markup()
 
 
 def doubt_lines(result: Result) -> list[str]:
@@ -393,19 +393,15 @@ def _observation_lines(result: Result) -> list[str]:
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
     if seen.total == 0:  # boards are the whole measurement
         lines = ["Outlines: none, no leg was measured."]
-    return [*lines, *_left_out_lines(seen)]
-
-
-def _left_out_lines(seen: Observations) -> list[str]:
     of_views = Counter(image.view for cause in seen.left_out for image in cause.images)
-    if not of_views:
-        return []
-    counts = list_in_words([f"{n} of {view}" for view, n in of_views.items()])
-    n_views = len(of_views)
-    return [
-        f"Left out: {sum(of_views.values())} of {seen.images} images, in {n_views} "
-        f"view{'s' * (n_views != 1)} ({counts})."
-    ]
+    if of_views:
+        counts = list_in_words([f"{n} of {view}" for view, n in of_views.items()])
+        n_views = len(of_views)
+        lines.append(
+            f"Left out: {sum(of_views.values())} of {seen.images} images, in {n_views} "
+            f"view{'s' * (n_views != 1)} ({counts})."
+        )
+    return lines
 
 
 _MAX_REASONS = 4
@@ -550,9 +546,3 @@ def platform_chart(result: Result) -> list[Canvas]:
         )
     ]
     return [scatter("Platform error", lines, "pose", "platform [mm]", log="y")] if poses else []
-
-
-def uncertainty_figure(result: Result) -> Canvas:
-    """Draw changes and standard deviations of all parameters, and of the platform at poses."""
-    charts = parameter_charts(parameters_of(result))
-    return stacked("How well the parameters are known", [*charts, *platform_chart(result)])

@@ -20,7 +20,7 @@ from legcal.calibration.doubts import (
 )
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.outlier_readings import reading_notes
-from legcal.calibration.joint_fit.parameter_choices import known_parameters
+from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.sensitivity import EXACT_CAMERAS, SIGMA_EXACT
@@ -94,10 +94,8 @@ def judge(
         change, sigma, found = _change_of_parameters(dataset, reported)
     else:
         change, sigma, found = _change_of_platform(platform)
-        by_radii = _share_of_scale(platform)
-        by_travel = _error_of_travel(platform, solution, machine.tolerance)
-        by_camera = _error_of_exact_cameras(platform)
-        found += "".join(f"; {clause}" for clause in (by_radii, by_travel, by_camera) if clause)
+        clauses, by_radii = _assumed_errors(platform, solution, machine.tolerance)
+        found = "; ".join([found, *clauses])
         if by_radii:
             remedy = f"measure the distance of two joints and state it ({machine.length_option})"
     sequences = sequences_of(dataset)
@@ -121,7 +119,12 @@ def judge(
         doubts = (*doubts, Doubt("no_improvement", what, more, is_grave=True))
     # Grave ones first, then those of known effects, the largest first
     doubts = tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
-    verdict = _verdict(doubts, found, remedy)
+    sentence = f"Calibrated: {found}."
+    if doubts:
+        n_more = len(doubts) - 1
+        beside = f" {n_more} more doubt{'s' * (n_more > 1)} beside that." if n_more else ""
+        heading = REFUSED if doubts[0].is_grave else "In doubt"
+        sentence = f"{heading}: {found}. {doubts[0].sentence}{beside}"
     causes = {finding.what for finding in session.findings}
     if any(doubt.what in causes or doubt.code in ("scale", "mistake") for doubt in doubts):
         # What a named cause does to cameras and readings accuses neither
@@ -134,7 +137,7 @@ def judge(
         reported,
         steps,
         platform,
-        verdict,
+        Verdict(doubts, sentence, remedy),
         (
             *notes,
             *_beyond_boards(dataset, solution),
@@ -153,7 +156,7 @@ def judge(
 
 def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:
     """Return a note on the file of each camera that the measurements contradict."""
-    names = [view.name for view in dataset.measurements.views]
+    names = dataset.measurements.view_names
     return [
         f"View {view} uses the camera file {dataset.camera_paths[names.index(view)]}."
         for view in dict.fromkeys(wrong.view for wrong in solution.camera_doubts)
@@ -254,55 +257,49 @@ def _change_of_platform(platform: PlatformAccuracy) -> tuple[float, float, str]:
     return change.mean_displacement, sigma.mean_displacement, found
 
 
-def _share_of_scale(platform: PlatformAccuracy) -> str:
-    """Return a clause on the scale where it is the largest part of the predicted error, or ""."""
+def _assumed_errors(
+    platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance
+) -> tuple[list[str], bool]:
+    """Return clauses on errors that no sigma of the fit has, where these are not negligible.
+
+    Also whether radii alone say the scale, as the largest part of the predicted error.
+    """
     predicted = (platform.workspace or platform.sigma).mean_displacement
-    scale = platform.effects.get(SCALE)
-    if scale is None or 2.0 * scale.mean_displacement**2 < predicted**2:
-        return ""
-    return (
-        "the largest part of that is the scale of the machine "
-        f"({1e3 * scale.mean_displacement:.3f} of "
-        f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
-    )
-
-
-def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance) -> str:
-    """Return a clause on what an error of all travel does, "" where that is negligible."""
-    predicted = (platform.workspace or platform.sigma).mean_displacement
-    moved = platform.effects.get(ALL_READINGS)
-    if moved is None or moved.mean_displacement <= NEGLIGIBLE * predicted:
-        return ""
-    problem = solution.posterior.problem
-    witnesses = scale_witnesses(problem)
-    rests = f"{witnesses[0]} alone; " if len(witnesses) == 1 else f"{few(witnesses)}; of "
-    assumed = "" if tolerance.travel else ", assumed: state tolerance: {travel: ...}"
-    return (
-        f"the scale rests on {rests}an error of {problem.legs.sigma_travel:.2%} of the travel "
-        f"(1 sigma{assumed}) "
-        + ("" if len(witnesses) == 1 else "what these leave ")
-        + f"moves the platform by {mm_deg(moved.mean_displacement, moved.mean_rotation)}"
-    )
-
-
-def _error_of_exact_cameras(platform: PlatformAccuracy) -> str:
-    """Return a clause on what an error of exact focal lengths does, "" where it is negligible."""
-    predicted = (platform.workspace or platform.sigma).mean_displacement
-    moved = platform.effects.get(EXACT_CAMERAS)
-    if moved is None or moved.mean_displacement <= NEGLIGIBLE * predicted:
-        return ""
-    return (
-        f"no covariance of the camera is stated; an error of {SIGMA_EXACT:.1%} of its focal length "
-        "(1 sigma, assumed) moves the platform by "
-        f"{mm_deg(moved.mean_displacement, moved.mean_rotation)}"
-    )
+    effects = {
+        what: (error.mean_displacement, error.mean_rotation)
+        for what, error in platform.effects.items()
+        if error.mean_displacement > NEGLIGIBLE * predicted
+    }
+    clauses, scale = list[str](), platform.effects.get(SCALE)
+    by_radii = scale is not None and 2.0 * scale.mean_displacement**2 >= predicted**2
+    if scale is not None and by_radii:
+        clauses.append(
+            "the largest part of that is the scale of the machine "
+            f"({1e3 * scale.mean_displacement:.3f} of "
+            f"{1e3 * predicted:.3f} mm over the workspace), which radii alone say"
+        )
+    if ALL_READINGS in effects:
+        problem = solution.posterior.problem
+        witnesses = scale_witnesses(problem)
+        rests = f"{witnesses[0]} alone; " if len(witnesses) == 1 else f"{few(witnesses)}; of "
+        assumed = "" if tolerance.travel else ", assumed: state tolerance: {travel: ...}"
+        clauses.append(
+            f"the scale rests on {rests}an error of {problem.legs.sigma_travel:.2%} of the travel "
+            f"(1 sigma{assumed}) "
+            + ("" if len(witnesses) == 1 else "what these leave ")
+            + f"moves the platform by {mm_deg(*effects[ALL_READINGS])}"
+        )
+    if EXACT_CAMERAS in effects:
+        clauses.append(
+            f"no covariance of the camera is stated; an error of {SIGMA_EXACT:.1%} of its focal "
+            f"length (1 sigma, assumed) moves the platform by {mm_deg(*effects[EXACT_CAMERAS])}"
+        )
+    return clauses, by_radii
 
 
 def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, float, str]:
     """Return the change of joints and lengths, its uncertainty, rms [m], and a clause of both."""
-    known = known_parameters(
-        dataset.machine, dataset.measurements.views, boards=dataset.boards
-    ).by_name
+    known = dataset_parameters(dataset).by_name
     found = solution.estimates
     lengths = [
         (found.values[name] - known[name].nominal, sigma)
@@ -316,15 +313,6 @@ def _change_of_parameters(dataset: Dataset, solution: Solution) -> tuple[float, 
         f"{dataset.machine.undetermined}"
     )
     return change, sigma, clause
-
-
-def _verdict(doubts: tuple[Doubt, ...], found: str, remedy: str) -> Verdict:
-    if not doubts:
-        return Verdict(doubts, f"Calibrated: {found}.", remedy)
-    more = len(doubts) - 1
-    others = f" {more} more doubt{'s' * (more > 1)} beside that." if more else ""
-    heading = REFUSED if doubts[0].is_grave else "In doubt"
-    return Verdict(doubts, f"{heading}: {found}. {doubts[0].sentence}{others}", remedy)
 
 
 # The plan of a session

@@ -11,9 +11,8 @@ covariance of both. Directions that the new images determine worse than the prio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +30,11 @@ from legcal.calibration.documents import (
 from legcal.calibration.evaluation import machine_difference
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.calibration.joint_fit.part_errors import with_zeros
+from legcal.calibration.joint_fit.part_errors import part_derivatives
 from legcal.calibration.joint_fit.platform import expected_error, moved_by
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import State
+from legcal.calibration.joint_fit.variables import State, fitted_legs
 from legcal.calibration.ordered_dataset import Options, order_dataset
 from legcal.calibration.pipeline import estimate_parameters, outline_key
 from legcal.calibration.result_folder import EarlierResult, load_result
@@ -47,24 +46,19 @@ from legcal.estimation.solver import Minimum, information, minimise
 from legcal.estimation.uncertainty import named_covariance
 from legcal.geometry.covariances import whitener
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import pose_sensitivity
-from legcal.machine.leg import ARMS, Leg, LegColumns, LegKind, ParameterId
+from legcal.machine.leg import ARMS, LegKind, ParameterId
 from legcal.machine.model import Machine, vectors_A_to_B
 from legcal.machine.parameters import (
-    Parametrization,
     geometries,
-    in_joint_frames,
-    moved_legs,
     parametrization_of,
     vector_of,
 )
-from legcal.machine.rods import actuator_index, actuators_of
+from legcal.machine.rods import first_rods
 from legcal.progress import Progress, shown_progress
-from legcal.vision.camera import shared_cameras
 from legcal.workers import Workers, worker_pool
 
-_STEP = 1e-6  # step of numerical derivatives [rad, mean leg lengths]
+_SEEN = 1e-6  # change of a parameter over that of a part, below which it has no effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +106,7 @@ def difference(
 
     Directions are derivatives by the parameters, each in sigmas of its prior.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the new images determine nothing.
+    Raises NotIdentifiable if the new images determine nothing.
     """
     # In units of the priors, S is the information of the new images.
     scaled = covariance / np.outer(prior, prior)
@@ -212,96 +203,60 @@ def _explain(
     )
 
 
-# Name, unit, link of the axes and motion of a component of what may have changed
-_Component = tuple[str, str, str, Callable[[float], Sequence[Leg]]]
-
-
-def possible_changes(
-    machine: Machine, parametrization: Parametrization
-) -> tuple[tuple[Change, ...], ...]:
+def possible_changes(machine: Machine, names: Sequence[str]) -> tuple[tuple[Change, ...], ...]:
     """Return the possible changes: single lengths first, then joints, then whole legs.
 
-    Joints move along the axes of the links of base and platform. Changes of a motor that moves
-    joints at A affect all its rods.
+    *names* are the parameters that may differ. Joints move along the axes of the links of base and
+    platform. Changes of a motor that moves joints at A affect all its rods.
     """
-    legs, changes = geometries(machine), dict[str, list[Change]]()
-    metre = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
+    fitted, changes = fitted_legs(machine), dict[str, list[Change]]()
+    legs, moved = fitted.nominal, part_derivatives(fitted)[0]
+    every, unit_of = fitted.parametrization.names, fitted.parametrization.units
+    rows = np.array([every.index(name) for name in names], dtype=np.intp)
+    sizes = {"m": machine.size, "rad": 1.0}
+    least = _SEEN * np.array([[sizes[unit_of[i]]] for i in rows])
+    turns = ("1", "2", "place 1", "place 2"), ("rad", "rad", "m", "m")
 
-    def parameters(moved: Sequence[Leg]) -> Array:
-        return vector_of(parametrization, in_joint_frames(moved, machine.frame_legs), legs)
-
-    for owner, part, components in _possible(machine, legs):
-        shown = list[tuple[str, str, str, Array]]()
-        for component, unit, link, moved in components:
-            size = _STEP * (machine.size if unit == "m" else 1.0)
-            column = (parameters(moved(size)) - parameters(moved(-size))) / (2.0 * size)
-            if np.any(np.abs(column) * size > _STEP * _STEP * metre):
-                shown.append((component, unit, link, column))
-        if shown:
-            names, units, links, columns = zip(*shown, strict=True)
-            change = Change(part, owner, names, units, links, np.column_stack(columns))
+    def add(
+        owner: str, part: str, names: Sequence[str], units: Sequence[str], J: Array, link: str = ""
+    ) -> None:
+        """Add the change of a part, without components that have no effect."""
+        size = [sizes[unit] for unit in units[: J.shape[1]]]
+        shown = np.flatnonzero(np.any(np.abs(J[rows]) * size > least, axis=0))
+        if len(shown):
+            components, of_shown = (tuple(x[k] for k in shown.tolist()) for x in (names, units))
+            links, columns = (link,) * len(shown), J[np.ix_(rows, shown)]
+            change = Change(part, owner, components, of_shown, links, columns)
             changes.setdefault(owner, []).append(change)
-    every = [change for of_owner in changes.values() for change in of_owner]
-    return (
-        tuple(change for change in every if len(change.components) == 1),
-        tuple(change for change in every if len(change.components) > 1),
-        tuple(_together(owner, own) for owner, own in changes.items() if len(own) > 1),
-    )
-
-
-def _possible(
-    machine: Machine, legs: Sequence[Leg]
-) -> Iterator[tuple[str, str, Iterable[_Component]]]:
-    """Yield the parts of legs and motors that may change, each with its owner and components."""
-    place = np.arange(len(legs) * LegColumns.COUNT).reshape(len(legs), LegColumns.COUNT)
-
-    def along(
-        which: Sequence[int], columns: slice, parts: Iterable[tuple[str, str, str, Array]]
-    ) -> Iterator[_Component]:
-        """Yield motions of some of the numbers of legs (:class:`LegColumns`) along directions."""
-
-        def moved(direction: Array, step: float) -> Sequence[Leg]:
-            change = np.zeros(place.shape)
-            change[list(which), columns] = step * direction
-            return moved_legs(legs, place, change.ravel())
-
-        for name, unit, link, direction in parts:
-            yield name, unit, link, partial(moved, direction)
 
     for j, leg in enumerate(legs):
-        if leg.kind is not LegKind.PASSIVE:
+        if (j, "length") in moved:
             length = "length" if leg.kind is LegKind.CONSTANT else "offset"
-            number = slice(LegColumns.LENGTH, LegColumns.LENGTH + 1)
-            one = [(f"{leg.name}.{length}", "m", "", np.ones(1))]
-            yield leg.name, length, along([j], number, one)
-        for part, link, T, columns in (  # rows of T are the axes of the links in R_b and R_e
-            ("base joint", machine.base, machine.T_base_Rb, LegColumns.A),
-            ("platform joint", machine.platform, machine.T_platform_Re, LegColumns.B),
+            add(leg.name, length, [f"{leg.name}.{length}"], "m", moved[j, "length"])
+        for part, end, link, T in (  # rows of T are the axes of the links in R_b and R_e
+            ("base joint", "A", machine.base, machine.T_base_Rb),
+            ("platform joint", "B", machine.platform, machine.T_platform_Re),
         ):
-            axes = zip("xyz", "mmm", [link] * 3, T.rotation.as_matrix(), strict=True)
-            yield leg.name, part, along([j], columns, axes)
-        for part, axis, columns in (
-            ("base axis", leg.base_axis, LegColumns.BASE_AXIS),
-            ("platform axis", leg.platform_axis, LegColumns.PLATFORM_AXIS),
-        ):
-            if axis is not None:
-                turns = zip("12", ["rad"] * 2, [""] * 2, np.eye(2), strict=True)
-                yield leg.name, part, along([j], columns, turns)
-    index = actuator_index(legs)
-    for a, actuator in enumerate(actuators_of(legs)):
-        motor, rods = actuator.joint, [j for j, other in enumerate(index) if other == a]
-        zero = partial(lambda motor, step: with_zeros(legs, {motor: step}), motor)
-        yield motor, "zero", [(f"{motor}.zero", actuator.unit, "", zero)]
-        lines = [("axis", ActuatorColumns.LINE)]
-        if not actuator.turns:
-            lines = [("direction", ActuatorColumns.AXIS)]
-        elif actuator.arm is not None:
-            lines.append(("arm line", ActuatorColumns.ARM))
-        for part, columns in lines:
-            names, units = ("1", "2", "place 1", "place 2"), ("rad", "rad", "m", "m")
-            n = columns.stop - columns.start
-            numbers = zip(names[:n], units[:n], [""] * n, np.eye(n), strict=True)
-            yield motor, part, along(rods, columns, numbers)
+            along = moved[j, end] @ T.rotation.as_matrix().T
+            add(leg.name, part, "xyz", "mmm", along, link)
+        for axis in ("base_axis", "platform_axis"):
+            if (j, axis) in moved:
+                add(leg.name, axis.replace("_", " "), *turns, moved[j, axis])
+    for j, motor in ((j, legs[j].motor_label) for j in first_rods(legs)):
+        add(motor, "zero", [f"{motor}.zero"], [legs[j].reading_unit], moved[j, "zero"])
+        if not legs[j].reads_angle:
+            add(motor, "direction", *turns, moved[j, "axis"])
+            continue
+        add(motor, "axis", *turns, np.hstack([moved[j, "axis"], moved[j, "point"]]))
+        if (j, "arm_axis") in moved:
+            line = np.hstack([moved[j, "arm_axis"], moved[j, "arm_point"]])
+            add(motor, "arm line", *turns, line)
+    found = [change for of_owner in changes.values() for change in of_owner]
+    return (
+        tuple(change for change in found if len(change.components) == 1),
+        tuple(change for change in found if len(change.components) > 1),
+        tuple(_together(owner, own) for owner, own in changes.items() if len(own) > 1),
+    )
 
 
 def _together(name: str, changes: Sequence[Change]) -> Change:
@@ -361,19 +316,12 @@ class Check:
 
     def document(self) -> dict[str, Any]:
         """Return the output of ``--json``."""
-        movement = self.movement
-        return CheckDocument(
+        return CheckDocument.describing(
+            self.movement,
             legcal_check=1,
             result=str(self.earlier.folder),
-            moved=movement.moved,
-            significance=movement.significance,
-            p_value=movement.p_value,
-            statistic=movement.statistic,
-            dof=movement.dof,
             of=len(self.earlier.names),
-            noise_dof=movement.noise_dof,
             verdict=self.sentence,
-            explanations=list(movement.explanations),
             platform=self.at_platform,
             images=self.dataset.measurements.n_rows,
             residuals=FitQuality.model_validate(self.solution.quality),
@@ -499,21 +447,14 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
         name: Prior(mean, sigma)
         for name, mean, sigma in zip(prior.names, means, sigmas, strict=True)
     }
-    views = dataset.measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    intrinsics = {
-        owner: earlier.intrinsics(v.camera) for owner, v in zip(owners, views, strict=True)
-    }
+    m = dataset.measurements
+    cameras = dict(zip(m.owners, map(earlier.intrinsics, m.cameras), strict=True))
     # Lines of arms that the earlier images did not show were kept nominal and are uncertain.
     fixed = [name for name in earlier.fixed if ParameterId.parse(name).kind not in ARMS]
     return Choices(
         fixed=frozenset(fixed),
         priors=priors,
-        cameras={
-            owner: known_intrinsics
-            for owner, known_intrinsics in intrinsics.items()
-            if known_intrinsics is not None
-        },
+        cameras={owner: known for owner, known in cameras.items() if known is not None},
         least_shared_px=earlier.document.residuals.shared_px,
     )
 
@@ -522,7 +463,6 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _EarlierEstimate) 
 class _Free:
     """The new images fitted with wide priors, at one of their minima."""
 
-    problem: FitProblem
     minimum: Minimum[State]
     tested: IntArray  # indices of the tested parameters among the named unknowns
     more: Array  # (n, n): covariance of the tested parameters not included in the information
@@ -535,16 +475,13 @@ class _Free:
 
     def estimate(self) -> tuple[Array, Array]:
         """Return the tested parameters (n,) and their covariance (n, n), at most the prior's."""
-        problem, state, tested = self.problem, self.minimum.state, self.tested
-        normal = information(problem, state, self.minimum.linear, problem.loss)
-        named = named_covariance(problem, state, normal.kept_covariance())
-        covariance, unit = (
-            named[np.ix_(tested, tested)] + self.more,
-            np.outer(self.prior, self.prior),
-        )
+        linear, tested = self.minimum.linear, self.tested
+        problem, unit = linear.problem, np.outer(self.prior, self.prior)
+        named = named_covariance(linear, information(linear, problem.loss).kept_covariance())
+        covariance = named[np.ix_(tested, tested)] + self.more
         variance, vectors = np.linalg.eigh(covariance / unit)
         covariance = (vectors * np.minimum(variance, 1.0)) @ vectors.T * unit
-        return problem.coordinates(state)[tested], covariance
+        return problem.coordinates(linear.state)[tested], covariance
 
 
 def _fits(
@@ -562,8 +499,9 @@ def _fits(
     number = np.array([block.labels.index(name) for name in prior.names], dtype=np.intp)
     tested = problem.where("legs")[number]
     # Local edge biases do not show in residuals.
-    normal = information(problem, state, linearize(problem, state), loss)
-    at_places = named_covariance(problem, state, posterior.covariance - normal.kept_covariance())
+    linear = linearize(problem, state)
+    without = information(linear, loss).kept_covariance()
+    at_places = named_covariance(linear, posterior.covariance - without)
     at_places = at_places[np.ix_(tested, tested)]
     held = solution.kinematic.of_values(prior.names)[1]
     additional = at_places + prior.held_sigma**2 * held.T @ held
@@ -585,9 +523,7 @@ def _fits(
     )
     near, elsewhere = minimum(problem, constrained.state), minimum(problem, state)
     best = elsewhere if near.cost - elsewhere.cost > BETTER else near
-    near_earlier, free = (
-        _Free(problem, result, tested, additional, prior.sigma) for result in (near, best)
-    )
+    near_earlier, free = (_Free(result, tested, additional, prior.sigma) for result in (near, best))
     saved = 2.0 * (constrained.cost - min(near.cost, elsewhere.cost))
     return free, near_earlier, max(saved, 0.0)  # zero for the images of the earlier result
 
@@ -609,7 +545,7 @@ def _compare(
     if variance_factor == 1.0:
         dof = noise_dof(solution.quality.dof, covariance, prior.sigma)
     parts = determined_parts(covariance, prior.sigma)
-    changes = possible_changes(machine, _only(parametrization, columns))
+    changes = possible_changes(machine, prior.names)
     movement = judge_movement(measured_difference, saved, parts, dof, changes, significance)
     fit = free if movement.moved else near
     J = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, *fit.poses)
@@ -639,14 +575,3 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
         for noise in (solution.quality.noise, before)
     )
     return max(earlier_variance / new_variance, 1.0)
-
-
-def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
-    place = np.full(parametrization.place.shape, -1, dtype=np.intp)
-    for new, old in enumerate(columns):
-        place[parametrization.place == old] = new
-    return Parametrization(
-        tuple(parametrization.names[i] for i in columns),
-        tuple(parametrization.units[i] for i in columns),
-        place,
-    )

@@ -238,9 +238,8 @@ def _rows_of(dataset: Dataset, part: str) -> IntArray:
     A range that begins with a view and does not end with one is of that view alone.
     """
     m, names = dataset.measurements, row_names(dataset.measurements)
-    views = [view.name for view in m.views]
-    if part in views and part not in names:
-        return np.flatnonzero(m.view == views.index(part))
+    if part in m.view_names and part not in names:
+        return np.flatnonzero(m.view == m.view_names.index(part))
     first, dots, last = part.partition("..")
     view, begins = _rows_named(m, first)
     if not dots:
@@ -261,7 +260,7 @@ def _rows_of(dataset: Dataset, part: str) -> IntArray:
 
 def _rows_named(m: Measurements, name: str) -> tuple[int, IntArray]:
     """Return the view before an image (-1: none), and the rows of that name."""
-    names, views = np.array(row_names(m), dtype=object), [view.name for view in m.views]
+    names, views = np.array(row_names(m), dtype=object), m.view_names
     head, colon, rest = name.partition(":")
     view = views.index(head) if colon and head in views and name not in names else -1
     rows = np.flatnonzero((names == (name if view < 0 else rest)) & ((view < 0) | (m.view == view)))

@@ -94,7 +94,7 @@ class Order:
 def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Order:
     """Return legs and views by name, and rows by view, image, pose label and readings."""
     legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
-    view_names = np.array([view.name for view in measurements.views], dtype=object)
+    view_names = np.array(measurements.view_names, dtype=object)
     views = np.argsort(view_names, kind="stable")
     labels = measurements.pose_labels or ("",) * measurements.n_poses
     keys = [

@@ -36,7 +36,7 @@ from legcal.files.schema import closest, describe, few
 from legcal.files.table import Column, Table, read_table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import TRAVEL_MARGIN, Leg
-from legcal.vision.camera import Camera
+from legcal.vision.camera import Camera, shared_cameras
 
 # Fraction of the travel, and standard deviations: readings outside by less are within the travel
 # but for rounding and noise.
@@ -116,6 +116,21 @@ class Measurements:
         return int(self.pose.max()) + 1 if len(self.pose) else 0
 
     @property
+    def view_names(self) -> tuple[str, ...]:
+        """The names of the views."""
+        return tuple(view.name for view in self.views)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of each view, with the intrinsics of its file."""
+        return tuple(view.camera for view in self.views)
+
+    @property
+    def owners(self) -> tuple[str, ...]:
+        """For each view the name of the first view with its camera."""
+        return shared_cameras(self.view_names, self.cameras)
+
+    @property
     def clicked_views(self) -> tuple[str, ...]:
         """The views with a rough pose from clicks on joints."""
         return tuple(view.name for view in self.views if view.by_landmarks)
@@ -190,8 +205,8 @@ def refuse_outside(
 ) -> None:
     """Refuse pixels, in two columns, outside the image of their row of the measurements."""
     px = table.numbers(columns)
-    cameras = [view.camera for view in measurements.views]
-    size = np.array([(camera.width, camera.height) for camera in cameras])[measurements.view[rows]]
+    sizes = np.array([(camera.width, camera.height) for camera in measurements.cameras])
+    size = sizes[measurements.view[rows]]
     outside = ((px < -0.5) | (px > size - 0.5)) & (rows >= 0)[:, None]
     for i, k in np.argwhere(outside).tolist():
         needed = f"-0.5 to {size[i, k] - 0.5:g} px, inside the image"

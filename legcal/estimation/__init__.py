@@ -25,8 +25,8 @@ unknowns that are fixed.
 
     problem = EstimationProblem((camera,), board_poses, (corners,))
     minimum = minimise(problem, state, Huber(3.0))  # Levenberg-Marquardt, loss narrowed on the way
-    normal = information(problem, minimum.state, minimum.linear)
-    covariance = named_covariance(problem, minimum.state, normal.kept_covariance())
+    normal = information(minimum.linear)
+    covariance = named_covariance(minimum.linear, normal.kept_covariance())
 
 A client writes a state, a function of residual rows for each kind of measurement (analytic
 derivatives; one finite-difference test checks them all), and the blocks. At predicted observations

@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from legcal.estimation.loss import LEAST_SQUARES, Loss
-from legcal.estimation.problem import EstimationProblem, Linearization, S
 from legcal.estimation.solver import NormalEquations, inverse_on_range
 from legcal.geometry.types import Array, BoolArray, IntArray
 
@@ -116,23 +116,12 @@ class Clusters:
         return np.asarray(C @ (ratio * self.information.sum(axis=0) + self.prior) @ C)
 
 
-def clustered(
-    problem: EstimationProblem[S],
-    linear: Linearization,
-    normal: NormalEquations,
-    loss: Loss = LEAST_SQUARES,
-) -> Clusters:
+def clustered(normal: NormalEquations[Any, Any], loss: Loss = LEAST_SQUARES) -> Clusters:
     """Compute the score and the information that each eliminated element has of the kept unknowns.
 
-    Parameters
-    ----------
-    problem, linear
-        Linearised where every element is at its minimum.
-    normal : NormalEquations
-        For the same problem, state and loss.
-    loss : Loss
-        Loss of the robust factors.
+    Every element is at its minimum, of the same loss.
     """
+    problem, linear = normal.problem, normal.linear
     n, k = problem.n_elements, problem.n_kept
     score, U = np.zeros((n, k + 1)), np.zeros((n, k + 1, k + 1))
     for factor in problem.factors:

@@ -25,6 +25,7 @@ from legcal.geometry.rotations import turned
 from legcal.geometry.types import Array, IntArray
 
 S = TypeVar("S")  # the state: a dataclass with one field for each block of variables
+P = TypeVar("P", bound="EstimationProblem[Any]")
 
 
 def _added(value: Array, change: Array) -> Array:
@@ -619,12 +620,13 @@ class PriorRows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Linearization:
-    """Whitened residuals and derivatives of all factors and priors at a state."""
+class Linearization(Generic[P, S]):
+    """A problem at a state: whitened residuals and derivatives of all factors and priors."""
 
+    problem: P
+    state: S
     rows: Mapping[str, Residuals]
     priors: tuple[PriorRows, ...]  # of blocks with a prior
-    n_kept: int
 
     def __getitem__(self, name: str) -> Residuals:
         return self.rows[name]
@@ -637,9 +639,10 @@ class Linearization:
     @property
     def prior_J(self) -> Array:
         """Derivatives of the residuals of all priors, (n_priors, n_kept)."""
-        parts = [np.zeros((0, self.n_kept))]
+        n_kept = self.problem.n_kept
+        parts = [np.zeros((0, n_kept))]
         for r, slope, unknown, first in self.priors:
-            part = np.zeros((len(r), self.n_kept))
+            part = np.zeros((len(r), n_kept))
             if slope.ndim == 1:
                 part[np.arange(len(r)), unknown] = slope
             else:
@@ -659,7 +662,7 @@ class Linearization:
                 g[block] += slope.T @ r
 
 
-def linearize(problem: EstimationProblem[S], state: S) -> Linearization:
+def linearize(problem: P, state: S) -> Linearization[P, S]:
     """Linearise a problem at a state."""
     priors, first = [], 0
     for block in problem.variables:
@@ -675,4 +678,4 @@ def linearize(problem: EstimationProblem[S], state: S) -> Linearization:
             priors.append(PriorRows(r, slope, first + prior.unknown, first))
         first += size
     rows = {factor.name: factor.linearize(state) for factor in problem.factors}
-    return Linearization(rows, tuple(priors), problem.n_kept)
+    return Linearization(problem, state, rows, tuple(priors))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic
+from typing import Any, Generic
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
@@ -22,6 +22,7 @@ from legcal.estimation.loss import LEAST_SQUARES, Loss, PseudoHuber
 from legcal.estimation.problem import (
     EstimationProblem,
     Linearization,
+    P,
     Residuals,
     S,
     Sparsity,
@@ -57,7 +58,7 @@ class Minimum(Generic[S]):
     """A minimum of the robust cost."""
 
     state: S
-    linear: Linearization
+    linear: Linearization[Any, S]
     cost: float
     iterations: int  # attempted steps
     rate: float = 1.0  # predicted decrease of the last step over that of the step before
@@ -68,11 +69,15 @@ def minimise(
     state: S,
     loss: Loss = LEAST_SQUARES,
     *,
-    max_iterations: int = 200,
-    is_near: bool = False,
-    tolerance: float = COST_TOLERANCE,
+    max_iterations: int = 200,  # attempted steps
+    is_near: bool = False,  # the start is the minimum for other weights: no damping of a first step
+    tolerance: float = COST_TOLERANCE,  # predicted decrease at convergence, in squared sigmas
+    # relative decrease at convergence, after the first 30 steps: outliers make the cost nearly
+    # linear, and its last decreases slow
     relative_tolerance: float = 0.0,
-    must_converge: bool = True,
+    must_converge: bool = True,  # raise if the steps do not; otherwise return the best state
+    # that of a minimum nearby: it predicts the decrease after the first step, which may then be the
+    # only one
     rate: float = 1.0,
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
@@ -82,45 +87,22 @@ def minimise(
     cost is at rounding, it is below *tolerance*, or, after the first 30 steps, it is below
     *relative_tolerance* times the cost.
 
-    Parameters
-    ----------
-    problem, state, loss
-        EstimationProblem, starting values and robust loss.
-    max_iterations : int
-        Attempted steps.
-    is_near : bool
-        The start is the minimum for other weights: the first step is not damped.
-    tolerance : float
-        Predicted decrease of the cost at convergence, in squared sigmas.
-    relative_tolerance : float
-        Relative decrease at convergence, after the first 30 steps: outliers make the cost nearly
-        linear, and its last decreases slow.
-    must_converge : bool
-        Raise if the steps do not converge; otherwise return the best state.
-    rate : float
-        ``Minimum.rate`` of a minimum nearby: it predicts the decrease after the first step, which
-        may then be the only one.
-
-    Raises
-    ------
-    DidNotConverge
-        If no step decreases the cost before convergence, or if the cost still falls by more than
-        1e-6 a step after *max_iterations* steps.
+    Raises DidNotConverge if no step decreases the cost before convergence, or if the cost still
+    falls by more than 1e-6 a step after *max_iterations* steps.
     """
-    state = problem.projected(state)
-    linear = linearize(problem, state)
-    current_loss = _loss_for(problem, linear, loss, np.inf)
+    linear = linearize(problem, problem.projected(state))
+    current_loss = _loss_for(linear, loss, np.inf)
     damping, failed, fall_before = _MIN_DAMPING if is_near else _FIRST_DAMPING, 0.0, np.inf
-    cost, normal = robust_cost(problem, linear, current_loss), None
+    cost, normal = robust_cost(linear, current_loss), None
     for iteration in range(1, max_iterations + 1):
-        normal = normal or normal_equations(problem, state, linear, current_loss)
+        normal = normal or normal_equations(linear, current_loss)
         step, predicted = normal.step(damping)
         converged = predicted < COST_TOLERANCE + _ROUNDING * cost
-        trial = _take_step(problem, state, step)
-        trial_cost = np.inf if trial is None else robust_cost(problem, trial[1], current_loss)
+        trial = _take_step(linear, step)
+        trial_cost = np.inf if trial is None else robust_cost(trial, current_loss)
         if trial is not None and not converged and not trial_cost < cost:
-            trial = _correct_elements(problem, *trial, current_loss, cost)
-            trial_cost = np.inf if trial is None else robust_cost(problem, trial[1], current_loss)
+            trial = _correct_elements(trial, current_loss, cost)
+            trial_cost = np.inf if trial is None else robust_cost(trial, current_loss)
         fall = cost - trial_cost
         if trial is None or not np.isfinite(fall) or not (fall > 0.0 or converged):
             failed, damping = damping, 10.0 * damping
@@ -128,7 +110,7 @@ def minimise(
             if damping > _MAX_DAMPING:
                 break
             continue
-        (state, linear), cost, normal = trial, trial_cost, None
+        linear, cost, normal = trial, trial_cost, None
         damping = max(
             _next_damping(damping, fall / max(predicted, 1e-300)), _DAMPING_MARGIN * failed
         )
@@ -138,29 +120,29 @@ def minimise(
         expected = predicted * rate
         narrowed = current_loss
         if expected < _SLOW_FALL * cost:
-            narrowed = _loss_for(problem, linear, loss, current_loss.width)
+            narrowed = _loss_for(linear, loss, current_loss.width)
         if narrowed.width == current_loss.width and expected < _CONVERGED_FALL * cost:
             narrowed = _with_width(loss, max(loss.width, _NARROWED * current_loss.width))
         if narrowed.width != current_loss.width:
             current_loss, fall_before, rate = narrowed, np.inf, 1.0
-            cost = robust_cost(problem, linear, current_loss)
+            cost = robust_cost(linear, current_loss)
             continue
         smallest = relative_tolerance * cost if iteration > _MIN_ITERATIONS else 0.0
         if converged or expected < max(smallest, tolerance):
-            return Minimum(state, linear, cost, iteration, rate)
+            return Minimum(linear.state, linear, cost, iteration, rate)
         fall_before = predicted
     if not must_converge or (iteration == max_iterations and predicted < _LAST_TOLERANCE):
-        return Minimum(state, linear, cost, iteration)
+        return Minimum(linear.state, linear, cost, iteration)
     raise DidNotConverge(
         f"The {problem.name} did not converge: after {iteration} steps, the cost still falls by "
         f"{predicted:.2g} a step; {problem.remedy}."
     )
 
 
-def robust_cost(problem: EstimationProblem[S], linear: Linearization, loss: Loss) -> float:
+def robust_cost(linear: Linearization[Any, Any], loss: Loss) -> float:
     """Return half the squares of priors and plain factors, plus the loss of robust factors."""
     plain, robust = float(linear.prior_r @ linear.prior_r), 0.0
-    for factor in problem.factors:
+    for factor in linear.problem.factors:
         rows = linear[factor.name]
         if factor.robust:
             robust += loss.cost(rows.squared_norms)
@@ -174,14 +156,12 @@ def _with_width(loss: Loss, width: float) -> Loss:
     return PseudoHuber(width) if isinstance(loss, PseudoHuber) else loss
 
 
-def _loss_for(
-    problem: EstimationProblem[S], linear: Linearization, loss: Loss, previous_width: float
-) -> Loss:
+def _loss_for(linear: Linearization[Any, Any], loss: Loss, previous_width: float) -> Loss:
     """Widen the loss to a few median residuals while these exceed its final width."""
     if np.isinf(loss.width):
         return loss
     medians = [0.0]
-    for factor in problem.factors:
+    for factor in linear.problem.factors:
         if factor.robust:
             norms = linear[factor.name].squared_norms
             norms = norms[norms > 0.0]
@@ -200,43 +180,42 @@ def _next_damping(damping: float, gain_ratio: float) -> float:
     return damping if gain_ratio > 0.25 else 4.0 * damping
 
 
-def _take_step(
-    problem: EstimationProblem[S], state: S, step: Array
-) -> tuple[S, Linearization] | None:
+def _take_step(linear: Linearization[P, S], step: Array) -> Linearization[P, S] | None:
     """Take a step, shortened to the step limits; None if the new state is not defined."""
+    problem = linear.problem
     if not np.all(np.isfinite(step)):
         return None
     try:
-        moved = problem.moved(state, step / max(problem.overshoot(step), 1.0))
+        moved = problem.moved(linear.state, step / max(problem.overshoot(step), 1.0))
         moved = problem.projected(moved)
     except DidNotConverge:
         return None
-    return moved, linearize(problem, moved)
+    return linearize(problem, moved)
 
 
 def _correct_elements(
-    problem: EstimationProblem[S], state: S, linear: Linearization, loss: Loss, cost: float
-) -> tuple[S, Linearization] | None:
+    linear: Linearization[P, S], loss: Loss, cost: float
+) -> Linearization[P, S] | None:
     """Move eliminated elements alone after a step that did not decrease the cost.
 
     Some factors are nearly exact and curved: a long straight step violates them, and a correction
     of the elements makes an otherwise good step succeed.
     """
-    candidate: tuple[S, Linearization] | None = (state, linear)
-    for _ in range(_MAX_ELEMENT_STEPS if problem.eliminated is not None else 0):
-        if candidate is None or not np.isfinite(robust_cost(problem, candidate[1], loss)):
+    candidate: Linearization[P, S] | None = linear
+    for _ in range(_MAX_ELEMENT_STEPS if linear.problem.eliminated is not None else 0):
+        if candidate is None or not np.isfinite(robust_cost(candidate, loss)):
             return None
-        step = normal_equations(problem, *candidate, loss).element_step()
-        candidate = _take_step(problem, candidate[0], step)
-        if candidate is not None and robust_cost(problem, candidate[1], loss) < cost:
+        candidate = _take_step(candidate, normal_equations(candidate, loss).element_step())
+        if candidate is not None and robust_cost(candidate, loss) < cost:
             return candidate
     return candidate
 
 
 @dataclass(frozen=True, eq=False)
-class NormalEquations:
+class NormalEquations(Generic[P, S]):
     """The normal equations of a problem at a state."""
 
+    linear: Linearization[P, S]
     U: Array  # (n_kept, n_kept)
     W: Array  # (n_kept, n_elements, f)
     V: Array  # (n_elements, f, f)
@@ -244,6 +223,16 @@ class NormalEquations:
     g_elements: Array  # (n_elements, f)
     tangent: Tangent | None  # None where eliminated elements are free
     held_directions: Array  # (w, n_kept) directions without a step
+
+    @property
+    def problem(self) -> P:
+        """The problem."""
+        return self.linear.problem
+
+    @property
+    def state(self) -> S:
+        """The state."""
+        return self.linear.state
 
     @cached_property
     def V_inverse(self) -> Array:
@@ -351,48 +340,45 @@ class NormalEquations:
 
 
 def normal_equations(
-    problem: EstimationProblem[S], state: S, linear: Linearization, loss: Loss = LEAST_SQUARES
-) -> NormalEquations:
+    linear: Linearization[P, S], loss: Loss = LEAST_SQUARES
+) -> NormalEquations[P, S]:
     """Return the normal equations of the robust cost, with the curvature of the loss."""
     weighted = {}
-    for factor in problem.factors:
+    for factor in linear.problem.factors:
         rows = linear[factor.name]
         if factor.robust and np.isfinite(loss.width):
             rows = Residuals(*loss.softened(rows.r, rows.slope), rows.chain)
         weighted[factor.name] = rows, 1.0
-    return _normal_equations_of(problem, state, linear, weighted)
+    return _normal_equations_of(linear, weighted)
 
 
 def information(
-    problem: EstimationProblem[S],
-    state: S,
-    linear: Linearization,
+    linear: Linearization[P, S],
     loss: PseudoHuber = LEAST_SQUARES,
     only: Collection[str] | None = None,
-) -> NormalEquations:
+) -> NormalEquations[P, S]:
     """Return the information of the unknowns; its inverse is their covariance.
 
     Robust factors count with the efficiency of the loss. With *only*, other factors are left out;
     priors stay.
     """
     weighted = {}
-    for factor in problem.factors:
+    for factor in linear.problem.factors:
         if only is None or factor.name in only:
             rows = linear[factor.name]
             kept = 1.0
             if factor.robust and np.isfinite(loss.width):
                 kept = loss.efficiency(factor.n_rows)
             weighted[factor.name] = rows, kept
-    return _normal_equations_of(problem, state, linear, weighted)
+    return _normal_equations_of(linear, weighted)
 
 
 def _normal_equations_of(
-    problem: EstimationProblem[S],
-    state: S,
-    linear: Linearization,
+    linear: Linearization[P, S],
     weighted: dict[str, tuple[Residuals, float]],  # weight of the squares
-) -> NormalEquations:
+) -> NormalEquations[P, S]:
     """Build normal equations, elements in the tangent space of their constraints."""
+    problem = linear.problem
     sparsity = problem.sparsity
     U, W, V, g_kept, g_elements = _summed_products(
         [(sparsity[name], rows, weight) for name, (rows, weight) in weighted.items()], problem
@@ -400,7 +386,7 @@ def _normal_equations_of(
     linear.add_priors(U, g_kept)
     tangent = None
     if problem.constraint is not None:
-        tangent = problem.constraint.tangent(problem, state)
+        tangent = problem.constraint.tangent(problem, linear.state)
     if tangent is not None:
         Z, Q = tangent.Z, tangent.Q
         coupled, QV = _sum_of_products(W, Q), _times_blocks(Q, V)
@@ -413,7 +399,7 @@ def _normal_equations_of(
     held_directions[:, : problem.held_directions.shape[1]] = problem.held_directions
     if tangent is not None and len(tangent.ties):
         held_directions = np.concatenate([held_directions, tangent.ties])
-    return NormalEquations(U, W, V, g_kept, g_elements, tangent, held_directions)
+    return NormalEquations(linear, U, W, V, g_kept, g_elements, tangent, held_directions)
 
 
 def _summed_products(

@@ -13,13 +13,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse import csc_array, vstack
 
-from legcal.estimation.problem import (
-    EstimationProblem,
-    Linearization,
-    Residuals,
-    S,
-    linearize,
-)
+from legcal.estimation.problem import Linearization, Residuals
 from legcal.estimation.solver import (
     Minimum,
     NormalEquations,
@@ -61,22 +55,23 @@ def worst_directions(
     return tuple(directions)
 
 
-def named_covariance(problem: EstimationProblem[S], state: S, covariance: Array) -> Array:
+def named_covariance(linear: Linearization[Any, Any], covariance: Array) -> Array:
     """Return the covariance (n_named, n_named) of coordinates from that of the kept unknowns."""
-    n = problem.n_named
+    problem, n = linear.problem, linear.problem.n_named
     if problem.is_read_directly:
         return covariance[:n, :n].copy()
-    by_x = problem.jacobian(state)
+    by_x = problem.jacobian(linear.state)
     return np.asarray(by_x @ covariance[:n, :n] @ by_x.T)
 
 
-def named_information(problem: EstimationProblem[S], state: S, normal: NormalEquations) -> Array:
+def named_information(normal: NormalEquations[Any, Any]) -> Array:
     """Return the information (n_named, n_named) of coordinates, other unknowns marginalised out.
 
     Directions tied by exact constraints count as known a thousand times better than by
     measurements.
     """
-    R, n = normal.reduced(), problem.n_named
+    problem, R = normal.problem, normal.reduced()
+    n = problem.n_named
     if normal.tangent is not None and len(normal.tangent.ties):
         size = np.sqrt(np.maximum(np.diagonal(R), np.finfo(np.float64).tiny))
         along = np.linalg.qr((normal.tangent.ties / size).T)[0].T * size
@@ -85,7 +80,7 @@ def named_information(problem: EstimationProblem[S], state: S, normal: NormalEqu
         R = R[:n, :n] - R[:n, n:] @ inverse_on_range(R[n:, n:]) @ R[n:, :n]
     if problem.is_read_directly:
         return R
-    back = np.linalg.inv(problem.jacobian(state))
+    back = np.linalg.inv(problem.jacobian(normal.state))
     return np.asarray(back.T @ R @ back)
 
 
@@ -97,7 +92,7 @@ def marginal(information: Array, which: IntArray) -> Array:
     return np.asarray(information[np.ix_(which, which)] - mixed.T @ inverse @ mixed)
 
 
-def _element_derivatives(normal: NormalEquations) -> Array:
+def _element_derivatives(normal: NormalEquations[Any, Any]) -> Array:
     """Jacobian (n_elements, d, n_kept) of elements at their minimum by the kept unknowns."""
     inside = normal.elements_by_kept
     if normal.tangent is None:
@@ -106,18 +101,19 @@ def _element_derivatives(normal: NormalEquations) -> Array:
 
 
 def leverage(
-    problem: EstimationProblem[S],
-    linear: Linearization,
-    normal: NormalEquations,
+    normal: NormalEquations[Any, Any],
     name: str,
     covariance: Array | None = None,
+    linear: Linearization[Any, Any] | None = None,
 ) -> Array:
     """Return the covariance (n, q, q) of a factor's predicted measurements, whitened.
 
     Residuals of fitted measurements have the covariance 1 - C, residuals of held-out measurements
-    1 + C. *covariance* (n_kept, n_kept) of the kept unknowns is taken from *normal* by default.
+    1 + C. *covariance* (n_kept, n_kept) of the kept unknowns is taken from *normal* by default, and
+    so is *linear*, which has the measurements with their derivatives.
     """
-    sparsity, rows = problem.sparsity[name], linear[name]
+    linear = normal.linear if linear is None else linear
+    sparsity, rows = linear.problem.sparsity[name], linear[name]
     if covariance is None:
         covariance = normal.kept_covariance()
     share = np.zeros((*rows.r.shape, rows.r.shape[1]))
@@ -151,14 +147,12 @@ def leverage(
     return share
 
 
-def residual_changes(
-    problem: EstimationProblem[S], linear: Linearization, block: str, error: Array
-) -> dict[str, Array]:
+def residual_changes(linear: Linearization[Any, Any], block: str, error: Array) -> dict[str, Array]:
     """Return the change of whitened residuals (n, q) of each factor by an error of a block.
 
     *error* (n, d) has all coordinates of the block, estimated or fixed.
     """
-    changes = {}
+    changes, problem = {}, linear.problem
     width = {variables.name: variables.unknown.shape[1] for variables in problem.variables}
     for factor in problem.factors:
         J, first = linear[factor.name].J, 0
@@ -173,25 +167,17 @@ def residual_changes(
     return changes
 
 
-def response(
-    problem: EstimationProblem[S],
-    linear: Linearization,
-    normal: NormalEquations,
-    changes: Mapping[str, Array],
-) -> Array:
+def response(normal: NormalEquations[Any, Any], changes: Mapping[str, Array]) -> Array:
     """Return the shift (n_kept, c) of the kept unknowns for c changes of whitened residuals.
 
     *changes* has (n, q, c) for factors by name.
     """
-    kept, _, _ = _gradients(problem, linear, normal, changes)
+    kept, _, _ = _gradients(normal, changes)
     return -normal.moved_by(kept)
 
 
 def _gradients(
-    problem: EstimationProblem[S],
-    linear: Linearization,
-    normal: NormalEquations,
-    columns: Mapping[str, Array],
+    normal: NormalEquations[Any, Any], columns: Mapping[str, Array]
 ) -> tuple[Array, Array, csc_array]:
     """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
 
@@ -199,12 +185,12 @@ def _gradients(
     space of their constraints (n_elements, d, c). Columns are sparse: there may be thousands, each
     of which acts on few measurements.
     """
-    c = next(iter(columns.values())).shape[-1]
+    problem, c = normal.problem, next(iter(columns.values())).shape[-1]
     kept = np.zeros((problem.n_kept + 1, c))
     elements = np.zeros((problem.n_elements * problem.d_element, c))
     stacked = []
     for name, of_factor in columns.items():
-        sparsity, rows = problem.sparsity[name], linear[name]
+        sparsity, rows = problem.sparsity[name], normal.linear[name]
         n, q = rows.r.shape
         flat = csc_array(of_factor.reshape(n * q, c))
         stacked.append(flat)
@@ -229,15 +215,15 @@ def _gradients(
     return kept, of_elements, vstack(stacked, "csc")
 
 
-def restricted_log_likelihood(problem: EstimationProblem[S], minimum: Minimum[S]) -> float:
+def restricted_log_likelihood(minimum: Minimum[Any]) -> float:
     """Return the log-likelihood of whitened residuals, all unknowns integrated out.
 
     At a minimum of plain squares, up to the determinants of the whitening and a constant that
     depends on the numbers of unknowns and residuals. Priors of random effects count with their
     variances.
     """
-    linear = minimum.linear
-    normal = normal_equations(problem, minimum.state, linear)
+    linear, problem = minimum.linear, minimum.linear.problem
+    normal = normal_equations(linear)
     squares = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
     squares += float(np.sum(linear.prior_r**2))
     R = normal.reduced()
@@ -249,17 +235,14 @@ def restricted_log_likelihood(problem: EstimationProblem[S], minimum: Minimum[S]
 
 
 def score_test(
-    problem: EstimationProblem[S],
-    linear: Linearization,
-    normal: NormalEquations,
-    columns: Mapping[str, Array],
+    normal: NormalEquations[Any, Any], columns: Mapping[str, Array]
 ) -> tuple[Array, Array]:
     """Return Rao's score v^T M r (c,) and its information v^T M v (c, c) of columns v.
 
     M is the projector onto the residuals of the fit. *columns* has whitened columns (n, q, c) of
     factors by name; *normal* is of plain squares.
     """
-    of = Projected.of(problem, linear, normal, columns)
+    of = Projected.of(normal, columns)
     return of.score, of.information(slice(None), slice(None))
 
 
@@ -277,20 +260,14 @@ class Projected:
     gradient: Array  # (k, c)
 
     @classmethod
-    def of(
-        cls,
-        problem: EstimationProblem[S],
-        linear: Linearization,
-        normal: NormalEquations,
-        columns: Mapping[str, Array],
-    ) -> Projected:
+    def of(cls, normal: NormalEquations[Any, Any], columns: Mapping[str, Array]) -> Projected:
         """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
-        kept, elements, stacked = _gradients(problem, linear, normal, columns)
+        kept, elements, stacked = _gradients(normal, columns)
         c = stacked.shape[1]
         moved = normal.V_inverse @ elements
         gradient = np.concatenate([kept, elements.reshape(-1, c)])
         response = np.concatenate([normal.moved_by(kept), moved.reshape(-1, c)])
-        residual = np.concatenate([linear[name].r.ravel() for name in columns])
+        residual = np.concatenate([normal.linear[name].r.ravel() for name in columns])
         of_fit = np.concatenate([_reduced_gradient(normal), normal.g_elements.ravel()])
         score = stacked.T @ residual - response.T @ of_fit
         return cls(np.asarray(score), stacked, response, gradient)
@@ -382,9 +359,7 @@ class LeftOut(NamedTuple):
     information: Array  # (n_kept, n_kept) of all else
 
 
-def left_out_blocks(
-    problem: EstimationProblem[S], state: S, linear: Linearization, block: IntArray
-) -> list[LeftOut]:
+def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[LeftOut]:
     """Return how well blocks of eliminated elements are predicted by all else.
 
     The block of each element is given, (n_elements,) from 0. The measurements of a block are
@@ -393,12 +368,12 @@ def left_out_blocks(
     their number.
     """
     blocks = list[LeftOut]()
-    everything = normal_equations(problem, state, linear)
+    everything = normal_equations(linear)
     gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
     rank_of_elements = _ranks(everything.V)
     for b in range(int(block.max(initial=-1)) + 1):
         rows, squares, dof = dict(linear.rows), 0.0, 0
-        for factor in problem.factors:
+        for factor in linear.problem.factors:
             if factor.element is None:
                 continue
             is_inside, of_factor = block[factor.element] == b, linear[factor.name]
@@ -411,7 +386,7 @@ def left_out_blocks(
             inside = of_factor.squared_norms[is_inside]
             squares += float(inside.sum())
             dof += factor.n_rows * int(np.sum(inside > 0.0))
-        rest = normal_equations(problem, state, replace(linear, rows=rows))
+        rest = normal_equations(replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
         squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
         dof -= rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
@@ -419,7 +394,7 @@ def left_out_blocks(
     return blocks
 
 
-def _reduced_gradient(normal: NormalEquations) -> Array:
+def _reduced_gradient(normal: NormalEquations[Any, Any]) -> Array:
     """Return the gradient (n_kept,) of kept unknowns, elements at their minimum."""
     elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
     return np.asarray(normal.g_kept - np.einsum("akp,kp->a", normal.W, elements))
@@ -433,32 +408,21 @@ def _ranks(matrices: Array) -> IntArray:
     return np.asarray(np.linalg.matrix_rank(scaled, tol=_ROUNDING, hermitian=True), dtype=np.intp)
 
 
-def scores_of_block(problem: EstimationProblem[S], state: S, name: str) -> tuple[Array, Array]:
-    """Return the scores of a block of random effects at zero effects.
+def scores_of_block(linear: Linearization[Any, Any], name: str) -> tuple[Array, Array]:
+    """Return the scores z of a block of random effects at zero effects, and their covariance K.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        Contains the block as the last named one; each of its unknowns has a prior of mean zero.
-    state : S
-        Near a minimum of the problem with some of the effects or none; the Gauss-Newton step from
-        there is taken into account.
-    name : str
-        Name of the block.
+    z (b,) is B^T M r with B the whitened effects, r the residuals without any effect and M the
+    projector onto the residuals of the fit; K (b, b) is B^T M B, the covariance for zero effects.
 
-    Returns
-    -------
-    z : (b,) array
-        B^T M r with B the whitened effects, r the residuals without any effect and M the projector
-        onto the residuals of the fit.
-    K : (b, b) array
-        B^T M B: the covariance of z for zero effects.
+    The problem has the block as the last named one, each of its unknowns with a prior of mean zero;
+    near a minimum with some of the effects or none: the Gauss-Newton step from there is taken into
+    account.
     """
-    normal = normal_equations(problem, state, linearize(problem, state))
+    problem, normal = linear.problem, normal_equations(linear)
     R = normal.reduced()
     g = _reduced_gradient(normal)
     effects, block = problem.where(name), problem.block(name)
-    value = block.read(getattr(state, name))
+    value = block.read(getattr(linear.state, name))
     others = np.setdiff1d(np.arange(len(R)), effects)
     prior_information = 1.0 / block.prior.sigma**2
     R_others, R_mixed = R[np.ix_(others, others)], R[np.ix_(others, effects)]

@@ -33,21 +33,11 @@ _MIN_EIGENVALUE = 1e-9  # over the largest element of K: below, an effect is inv
 
 @dataclass(frozen=True, eq=False)
 class Effects:
-    """Scores of b random effects and their covariance, from the residuals of a fit.
+    """Scores of b random effects and their covariance, from the residuals of a fit."""
 
-    Attributes
-    ----------
-    z : (b,) array
-        Scores at zero effects, nuisance parameters of the fit projected out.
-    K : (b, b) array
-        Covariance of the scores for zero effects.
-    kind : (b,) array of int
-        Kind of each effect; effects of a kind have one variance.
-    """
-
-    z: Array
-    K: Array
-    kind: IntArray
+    z: Array  # (b,) scores at zero effects, nuisance parameters of the fit projected out
+    K: Array  # (b, b) covariance of the scores for zero effects
+    kind: IntArray  # (b,) kind of each effect; effects of a kind have one variance
 
     @property
     def n_kinds(self) -> int:
@@ -103,23 +93,11 @@ class EffectsWithVariances:
 def estimate_variances(
     effects: Effects, least_gain: float, start: Array | None = None
 ) -> tuple[Array, float]:
-    """Estimate the variances of random effects by restricted maximum likelihood.
+    """Estimate the variances (n_kinds,) of random effects by restricted maximum likelihood.
 
-    Parameters
-    ----------
-    effects : Effects
-    least_gain : float
-        Twice the log-likelihood that the variances must gain over zero variances; with less, all
-        of them are zero.
-    start : (n_kinds,) array, optional
-        Starting values; zeros by default, and where these are less likely than zeros.
-
-    Returns
-    -------
-    variances : (n_kinds,) array
-        In the squared unit of the effects; never negative.
-    gain : float
-        Twice the log-likelihood gained.
+    Also returns twice the log-likelihood that they gain over zero variances; with less than
+    *least_gain*, all of them are zero. They are in the squared unit of the effects, and never
+    negative. *start* (n_kinds,) is replaced by zeros where these are likelier.
     """
     variances = np.zeros(effects.n_kinds)
     best = effects.with_variances(variances)
@@ -154,18 +132,8 @@ def expected_variances(effects: Effects, variances: Array, kinds: Sequence[int])
     typical effect of its kind that residuals resolve: nearly flat below s0, and with a finite mean
     from two effects on.
 
-    Parameters
-    ----------
-    effects : Effects
-    variances : (n_kinds,) array
-        Starting values, such as the likeliest ones; the variances of other kinds stay.
-    kinds : sequence of int
-        Kinds to estimate; a kind invisible to the residuals keeps its variance.
-
-    Returns
-    -------
-    (n_kinds,) array
-        In the squared unit of the effects.
+    *variances* (n_kinds,) are starting values, such as the likeliest ones; those of other *kinds*
+    stay, and of a kind that is invisible to the residuals.
 
     Notes
     -----

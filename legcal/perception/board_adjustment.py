@@ -182,7 +182,7 @@ def adjust_board(
         must_converge=False,
     )
     linear = linearize(problem, minimum.state) if held else minimum.linear
-    normal = normal_equations(problem, minimum.state, linear, LOSS)
+    normal = normal_equations(linear, LOSS)
     return AdjustedBoard(
         minimum.state.camera,
         minimum.state.board_pose.motions,
@@ -190,7 +190,7 @@ def adjust_board(
         -linear["corners"].r * seen.sigma_px[:, None],
         minimum.cost,
         normal.kept_covariance(),
-        clustered(problem, linear, normal, LOSS),
+        clustered(normal, LOSS),
         normal.V,
     )
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.causes import Cause, by_cause
 from legcal.data.landmarks import LANDMARKS_NAME
-from legcal.data.measurements import Measurements, few_views, images_in_words
+from legcal.data.measurements import Measurements, View, few_views, images_in_words
 from legcal.data.outlines import Outlines, is_edited
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.geometry.motions import pose_distance
@@ -491,8 +491,7 @@ def far_from_hints(
 
 
 def hint_notes(
-    names: Sequence[str],
-    hints: Sequence[RigidTransform | None],
+    views: Sequence[View],
     cameras: Sequence[RigidTransform | None],
     reach: float = 1.0,
     *,
@@ -505,6 +504,8 @@ def hint_notes(
     views ``by_landmarks`` follow from clicks.
     """
     notes, alike = [], dict[str, list[tuple[str, float, float]]]()  # by misinterpretation
+    names = [view.name for view in views]
+    hints = [view.T_base_camera for view in views]
     for name, hint, T in zip(names, hints, cameras, strict=True):
         if hint is None or T is None or not far_off(hint, T, reach):
             continue
@@ -538,9 +539,9 @@ def hint_notes(
             f"{np.degrees(angle):.0f} deg from the camera found in the images (xyz: [{x:.3f}, "
             f"{y:.3f}, {z:.3f}]); {remedy}."
         )
-    for meant, views in alike.items():
-        of_views, mm, deg = zip(*views, strict=True)
-        one = len(views) == 1
+    for meant, those in alike.items():
+        of_views, mm, deg = zip(*those, strict=True)
+        one = len(those) == 1
         notes.append(
             f"{few_views(of_views)}: {'its' if one else 'each'} T_base_camera is wrong: it is "
             f"{_span(mm)} mm and {_span(deg)} deg from the camera found in the images; it fits if "

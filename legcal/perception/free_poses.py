@@ -212,10 +212,7 @@ def find_free_poses(
 
     Where clicks have the platform at a pose, T_base_platform, it is looked for there alone.
 
-    Raises
-    ------
-    NotIdentifiable
-        If a view has no rough camera pose, or joints at A move.
+    Raises NotIdentifiable if a view has no rough camera pose, or joints at A move.
     """
     m = search.measurements
     require_standing_joints(machine)
@@ -561,7 +558,7 @@ def _fitted(
                 Factor("stays", stays, (), len(keys), 6, each),
             ),
         )
-        step, _ = information(problem, state, linearize(problem, state)).step(0.0)
+        step, _ = information(linearize(problem, state)).step(0.0)
         longest = float(np.abs(step[-6 * len(keys) :].reshape(-1, 6) / unit).max())
         state = problem.moved(state, step * (MAX_STEP / max(longest, MAX_STEP)))
     return dict(zip(keys.tolist(), state.poses, strict=True)), placed(state)

@@ -108,7 +108,7 @@ def marks_of_image(
         if any((absent.leg, segment.link) in pairs for segment in absent.segments):
             continue
         parts = range(len(absent.segments))
-        marks = tuple(mark for i in parts for mark in _prediction(camera, absent, i))
+        marks = tuple(mark for i in parts for mark in _predicted(camera, absent, i, (1, 2)))
         if marks:
             found.append(PartMarks(leg_names[absent.leg], "", marks))
     edges = tuple(
@@ -161,8 +161,7 @@ def _part_marks(
     if leg is not None and not np.all(are_measured) and not pair.rejected_for(Reason.OUTSIDE).any():
         for i, segment in enumerate(leg.segments):
             if segment.link == part:
-                edges = [e - 1 for e, seen in zip(pair.edge, are_measured, strict=True) if not seen]
-                marks += [mark for k, mark in enumerate(_prediction(camera, leg, i)) if k in edges]
+                marks += _predicted(camera, leg, i, sorted(pair.edge[~are_measured].tolist()))
     return tuple(marks)
 
 
@@ -174,16 +173,10 @@ def curve(camera: Camera, h: Array, ends: Array, n: int = N_POINTS) -> Array:
     return camera.distort(feet[0] + share * (feet[1] - feet[0]))
 
 
-def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
-    """Return both predicted outlines of segment i of a leg; none where it is outside the image."""
-    band = leg.bands[i]
-    if band is None:
-        return []
-    t = np.linspace(0.0, band.length, N_POINTS)
-    return [
-        Mark("predicted", camera.distort(band.points(t, band.offsets(h, t))))
-        for h in leg.outlines[i]
-    ]
+def _predicted(camera: Camera, leg: PredictedLeg, part: int, edges: Sequence[int]) -> list[Mark]:
+    """Return predicted outlines of a part of a leg; none where it is outside the image."""
+    points = (leg.points_of(part, edge, N_POINTS) for edge in edges)
+    return [Mark("predicted", camera.distort(xy)) for xy in points if xy is not None]
 
 
 def marks_of_corners(corners: Corners) -> tuple[Mark, ...]:

@@ -45,7 +45,7 @@ from legcal.perception.recognition import place_views
 from legcal.perception.tuning import JOINT_ERROR, WINDOW_PX
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
-from legcal.vision.camera import Camera, shared_cameras
+from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey, shrink
 from legcal.workers import Run
@@ -557,8 +557,7 @@ def defects_of(
     measurements: Measurements, exposures: Mapping[int, Exposure]
 ) -> dict[int, Rejection]:
     """Return rejections of unusable images, alone or compared with their view, by row."""
-    views = measurements.views
-    camera = shared_cameras([view.name for view in views], [view.camera for view in views])
+    camera = measurements.owners
     view = {row: int(measurements.view[row]) for row in exposures}
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
 

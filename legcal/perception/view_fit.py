@@ -154,7 +154,7 @@ def fit_view(
     try:
         linear = linearize(problem, state)
         for iteration in range(ITERATIONS):
-            normal = _normal_equations(problem, state, linear, weight, joint_sigma, image_sigma)
+            normal = _normal_equations(linear, weight, joint_sigma, image_sigma)
             step, _ = normal.step(0.0)
             distance = float(np.linalg.norm(state.pose.t))
             overshoot = max(
@@ -180,7 +180,7 @@ def fit_view(
                 )
     except NotVisible:
         return None
-    normal = _normal_equations(problem, state, linear, weight, joint_sigma, image_sigma)
+    normal = _normal_equations(linear, weight, joint_sigma, image_sigma)
     R = state.pose.R[0]
     T_group_base = RigidTransform.from_components(
         state.pose.t[0] - R @ middle, Rotation.from_matrix(R)
@@ -265,25 +265,23 @@ def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -
 
 
 def _normal_equations(
-    problem: EstimationProblem[_State],
-    state: _State,
-    linear: Linearization,
+    linear: Linearization[EstimationProblem[_State], _State],
     weight: Array,
     joint_sigma: float,
     image_sigma: float,
-) -> NormalEquations:
+) -> NormalEquations[EstimationProblem[_State], _State]:
     """Return the normal equations with weights (n_items,) of legs in images, by sigmas of priors.
 
     A weight is that of all that an image says of a leg, the prior of its offset included.
     """
     root = np.sqrt(weight)
-    item = problem.factor("outlines").element
+    item = linear.problem.factor("outlines").element
     rows = {
         "outlines": linear["outlines"].whitened(root[item][:, None, None]),
         "offsets": linear["offsets"].whitened((root / image_sigma)[:, None, None]),
         "shifts": linear["shifts"].whitened(np.asarray(1.0 / joint_sigma)),
     }
-    return information(problem, state, replace(linear, rows=rows))
+    return information(replace(linear, rows=rows))
 
 
 def _squared_distances(

@@ -232,9 +232,8 @@ class GuidedSession:
     def check(self, asked: Asked, photograph: Path) -> Checked:
         """Check a photograph of the pose that was asked; nothing is written."""
         m = self.dataset.measurements
-        names = [view.name for view in m.views]
         held = f"{asked.view}-1"  # images of a camera in the hand are views: hand-1, hand-2
-        v = names.index(asked.view if asked.view in names else held)
+        v = m.view_names.index(asked.view if asked.view in m.view_names else held)
         camera = m.views[v].camera
         facts, problem = inspect_image(photograph, camera)
         if problem is not None:

@@ -561,7 +561,7 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
     index = residuals.index[keep]
     offset, whitened = residuals.offset[keep], residuals.whitened[keep]
     row, leg = outlines.row[index], outlines.leg[index]
-    views, images = [v.name for v in measurements.views], row_names(measurements)
+    views, images = measurements.view_names, row_names(measurements)
     both_ends = np.repeat(np.arange(len(index)), 2)
     number, leg_of_end = index[both_ends], leg[both_ends]
     jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(both_ends))

@@ -298,7 +298,7 @@ def write_session(
             entry["gamma"] = view.camera.gamma
         entry |= rough_view(view.T_base_camera, view.legs, machine)
         views[groups[v] if groups else view.name] = entry
-    names, readings = list(groups) or [view.name for view in m.views], m.q[:, list(machine.motors)]
+    names, readings = list(groups) or list(m.view_names), m.q[:, list(machine.motors)]
     times = () if m.time is None else m.time.tolist()
     rows = (
         [

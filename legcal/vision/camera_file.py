@@ -818,12 +818,8 @@ def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str
     The covariance of a camera that legcal calibrated is kept for ros, which alone can hold it. A
     splined lens, which no other program reads, becomes the nearest one that the program has.
 
-    Raises
-    ------
-    DatasetError
-        If the camera file cannot be read.
-    UsageError
-        If the program has no such lens, or if another file stands there.
+    Raises DatasetError if the camera file cannot be read; UsageError if the program has no such
+    lens, or if another file stands there.
     """
     CONVERTED.check_place(output)
     camera, block = read_camera(path), calibrated_block(path)

@@ -243,6 +243,14 @@ class PredictedLeg:
         AB = self.B_camera - self.A_camera
         return np.asarray(AB / np.linalg.norm(AB))
 
+    def points_of(self, part: int, edge: int, n: int) -> Array | None:
+        """Return points (n, 2) of edge 1 or 2 of a part; None where the part is outside."""
+        band, h = self.bands[part], self.outlines[part, edge - 1]
+        if band is None:
+            return None
+        t = np.linspace(0.0, band.length, n)
+        return band.points(t, band.offsets(h, t))
+
     def distance_along(self, band: Band, t: Array) -> Array:
         """Return the distance from A [m] of the axis points seen at t [px] of a band."""
         ray = band.along @ band.origin + t / band.scale

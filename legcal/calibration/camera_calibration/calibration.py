@@ -218,10 +218,7 @@ def _shown_in(
 ) -> _ShownBoard:
     """Return the board with its corners in the images.
 
-    Raises
-    ------
-    NotVisible, NotIdentifiable
-        If no image shows the board, or too few do.
+    Raises NotVisible or NotIdentifiable if no image shows the board, or too few do.
     """
     paths = photographs.paths
     board, note = shown_board(stated, board_images)
@@ -236,7 +233,10 @@ def _shown_in(
     }
     usable = [k for k in enough if k not in lines]
     if not usable:
-        raise _not_visible(stated, _shown_instead(stated, photographs))
+        n = len(paths)
+        described = (describe_image(stated, photographs.read(k)) for k in range(n)[:_N_DESCRIBED])
+        what = next((words for words in described if words), "nothing like the board")
+        raise _not_visible(stated, f"{what} in its {n} image{'s' * (n != 1)}")
     copies, repeats = _copies(corners_by_image, usable, paths)
     distinct = [k for k in usable if k not in copies]
     if len(distinct) < MIN_IMAGES:
@@ -250,14 +250,6 @@ def _shown_in(
     }
     unused = copies | mirrored | lines
     return _ShownBoard(board, corners_by_image, distinct, unused, note, repeats)
-
-
-def _shown_instead(board: Board, photographs: _Photographs) -> str:
-    """Return a description of images without the board, to follow "found"."""
-    n = len(photographs.paths)
-    described = (describe_image(board, photographs.read(k)) for k in range(min(n, _N_DESCRIBED)))
-    description = next((words for words in described if words), "nothing like the board")
-    return f"{description} in its {n} image{'s' * (n != 1)}"
 
 
 def _not_visible(board: Board, instead: str) -> NotVisible:
@@ -351,6 +343,7 @@ def _result(
             )
         )
     used_images = [k for k, image in enumerate(images) if image.used]
+    of_reasons = _by_reason((image.image, image.reason) for image in images if image.reason)
     n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
     return CameraCalibration(
         camera=adjusted.camera,
@@ -370,7 +363,7 @@ def _result(
         corners=np.concatenate([corners.px, adjusted.residual], axis=1),
         warnings=(
             *([board_in_images.note] if board_in_images.note else []),
-            *_left_out(images),
+            *(f"{', '.join(names)} left out: {why}." for why, names in of_reasons.items()),
             *lens.warnings,
             *warnings(fitted),
             *_changes(
@@ -379,12 +372,6 @@ def _result(
         ),
         photographs=recorded([facts[k] for k in used_images]),
     )
-
-
-def _left_out(images: Sequence[BoardImage]) -> list[str]:
-    """Return a sentence for each reason, with the images left out."""
-    by_reason = _by_reason((image.image, image.reason) for image in images if image.reason)
-    return [f"{', '.join(names)} left out: {reason}." for reason, names in by_reason.items()]
 
 
 def _by_reason(left_out: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

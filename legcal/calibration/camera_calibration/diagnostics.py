@@ -249,7 +249,12 @@ def warnings(fit: RobustFit) -> list[str]:
             "scatter, which the standard deviations count: zoom, focus or stabilisation change, or "
             "the board moves or bends; switch these off, and lay the board on something flat."
         )
-    sentences += _folding(camera)
+    if not camera.reaches(camera.corners).all():  # two directions have one pixel
+        sentences.append(
+            "The lens model folds back before the corners of the image, where no board was seen: "
+            "pixels there cannot be used; bring the board into the corners, or take a simpler "
+            "--model."
+        )
     rms = fit.adjusted.rms_px()
     if rms > _LARGE_RESIDUAL_PX:
         sentences.append(
@@ -303,13 +308,3 @@ def _uncovered_parts(fit: RobustFit) -> str:
     images = [len(set(fit.corners.image[number == k].tolist())) for k in range(9)]
     unseen = [name for name, n in zip(_PARTS, images, strict=True) if n < _IMAGES_OF_PART]
     return ", ".join(unseen) or "every edge and corner"
-
-
-def _folding(camera: Camera) -> list[str]:
-    """Return a warning if the lens model maps two directions to one pixel inside the image."""
-    if camera.reaches(camera.corners).all():
-        return []
-    return [
-        "The lens model folds back before the corners of the image, where no board was seen: "
-        "pixels there cannot be used; bring the board into the corners, or take a simpler --model."
-    ]

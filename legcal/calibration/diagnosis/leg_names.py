@@ -23,25 +23,14 @@ _MIN_OUTLINES = 4  # of each leg
 
 
 def exchanged_legs(
-    outlines: Outlines,
+    outlines: Outlines,  # that were given, whatever a fit rejected
     measurements: Measurements,
     legs: Sequence[Leg],
+    # (n_rows, n_legs, 3): joints A and B in each image, in the base; NaN where they are not known
     ends: tuple[Array, Array],
-    cameras: Sequence[RigidTransform | None],
+    cameras: Sequence[RigidTransform | None],  # T_base_camera of each view, where it is known
 ) -> tuple[Diagnosis, ...]:
-    """Return legs whose outlines lie at each other's place in views.
-
-    Parameters
-    ----------
-    outlines : Outlines
-        The outlines that were given, whatever a fit rejected.
-    measurements, legs
-        Those of the session.
-    ends : (n_rows, n_legs, 3) arrays
-        Joints A and B in each image, in the base; NaN where they are not known.
-    cameras : sequence of RigidTransform or None
-        T_base_camera of each view, where it is known.
-    """
+    """Return legs whose outlines lie at each other's place in views."""
     o = along_legs(outlines, legs)
     o = o.choose(np.asarray(np.isfinite(o.h).all(axis=1)))
     radius = np.array(
@@ -127,8 +116,8 @@ def _diagnosis(
         same_as=(),
         mended="with the names corrected",
         images=len(rows),
-        before=int(np.sum(nearer <= 0.0)),
-        after=int(np.sum(nearer > 0.0)),
+        images_before=int(np.sum(nearer <= 0.0)),
+        images_after=int(np.sum(nearer > 0.0)),
         score=float(np.mean(other < own)),
         remedy=f"{remedy} there (columns leg and part of observations.csv)",
     )

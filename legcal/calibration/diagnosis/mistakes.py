@@ -8,6 +8,7 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import DiagnosisBlock
@@ -102,44 +103,15 @@ class Mistake:
     opposite: Assumed | None = None
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """The likely mistake of a session.
+class Diagnosis(DiagnosisBlock):
+    """The likely mistake of a session, with what its sentence says besides."""
 
-    Attributes
-    ----------
-    kind : str
-        What it is in a few words: ``columns exchanged``, ``handedness``, ...
-    what : str
-        The same as a clause that names columns, views and legs.
-    same_as : tuple of str
-        Clauses of mistakes that images cannot distinguish from it: one of each kind, then more of
-        these kinds, the commoner first.
-    n_kinds : int
-        Number of these in the sentence.
-    mended : str
-        The correction, as a clause: "with the columns swapped".
-    images, before, after : int
-        Number of judged images, and of those that agree without and with the correction.
-    score : float
-        Fraction of the predicted legs that images show with the correction.
-    remedy : str
-        The remedy, as an imperative.
-    tests : tuple of str
-        Tests that distinguish it from the mistakes of ``same_as``.
-    """
-
-    kind: str
-    what: str
-    same_as: tuple[str, ...]
-    mended: str
-    images: int
-    before: int
-    after: int
-    score: float
-    remedy: str
-    tests: tuple[str, ...] = ()
-    n_kinds: int = 0
+    mended: str = Field(exclude=True)  # the correction, as a clause: "with the columns swapped"
+    images: int = Field(exclude=True)  # that were judged
+    # tests that distinguish it from the mistakes of ``same_as``
+    tests: tuple[str, ...] = Field(default=(), exclude=True)
+    # of ``same_as`` in the sentence: one of each kind stands before more of these kinds
+    n_kinds: int = Field(default=0, exclude=True)
 
     @property
     def finding(self) -> str:
@@ -147,10 +119,10 @@ class Diagnosis:
         more = len(self.same_as) - self.n_kinds
         others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
         others += f", or {more} similar mistake{'s' * (more > 1)}" * (more > 0)
-        rest = " (the other images may have a further problem)"
+        n, rest = self.images_after, " (the other images may have a further problem)"
         return (
-            f"{self.what}{others}: {self.mended}, {self.after} of {self.images} images agree"
-            f"{rest * (self.after < MIN_SHARE * self.images)}, against {self.before} now"
+            f"{self.what}{others}: {self.mended}, {n} of {self.images} images agree"
+            f"{rest * (n < MIN_SHARE * self.images)}, against {self.images_before} now"
         )
 
     @property
@@ -163,18 +135,6 @@ class Diagnosis:
     def sentence(self) -> str:
         """The diagnosis as a message."""
         return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
-
-    def document(self) -> DiagnosisBlock:
-        """Return the entry of documents."""
-        return DiagnosisBlock(
-            kind=self.kind,
-            what=self.what,
-            same_as=list(self.same_as),
-            images_before=self.before,
-            images_after=self.after,
-            score=self.score,
-            remedy=self.remedy,
-        )
 
 
 def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:
@@ -227,7 +187,7 @@ def mistakes(data: OrderedDataset) -> list[Mistake]:
         *_image_mistakes(data, given),
         *_handedness_mistake(given),
         *_radius_mistakes(given),
-        *_focal_length_mistakes(given),
+        *(_focal_length(given, factor) for factor in _FOCAL_LENGTHS),
     ]
     return [
         mistake for mistake in candidates if mistake.true.is_in_travel or not given.is_in_travel
@@ -752,12 +712,8 @@ def _radius_mistakes(given: Assumed) -> Iterator[Mistake]:
         )
 
 
-def _focal_length_mistakes(given: Assumed) -> Iterator[Mistake]:
-    """Yield focal lengths of images that were scaled or cropped."""
-    yield from (_focal_length(given, factor) for factor in _FOCAL_LENGTHS)
-
-
 def _focal_length(given: Assumed, factor: float) -> Mistake:
+    """Return the focal length of images that were scaled or cropped."""
     return Mistake(
         "focal length",
         f"the focal length appears to be {factor:.2g} times the stated one (images scaled or "

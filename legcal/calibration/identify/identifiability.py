@@ -21,7 +21,7 @@ from legcal.calibration.identify.report import (
 from legcal.calibration.identify.session import (
     THIN,
     Session,
-    cameras_for,
+    default_cameras,
     legs_around,
     neighbours,
     planned_session,
@@ -31,8 +31,7 @@ from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
     Group,
-    known_parameters,
-    resolve,
+    choices_of,
 )
 from legcal.calibration.joint_fit.part_errors import PartSigma, predicted_sigmas, sigmas_in_words
 from legcal.calibration.joint_fit.platform import moved_by
@@ -67,7 +66,7 @@ from legcal.machine.parameters import (
     split_by_motion,
 )
 from legcal.machine.shapes import bodies_of
-from legcal.machine.ties import ties_in_words
+from legcal.machine.ties import by_step, independent, ties_in_words
 from legcal.paper.conditions import (
     Condition,
     count_conditions,
@@ -79,6 +78,7 @@ _MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determin
 _ERROR = 0.0025  # mean leg lengths: largest component of a reported direction
 _HARMLESS = 1e-3  # motion of the platform over it, below which it is harmless
 _OPEN = 1e-6  # of their mean, in directions that are not determined: lengths are open
+_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what is known exactly
 _KNOWN = 2.5e-9  # mean leg lengths: of a radius that is known
 _VAGUE = RefinementSettings.radius_sigma / 2.0  # of the scale
 
@@ -152,7 +152,7 @@ class Analysis:
         free = np.flatnonzero(by_coordinates.any(axis=0))
         k, (Q, S) = len(free), np.linalg.qr(by_coordinates[:, free], mode="complete")
         # Fixed parameters, and what the mechanism ties, are known exactly.
-        known = [Q[:, k:].T / session.sigma_exact]
+        known = [Q[:, k:].T / (_EXACT * session.mean_length)]
         if k:
             known.append(np.linalg.solve(S[:k].T, marginal_rows(rows, free).T).T @ Q[:, :k].T)
         return compress(np.concatenate(known))
@@ -167,7 +167,10 @@ class Analysis:
         """The joint fit."""
         basis = undetermined(self.session, self.information)
         weak = weak_directions(self.session, self.motion, basis)
-        n_p = len(self.session.unit) - self.session.n_ties
+        session = self.session
+        ties = session.fitted.ties.at(session.legs)
+        by_metres = by_step(ties, session.parametrization.place) * session.unit
+        n_p = len(session.unit) - len(independent(ties, by_metres)[1])
         return Ranks(n_p - len(weak), n_p, weak)
 
 
@@ -190,12 +193,6 @@ class PlatformMotion:
             self.why_not = str(error)
             return
         self.by_metres = moved * session.unit
-
-    def effect(self, direction: Array) -> RmsMotion | None:
-        """Motion of the platform by a direction (p,) in metres."""
-        if self.by_metres is None:
-            return None
-        return RmsMotion(*moved_by(self.by_metres, direction[:, None]).rms)
 
     def sigma(self, information: Array) -> RmsMotion | None:
         """Return the standard deviation of the platform for the information of parameters."""
@@ -248,13 +245,15 @@ def _direction(
     shown = shown[np.argsort(-np.abs(row[shown]).round(3), kind="stable")]
     row = row * (_ERROR * session.mean_length)
     names = tuple(session.parametrization.names[i] for i in shown)
-    effect = motion.effect(row)
+    dX_m, dE_rad = None, None
+    if motion.by_metres is not None:
+        dX_m, dE_rad = moved_by(motion.by_metres, row[:, None]).rms
     return WeakDirection(
         describe_direction(names, session.leg_names),
         names,
         tuple(float((row * session.unit)[i]) for i in shown),
-        None if effect is None else effect.dX_m,
-        None if effect is None else effect.dE_rad,
+        dX_m,
+        dE_rad,
         harmless,
     )
 
@@ -427,16 +426,7 @@ def answer(
     from legcal.data.dataset import load_dataset
 
     dataset = load_dataset(path, check_images=False)
-    parameters = known_parameters(
-        dataset.machine,
-        dataset.measurements.views,
-        boards=dataset.boards,
-    )
-    by_parts = Choices.by_tolerances(dataset.machine, only)
-    choices = replace(
-        resolve(dataset.overrides, parameters), built=by_parts.built, only=by_parts.only
-    )
-    return identifiability_of_dataset(dataset, choices, expected)
+    return identifiability_of_dataset(dataset, choices_of(dataset, only=only), expected)
 
 
 def identifiability(
@@ -765,6 +755,7 @@ def _directions(ranks: Ranks, *, harmless: bool) -> str:
 
 
 _MOST_OF_A_KIND = 2
+_SEED = 2003  # of a further camera
 _MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
 _ENOUGH_IMAGES = 15  # a view
@@ -782,7 +773,7 @@ def find_remedies(
     raise a rank.
     """
     n_parameters = analysis.full.of
-    before = _score(analysis)
+    _, before = _score(analysis)
     images, more = int(np.bincount(analysis.session.view).min()), list[_Candidate]()
     if replanned is not None and images < _ENOUGH_IMAGES:
         text = f"take {_ENOUGH_IMAGES} images a view instead of {images}"
@@ -799,37 +790,29 @@ def find_remedies(
     return everything or sufficient or helpful
 
 
-@dataclass(frozen=True)
-class _Score:
-    """How many directions are open, and how many of them move the platform."""
-
-    open: int
-    harmful: int
-
-
 # What to do, the analysis with that, and parameters that are known then
 _Candidate = tuple[str, Analysis, Sequence[int]]
 
 
-def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
-    """Count the open directions with some parameters *known*."""
+def _score(analysis: Analysis, known: Sequence[int] = ()) -> tuple[int, int]:
+    """Count the open directions with some parameters *known*, and those that move the platform."""
     session, motion = analysis.session, analysis.motion
     extra = np.zeros((len(known), len(session.unit)))
     extra[np.arange(len(known)), list(known)] = _WELL_KNOWN / session.mean_length
     rows = np.concatenate([analysis.information, extra])
-    return _Score(len(undetermined(session, rows)), missing(session, rows, motion))
+    return len(undetermined(session, rows)), missing(session, rows, motion)
 
 
-def _try_kind(kind: Iterable[_Candidate], before: _Score, n_parameters: int) -> list[Remedy]:
+def _try_kind(kind: Iterable[_Candidate], before: int, n_parameters: int) -> list[Remedy]:
     """Return the first few sufficient candidates of a kind, else the most helpful one."""
     sufficient, helpful = list[Remedy](), list[tuple[int, Remedy]]()
     for tried, (text, changed, known) in enumerate(kind):
-        after = _score(changed, known)
-        gain = before.harmful - after.harmful
+        n_open, harmful = _score(changed, known)
+        gain = before - harmful
         if gain <= 0:
             continue
-        complete = after.harmful == 0
-        remedy = Remedy(text, n_parameters - after.open, complete)
+        complete = harmful == 0
+        remedy = Remedy(text, n_parameters - n_open, complete)
         if complete:
             sufficient.append(remedy)
         else:
@@ -841,12 +824,14 @@ def _try_kind(kind: Iterable[_Candidate], before: _Score, n_parameters: int) -> 
 
 def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield further camera positions that show weak legs and their neighbours."""
-    session, weak = analysis.session, _weak_legs(analysis)
+    session, touched = analysis.session, {p for d in _harmful(analysis) for p in d.parameters}
+    names = enumerate(session.leg_names)
+    weak = {j for j, name in names if any(p.startswith(f"{name}.") for p in touched)}
     ring = legs_around(session)
     largest = max(len(view) for view in session.views)
     for size in sorted({min(k, session.n_legs) for k in (3, 4, largest)}):
-        groups = [legs for legs in neighbours(ring, size) if set(weak) & set(legs)]
-        groups.sort(key=lambda legs: -len(set(weak) & set(legs)))
+        groups = [legs for legs in neighbours(ring, size) if weak & set(legs)]
+        groups.sort(key=lambda legs: -len(weak & set(legs)))
         for legs in groups:
             named = legs_in_words(legs, session.leg_names)
             more = analysis.elsewhere(_extended(session, legs))
@@ -875,12 +860,6 @@ def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:
         yield f"fix {list_in_words(which)}", analysis, known
 
 
-def _weak_legs(analysis: Analysis) -> list[int]:
-    touched = {p for d in _harmful(analysis) for p in d.parameters}
-    names = analysis.session.leg_names
-    return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
-
-
 def _harmful(analysis: Analysis) -> list[WeakDirection]:
     return [d for d in analysis.full.weak if not d.harmless]
 
@@ -891,7 +870,9 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
     new = len(session.t) + np.arange(len(images))
     seen = np.zeros((1, session.n_legs), dtype=np.bool_)
     seen[0, list(legs)] = True
-    (further,) = cameras_for(session, [legs])
+    A, B = (end.mean(axis=0) for end in session.ends)
+    rng = np.random.default_rng(_SEED)
+    (further,) = default_cameras(A, B, [legs], session.spatial, rng)
     return replace(
         session,
         R=np.concatenate([session.R, session.R[images]]),

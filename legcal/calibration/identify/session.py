@@ -55,7 +55,7 @@ from legcal.machine.rods import (
     ends_at_poses,
 )
 from legcal.machine.shapes import Occluder, bodies_of
-from legcal.machine.ties import by_step, independent, machine_ties, on_ties
+from legcal.machine.ties import machine_ties, on_ties
 from legcal.perception.body_edges import predicted_edges
 from legcal.vision.board import Board, FixedBoard, facing_board
 from legcal.vision.camera import sample_camera
@@ -64,7 +64,6 @@ from legcal.vision.visibility import Bodies, visible_parts
 _DISTANCE = 2.5  # machine sizes
 _TILT = 0.5  # [rad] from the normal of a planar machine
 _SEED = 2002
-_EXACT = 2.5e-7  # mean leg lengths: standard deviation of what is known exactly
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
 REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
@@ -280,22 +279,11 @@ class Session:
         """Mean leg length, by which angles become lengths [m]."""
         return float(self.length.mean())
 
-    @property
-    def sigma_exact(self) -> float:
-        """Standard deviation of the constraints of the mechanism [m]."""
-        return _EXACT * self.mean_length
-
     @cached_property
     def unit(self) -> Array:
         """A metre of every parameter in its own unit, (p,): angles at the leg's length."""
         lengths = np.array([unit == "m" for unit in self.parametrization.units], dtype=np.bool_)
         return np.where(lengths, 1.0, 1.0 / self.mean_length)
-
-    @property
-    def n_ties(self) -> int:
-        """Number of independent ties of the parameters to each other."""
-        rows = self.fitted.ties.at(self.legs)
-        return len(independent(rows, by_step(rows, self.parametrization.place) * self.unit)[1])
 
     @cached_property
     def with_length(self) -> BoolArray:
@@ -486,12 +474,6 @@ def default_cameras(
         camera = replace(sample_camera(), gamma_is_given=False)
         cameras.append(View(str(v + 1), camera, place, hand_held=hand_held))
     return tuple(cameras)
-
-
-def cameras_for(session: Session, views: Sequence[Sequence[int]]) -> tuple[View, ...]:
-    """Return the default positions of further cameras."""
-    A, B = (end.mean(axis=0) for end in session.ends)
-    return default_cameras(A, B, views, session.spatial, np.random.default_rng(_SEED + 1))
 
 
 def _axis(A: Array, B: Array) -> Array:

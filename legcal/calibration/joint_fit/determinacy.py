@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State, with_values
 from legcal.calibration.tuning import HARMLESS, HELD_SIGMA, MAX_SIGMA
 from legcal.errors import NotIdentifiable
-from legcal.estimation.solver import NormalEquations, inverse_on_range
+from legcal.estimation.solver import inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.equations import pose_sensitivity
@@ -40,23 +40,20 @@ class HeldDirections:
     ] = ()  # parameters that depend on the nominal model along these directions
 
 
-def undetermined_directions(
-    problem: FitProblem, state: State, normal: NormalEquations
-) -> HeldDirections:
+def undetermined_directions(normal: FitNormal) -> HeldDirections:
     """Return the open directions that hardly move the platform.
 
-    *problem* has no held directions yet; *normal* is its information at the state. Intrinsics with
-    the covariance of a camera file are not tested.
+    *normal* is the information of a problem without held directions yet. Intrinsics with the
+    covariance of a camera file are not tested.
 
-    Raises
-    ------
-    NotIdentifiable
-        If an open direction moves the platform, or includes a camera or a radius.
+    Raises NotIdentifiable if an open direction moves the platform, or includes a camera or a
+    radius.
     """
+    problem, state = normal.problem, normal.state
     every_unit, length = named_units(problem, state), state.mean_length
     judged = np.setdiff1d(np.arange(problem.n_named), problem.calibrated)
     names, unit = [problem.named[i] for i in judged], every_unit[judged]
-    information = marginal(named_information(problem, state, normal), judged)
+    information = marginal(named_information(normal), judged)
     unseen = [name for name, row in zip(names, information, strict=True) if not np.any(row)]
     scaled = unit[:, None] * information * unit
     eigenvalue, eigenvector = np.linalg.eigh(0.5 * (scaled + scaled.T))
@@ -100,27 +97,23 @@ def undetermined_directions(
 
 
 def refuse_undetermined_inliers(
-    problem: FitProblem,
-    state: State,
-    normal: NormalEquations,
-    held: HeldDirections,
-    accepted: BoolArray,  # inlier outlines
+    normal: FitNormal, held: HeldDirections, accepted: BoolArray
 ) -> None:
     """Refuse a fit with open directions besides the held ones, after outlier rejection.
 
-    Raises
-    ------
-    NotIdentifiable
-        Naming one of the directions.
+    *accepted* (n_outlines,) are the inliers.
+
+    Raises NotIdentifiable naming one of the directions.
     """
+    problem, length = normal.problem, normal.state.mean_length
     excluded = np.concatenate([problem.where("biases"), problem.calibrated])
     kept = np.setdiff1d(np.arange(problem.n_named), excluded)
     unit, basis = held.unit[kept], held.basis[:, kept]
-    scaled = unit[:, None] * marginal(named_information(problem, state, normal), kept) * unit
+    scaled = unit[:, None] * marginal(named_information(normal), kept) * unit
     N = null_space(basis) if len(basis) else np.eye(len(kept))
     eigenvalue, eigenvector = np.linalg.eigh(N.T @ scaled @ N)
     eigenvector = N @ eigenvector
-    if len(is_open := np.flatnonzero(_are_open(eigenvalue, eigenvector, state.mean_length))):
+    if len(is_open := np.flatnonzero(_are_open(eigenvalue, eigenvector, length))):
         names = [problem.named[i] for i in kept]
         description = _in_words(names, eigenvector[:, is_open[0]], problem.legs.names)
         if accepted.all():

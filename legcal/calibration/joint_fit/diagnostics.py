@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 
 import numpy as np
 from scipy.special import chdtrc
@@ -16,14 +15,14 @@ from scipy.special import chdtrc
 from legcal.calibration.joint_fit.determinacy import HeldDirections, undetermined_directions
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.parameter_choices import Prior, board_scale
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.calibration.tuning import SCATTER_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation.solver import NormalEquations, information, inverse_on_range
+from legcal.estimation.solver import information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import LINKS, Leg, ParameterId, radius_name
@@ -50,23 +49,21 @@ RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
 
-def refuse_contradicted_priors(problem: FitProblem, state: State, normal: NormalEquations) -> None:
+def refuse_contradicted_priors(normal: FitNormal) -> None:
     """Refuse stated priors that contradict the measurements.
 
-    *normal* is the information at *state*, a minimum.
+    *normal* is the information at a minimum.
 
-    Raises
-    ------
-    DidNotConverge
-        With one sentence for each prior.
+    Raises DidNotConverge with one sentence for each prior.
     """
+    problem = normal.problem
     if not problem.settings.judges_stated_values:
         return
     names = problem.choices.priors.keys()
     unit_of = dict(zip(problem.named, problem.units, strict=True))
     problems = [
         _contradiction(name, unit_of[name], (prior.mean, prior.sigma), estimate.mean, apart)
-        for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
+        for name, prior, estimate, apart in _contradicted(normal, names)
     ]
     if problems:
         raise DidNotConverge(problems)
@@ -90,21 +87,21 @@ def _contradiction(
     )
 
 
-def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
+def refuse_contradicted_board(normal: FitNormal) -> None:
     """Refuse a calibration board whose dimensions in the dataset contradict the measurements.
 
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
-    *normal* is the information at *state*, a first minimum.
+    *normal* is the information at a first minimum.
     """
     board_of = {board_scale(link): "" if link == "base" else f" on the {link}" for link in LINKS}
-    names = board_of.keys() - problem.choices.priors.keys()
+    names = board_of.keys() - normal.problem.choices.priors.keys()
     problems = [
         f"The dimensions of the calibration board{board_of[name]} contradict the readings and the "
         f"legs: the board is {estimate.mean:.4g} times the size stated in the dataset "
         f"({apart:.0f} standard deviations; assumed accuracy {1e2 * prior.sigma:.2g} %); "
         "measure the board and correct its dimensions in dataset.yaml, or the scale of the "
         f"readings if the board is right, or estimate the size of the board (--set {name}=free)."
-        for name, prior, estimate, apart in _contradicted(problem, state, normal, names)
+        for name, prior, estimate, apart in _contradicted(normal, names)
         if estimate.sigma <= _MAX_SCALE_SIGMA
     ]
     if problems:
@@ -112,11 +109,7 @@ def refuse_contradicted_board(problem: FitProblem, state: State, normal: NormalE
 
 
 def _contradicted(
-    problem: FitProblem,
-    state: State,
-    normal: NormalEquations,
-    names: Collection[str],
-    most: float = _SIGNIFICANT,
+    normal: FitNormal, names: Collection[str], most: float = _SIGNIFICANT
 ) -> Iterator[tuple[str, Prior, Prior, float]]:
     """Yield priors of named unknowns that the measurements contradict.
 
@@ -126,8 +119,8 @@ def _contradicted(
     For the information I of the measurements, an estimate at a distance d from the prior mean moves
     to d (1 + 1 / (I sigma^2)) without the prior. The difference has the variance sigma^2 + 1 / I.
     """
-    priors, coordinates = problem.priors, problem.coordinates(state)
-    information_of_named = named_information(problem, state, normal)
+    problem, information_of_named = normal.problem, named_information(normal)
+    priors, coordinates = problem.priors, problem.coordinates(normal.state)
     for i, mean, sigma in zip(
         priors.unknown.tolist(), priors.mean.tolist(), priors.sigma.tolist(), strict=True
     ):
@@ -143,23 +136,12 @@ def _contradicted(
             yield problem.named[i], Prior(mean, sigma), estimate, apart
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """A stated value and its estimate from the measurements."""
-
-    name: str
-    unit: str
-    estimate: float
-    sigmas_joint: float  # difference in standard deviations, other stated values free
-    sigmas_alone: float  # the same, other stated values right
-
-
 def refuse_contradicted_values(
-    problem: FitProblem,
+    problem: FitProblem,  # without held directions and edge biases
     start: Start,
-    state: State,
+    state: State,  # the minimum or the last state, with the values fixed
     *,
-    with_priors: bool = False,
+    with_priors: bool = False,  # also test stated priors
 ) -> None:
     """Refuse fixed values that contradict the measurements.
 
@@ -167,19 +149,7 @@ def refuse_contradicted_values(
     claimed covariances do not refuse a right value. It starts from *start*, and from *state* if
     that fails; if both fail, nothing is refused.
 
-    Parameters
-    ----------
-    problem : FitProblem
-        Without held directions and edge biases.
-    start, state
-        Start of the fit, and its minimum or last state with the values fixed.
-    with_priors : bool
-        Also test stated priors.
-
-    Raises
-    ------
-    DidNotConverge
-        One sentence for each value.
+    Raises DidNotConverge, one sentence for each value.
     """
     if not problem.settings.judges_stated_values:
         return
@@ -201,19 +171,21 @@ def refuse_contradicted_values(
     stated = {name: value for name, value in stated.items() if name in wider.named}
     if not stated:
         return
-    comparisons: list[_Comparison] = []
+    comparisons: list[tuple[str, str, float, tuple[float, float]]] = []
     for start_state in (wider.begin(start), state):
         try:
-            fit, held = _refit(wider, start_state)
+            first = first_minimum(wider, start_state)
+            held = undetermined_directions(information(first.linear, wider.loss))
+            fit = fit_in_rounds(wider, first, held)
         except (DidNotConverge, NotIdentifiable):
             continue
         comparisons = _compare(fit, held, stated, wide)
         break
-    for apart in (attrgetter("sigmas_joint"), attrgetter("sigmas_alone")):
+    for k in range(2):
         problems = [
-            _contradiction(one.name, one.unit, stated[one.name], one.estimate, apart(one))
-            for one in comparisons
-            if apart(one) > _SIGNIFICANT
+            _contradiction(name, unit, stated[name], estimate, sigmas[k])
+            for name, unit, estimate, sigmas in comparisons
+            if sigmas[k] > _SIGNIFICANT
         ]
         if problems:
             raise DidNotConverge(problems)
@@ -254,31 +226,24 @@ def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigm
     return Prior(value, max(float(wide), sigma))
 
 
-def _refit(problem: FitProblem, state: State) -> tuple[Fit, HeldDirections]:
-    """Fit with the stated parameters free; return the fit and its held directions."""
-    first = first_minimum(problem, state)
-    normal = information(problem, first.state, first.linear, problem.loss)
-    held = undetermined_directions(problem, first.state, normal)
-    return fit_in_rounds(problem, first, held), held
-
-
 def _compare(
     fit: Fit,
     held: HeldDirections,
     stated: Mapping[str, tuple[float, float]],
     wide: Mapping[str, Prior],
-) -> list[_Comparison]:
+) -> list[tuple[str, str, float, tuple[float, float]]]:
     """Compare stated values with their estimates, where the measurements depend on them.
+
+    Return names and units, estimates, and their differences in standard deviations: with the other
+    stated values free, and with these right.
 
     M is the information of these parameters, including their wide priors P around w, and f the
     estimates. The measurements alone have the information K = M - P, and the gradient
     M f - P w - K m at the stated values m.
     """
     problem, state = fit.problem, fit.state
-    normal = information(problem, state, fit.minimum.linear, problem.loss)
-    total_information = named_information(problem, state, normal) + _held_information(
-        problem, held, state.mean_length
-    )
+    total_information = named_information(information(fit.minimum.linear, problem.loss))
+    total_information += _held_information(problem, held, state.mean_length)
     unknowns = np.array([problem.named.index(name) for name in stated], dtype=np.intp)
     fitted = problem.coordinates(state)[unknowns]
     M, P = (
@@ -295,15 +260,10 @@ def _compare(
         if measured < _MIN_INFORMATION_WIDE * P[i]:
             continue
         joint_sigmas = abs(fitted[i] - mean[i]) / np.sqrt(covariance[i, i] + sigma[i] ** 2)
-        comparisons.append(
-            _Comparison(
-                name,
-                problem.units[unknowns[i]],
-                float(fitted[i]),
-                float(joint_sigmas) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0,
-                float(abs(slope[i] / measured) / np.sqrt(1.0 / measured + sigma[i] ** 2)),
-            )
-        )
+        together = float(joint_sigmas) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0
+        alone = float(abs(slope[i] / measured) / np.sqrt(1.0 / measured + sigma[i] ** 2))
+        unit = problem.units[unknowns[i]]
+        comparisons.append((name, unit, float(fitted[i]), (together, alone)))
     return comparisons
 
 
@@ -477,19 +437,15 @@ def reversed_motors(problem: FitProblem, state: State) -> tuple[str, ...]:
     )
 
 
-def contradicted_radii(problem: FitProblem, state: State, normal: NormalEquations) -> list[str]:
-    """Return a note on nominal radii, with default priors, that contradict the measurements.
-
-    *normal* is the information at *state*.
-    """
+def contradicted_radii(normal: FitNormal) -> list[str]:
+    """Return a note on nominal radii, with default priors, that contradict the measurements."""
+    problem = normal.problem
     radii = {radius_name(problem.legs.names[leg], part) for leg, part in problem.outlines.parts}
     names = radii - problem.choices.priors.keys()
     contradictions = [
         f"{name} {1e3 * estimate.mean:.2f} mm against {1e3 * prior.mean:.2f} +- "
         f"{1e3 * prior.sigma:.2f} mm ({apart:.0f} standard deviations)"
-        for name, prior, estimate, apart in _contradicted(
-            problem, state, normal, names, RADIUS_SIGMAS
-        )
+        for name, prior, estimate, apart in _contradicted(normal, names, RADIUS_SIGMAS)
     ]
     if not contradictions:
         return []

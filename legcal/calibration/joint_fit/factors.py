@@ -81,20 +81,17 @@ def observed_arrays(
 ) -> Observed:
     """Return measurements as arrays; *cameras* override the cameras of the views.
 
-    Raises
-    ------
-    DatasetError
-        If an outline cannot be used.
+    Raises DatasetError if an outline cannot be used.
     """
-    view_cameras = [view.camera for view in measurements.views]
-    observed = observed_outlines(outlines, measurements, legs)
-    if cameras is not None and any(a is not b for a, b in zip(cameras, view_cameras, strict=True)):
+    observed, given = observed_outlines(outlines, measurements, legs), measurements.cameras
+    cameras = given if cameras is None else cameras
+    if any(a is not b for a, b in zip(cameras, given, strict=True)):
         observed = observed.through(cameras)
     return Observed(
         observed,
         observed_readings(measurements, legs),
-        observed_edges(edges, measurements, legs, view_cameras if cameras is None else cameras),
-        *observed_corners(board, measurements, view_cameras if cameras is None else cameras),
+        observed_edges(edges, measurements, legs, cameras),
+        *observed_corners(board, measurements, cameras),
     )
 
 
@@ -194,12 +191,8 @@ class ObservedOutlines:
 
     def through(self, cameras: Sequence[Camera]) -> ObservedOutlines:
         """Project the same pixels onto the sensor planes of other cameras."""
-        feet, lens = self.feet.copy(), self.lens.copy()
-        for v in np.unique(self.view):
-            of_view = self.view == v
-            feet[of_view] = cameras[v].undistort(self.pixels[of_view])
-            lens[of_view] = _inverses(cameras[v].pixels_per_unit(feet[of_view]))
-        return replace(self, feet=feet, lens=lens)
+        feet, by_xy = _through_lenses(cameras, self.view, self.pixels)
+        return replace(self, feet=feet, lens=_inverses(by_xy))
 
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
         """Return the distance of both ends from the predicted outline, (n, 2) [px]."""
@@ -275,11 +268,8 @@ def observed_outlines(
 ) -> ObservedOutlines:
     """Return the used outlines as arrays.
 
-    Raises
-    ------
-    DatasetError
-        If the covariance of an outline is not positive definite, its part does not exist in the
-        mechanism, or outlines of a camera were measured with several gammas.
+    Raises DatasetError if the covariance of an outline is not positive definite, its part does not
+    exist in the mechanism, or outlines of a camera were measured with several gammas.
     """
     index = np.flatnonzero(outlines.used)
     row, leg = outlines.row[index], outlines.leg[index]
@@ -308,12 +298,9 @@ def observed_outlines(
     feet, pixels, lens = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2, 2))
     for v in np.unique(view):
         camera, of_view = measurements.views[v].camera, view == v
-        rows_of_view = index[of_view]
-        normal, xy = (
-            outlines.h[rows_of_view, None, :2],
-            camera.undistort(outlines.ends[rows_of_view]),
-        )
-        value = np.sum(normal * xy, axis=-1, keepdims=True) + outlines.h[rows_of_view, None, 2:]
+        h, xy = outlines.h[index[of_view], None], camera.undistort(outlines.ends[index[of_view]])
+        normal = h[..., :2]
+        value = np.sum(normal * xy, axis=-1, keepdims=True) + h[..., 2:]
         feet[of_view] = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
         lens[of_view] = _inverses(camera.pixels_per_unit(feet[of_view]))
         pixels[of_view] = camera.distort(feet[of_view])
@@ -332,7 +319,7 @@ def observed_outlines(
         np.zeros((n, 0), dtype=np.intp),
         np.zeros((n, 0, 2)),
         parts,
-        tuple(v.name for v in measurements.views),
+        measurements.view_names,
         _series(measurements),
         cameras,
         legs.n_actuators > 0,
@@ -362,9 +349,8 @@ def _bad_covariances(
 
 def _series(measurements: Measurements) -> IntArray:
     """Return the representative view of each view, (n_views,)."""
-    views = measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
-    images = np.bincount(measurements.view, minlength=len(views))
+    owners = measurements.owners
+    images = np.bincount(measurements.view, minlength=len(owners))
     first: dict[str, int] = {}
     representative = [
         first.setdefault(owner, v) if n == 1 else v
@@ -390,6 +376,18 @@ def _by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
     given = np.array([view.camera.gamma_is_given for view in measurements.views], dtype=np.bool_)
     unknown = ~given[measurements.view[outlines.row]] & np.isfinite(outlines.by_gamma)
     return np.where(unknown, outlines.by_gamma, 0.0)
+
+
+def _through_lenses(
+    cameras: Sequence[Camera], view: IntArray, pixels: Array
+) -> tuple[Array, Array]:
+    """Return points (n, ..., 2) on the sensor plane at pixels, and derivatives of pixels there."""
+    xy, by_xy = np.zeros(pixels.shape), np.zeros((*pixels.shape, 2))
+    for v in np.unique(view).tolist():
+        of_view = view == v
+        xy[of_view] = cameras[v].undistort(pixels[of_view])
+        by_xy[of_view] = cameras[v].pixels_per_unit(xy[of_view])
+    return xy, by_xy
 
 
 def _inverses(M: Array) -> Array:
@@ -422,8 +420,8 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
     gamma_of = {
         cameras[v]: gamma for v, gamma in zip(view, outlines.gamma[moved].tolist(), strict=True)
     }
-    names = [view.name for view in measurements.views]
-    return {n: gamma_of[c] for n, c in zip(names, cameras, strict=True) if c in gamma_of}
+    named = zip(measurements.view_names, cameras, strict=True)
+    return {name: gamma_of[camera] for name, camera in named if camera in gamma_of}
 
 
 # ---------------------------------------------------------------------------------------- edges
@@ -507,14 +505,11 @@ def observed_edges(
 ) -> ObservedEdges:
     """Return the used edges of bodies as arrays.
 
-    Raises
-    ------
-    DatasetError
-        If the covariance of an edge is not positive definite.
+    Raises DatasetError if the covariance of an edge is not positive definite.
     """
     edges = no_outlines() if edges is None else edges
     index = np.flatnonzero(edges.used)
-    n, row, leg = len(index), edges.row[index], edges.leg[index]
+    row, leg = edges.row[index], edges.leg[index]
     pixels, covariance = edges.ends[index], edges.covariance[index]
     problems = _bad_covariances(covariance, row, leg, measurements, legs)
     if problems:
@@ -523,11 +518,7 @@ def observed_edges(
     bodies = tuple(sorted(set(keys)))
     body = np.array([bodies.index(key) for key in keys], dtype=np.intp)
     view = measurements.view[row]
-    feet, lens = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
-    for v in np.unique(view).tolist():
-        of_view = view == v
-        feet[of_view] = cameras[v].undistort(pixels[of_view])
-        lens[of_view] = np.swapaxes(_inverses(cameras[v].pixels_per_unit(feet[of_view, 1])), 1, 2)
+    feet, by_xy = _through_lenses(cameras, view, pixels)
     difference = np.array([-1.0, 1.0])
     variance = np.einsum("i,nij,j->n", difference, covariance, difference)
     return ObservedEdges(
@@ -538,7 +529,7 @@ def observed_edges(
         body,
         feet,
         pixels,
-        lens,
+        np.swapaxes(_inverses(by_xy[:, 1]), 1, 2),
         np.sqrt(variance),
         edges.edge[index],
         bodies,
@@ -571,10 +562,6 @@ class Readings:
     def reading(self) -> Array:
         """The readings (n,) [m or rad]."""
         return self.sign * self.length
-
-    def wrong_by(self, rows: Residuals) -> Array:
-        """Return measured minus predicted readings, (n,) [m or rad]."""
-        return -self.sign * rows.r[:, 0]
 
     def rows(self, state: State) -> Residuals:
         """Return predicted minus measured readings, (n, 1) [m or rad], with their derivatives.
@@ -833,11 +820,7 @@ def _corners_on(
         [np.bincount(which, weights=weight * corners.px[used, i]) / total for i in range(2)], axis=1
     )
     view, pose, corner = unique_keys.T.astype(np.intp)
-    feet, lens = np.zeros((len(view), 2)), np.zeros((len(view), 2, 2))
-    for v in np.unique(view).tolist():
-        of_view = view == v
-        feet[of_view] = cameras[v].undistort(pixels[of_view])
-        lens[of_view] = cameras[v].pixels_per_unit(feet[of_view])
+    feet, lens = _through_lenses(cameras, view, pixels)
     point, sigma = fixed.board.points[corner - fixed.first], 1.0 / np.sqrt(total)
     return ObservedCorners(link, view, pose, corner, point, feet, pixels, lens, sigma)
 
@@ -979,7 +962,7 @@ class _EndsInCamera:
         derivatives by kept variables are A, B, camera, these, and the numbers of actuators.
         """
         by_ends, moved = slope.T, self.moved
-        n_numbers, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.n_q)
+        n_numbers, n_q = (0, 0) if moved is None else (ActuatorColumns.COUNT, moved.by_q.shape[1])
         by_A, by_B, n_leg_columns = by_ends[:3], by_ends[3:6], 6 + len(by_ends)
         m = n_leg_columns + n_numbers
         J = np.empty((m + 6 + n_q, *by_ends.shape[1:]))
@@ -1020,11 +1003,6 @@ class _JointMotions:
     arms: IntArray  # (m,) the measurements of arms
     far_numbers: Array  # (3, 9, m)
     far_q: Array  # (3, n_actuators, m)
-
-    @property
-    def n_q(self) -> int:
-        """Number of readings in a posture."""
-        return int(self.by_q.shape[1])
 
 
 def _joint_motion(

@@ -41,7 +41,7 @@ from legcal.calibration.joint_fit.outline_errors import NoiseModel, robust_noise
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.scale import explaining_missing_scale
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
@@ -58,7 +58,6 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import (
     Minimum,
-    NormalEquations,
     information,
     minimise,
     normal_equations,
@@ -79,50 +78,22 @@ _ENOUGH_STARTS = 3  # reaching the same minimum: no better one is near
 def refine(
     legs: FittedLegs,
     measurements: Measurements,
-    outlines: Outlines,
+    outlines: Outlines,  # in pixels; only the used ones enter
     start: Start | Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
-    board: BoardCorners | None = None,
+    board: BoardCorners | None = None,  # boards fixed to base and platform, and their corners
     choices: Choices = NO_CHOICES,
-    edges: Outlines | None = None,
+    edges: Outlines | None = None,  # of bodies, parallel to their legs; only the used ones enter
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii jointly to all data.
 
     From several starts, the lowest first minimum is refined; if that fails, the next one. A start
     that fails is skipped with a note; between equal costs the earlier start wins.
 
-    Parameters
-    ----------
-    legs : FittedLegs
-        The mechanism (:func:`fitted_legs`).
-    measurements : Measurements
-        Views, poses and readings [m].
-    outlines : Outlines
-        Outlines in pixels; only the used ones enter.
-    start : Start or sequence of Start
-        Starting values.
-    settings : RefinementSettings
-        Settings of the fit.
-    board : BoardCorners, optional
-        Calibration boards fixed to base and platform, and their corners in images.
-    choices : Choices
-        Fixed and freed parameters, and priors.
-    edges : Outlines, optional
-        Straight edges of bodies, parallel to their legs; only the used ones enter.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    NotIdentifiable
-        If the data do not determine the parameters, from any start.
-    DidNotConverge
-        If the solver does not converge from any start, or most outlines are outliers of the fit.
-    DatasetError
-        If an outline cannot be used.
+    Raises NotIdentifiable if the data do not determine the parameters, from any start;
+    DidNotConverge if the solver does not converge from any start, or most outlines are outliers of
+    the fit; DatasetError if an outline cannot be used.
     """
     starts = [start] if isinstance(start, Start) else start
 
@@ -191,8 +162,8 @@ def _gain_by_edges(fit: Posterior) -> float:
         )[..., problem.free]
         errors = []
         for one in (problem, without):
-            normal = normal_equations(one, state, linearize(one, state))
-            undetermined_directions(one, state, normal)
+            normal = normal_equations(linearize(one, state))
+            undetermined_directions(normal)
             covariance = normal.kept_covariance()[:n, :n]
             errors.append(expected_error(by_parameters, covariance).mean_displacement)
     except NotIdentifiable:
@@ -371,8 +342,7 @@ def _first_minimum_from(
     """First minimum from a state, with the directions held that are open there."""
     begin = problem.projected(begin)
     with contextlib.suppress(NotIdentifiable):  # at the start only, or reported at the minimum
-        normal = information(problem, begin, linearize(problem, begin))
-        held = undetermined_directions(problem, begin, normal)
+        held = undetermined_directions(information(linearize(problem, begin)))
         if len(held.basis):
             problem, begin = held_at_nominal(problem, begin, held)
     return first_minimum(problem, begin, must_converge=must_converge)
@@ -386,12 +356,16 @@ def _refine_minimum(
 ) -> Solution:
     """Refine a first minimum: held directions, rounds, checks, result."""
     refuse_contradicted_values(problem, start, first.state)
-    normal = information(problem, first.state, first.linear, problem.loss)
-    held = undetermined_directions(problem, first.state, normal)
-    refuse_contradicted_board(problem, first.state, normal)
+    # The first minimum may hold directions that are open at its start
+    normal = information(dataclasses.replace(first.linear, problem=problem), problem.loss)
+    held = undetermined_directions(normal)
+    refuse_contradicted_board(normal)
     while True:
         try:
-            fit, normal = _fit_holding(problem, held, first)
+            fit = fit_in_rounds(problem, first, held)
+            normal = information(fit.minimum.linear, problem.loss)
+            refuse_undetermined_inliers(normal, held, fit.accepted)
+            _refuse_other_radii(problem, fit.state)
             break
         except (DidNotConverge, NotIdentifiable) as failure:
             within, at = held_at_nominal(problem, first.state, held)
@@ -408,19 +382,8 @@ def _refine_minimum(
             held = more
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(problem, start, first.state, with_priors=True)
-    refuse_contradicted_priors(fit.problem, fit.state, normal)
+    refuse_contradicted_priors(normal)
     return assemble_solution(fit, normal, held, outlines, start.label)
-
-
-def _fit_holding(
-    problem: FitProblem, held: HeldDirections, first: Minimum[State]
-) -> tuple[Fit, NormalEquations]:
-    """Fit with held directions; also return the information, which must determine all others."""
-    fit = fit_in_rounds(problem, first, held)
-    normal = information(fit.problem, fit.state, fit.minimum.linear, problem.loss)
-    refuse_undetermined_inliers(fit.problem, fit.state, normal, held, fit.accepted)
-    _refuse_other_radii(problem, fit.state)
-    return fit, normal
 
 
 def _open_farther_on(
@@ -433,15 +396,14 @@ def _open_farther_on(
     """
     with contextlib.suppress(DidNotConverge, NotIdentifiable):
         near = minimise(held, state, held.loss, must_converge=False).state
-        there = linearize(problem, near)
-        found = undetermined_directions(problem, near, information(problem, near, there))
+        found = undetermined_directions(information(linearize(problem, near)))
         return found if len(found.basis) > n_held else None
     return None
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     """Raise NotIdentifiable if open directions explain a failed fit."""
-    undetermined_directions(problem, state, information(problem, state, linearize(problem, state)))
+    undetermined_directions(information(linearize(problem, state)))
 
 
 def _refuse_contradicted(problem: FitProblem, state: State) -> None:
@@ -450,9 +412,7 @@ def _refuse_contradicted(problem: FitProblem, state: State) -> None:
     noise = NoiseModel()
     if len(claimed):
         noise = robust_noise(problem.offsets(state), claimed)
-    problem = problem.weighted(noise)
-    linear = linearize(problem, state)
-    refuse_contradicted_priors(problem, state, information(problem, state, linear))
+    refuse_contradicted_priors(information(linearize(problem.weighted(noise), state)))
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:

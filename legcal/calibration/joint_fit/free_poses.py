@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from legcal.calibration.joint_fit.outline_errors import NoiseModel
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitLinear, FitProblem
 from legcal.calibration.joint_fit.variables import LegConstraints, State
 from legcal.calibration.tuning import OUTLIER_POSE_COST
 from legcal.estimation.loss import PseudoHuber
-from legcal.estimation.problem import Frames, GaussianPrior, Linearization, linearize
+from legcal.estimation.problem import Frames, GaussianPrior, linearize
 from legcal.estimation.solver import minimise, normal_equations
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.closing import solve_poses
@@ -57,7 +57,7 @@ def of_determined_poses(problem: FitProblem, state: State, accepted: BoolArray) 
 
 def _are_determined(problem: FitProblem, state: State) -> BoolArray:
     """Mask of poses determined by their measurements, (n_poses,)."""
-    V = normal_equations(problem, state, linearize(problem, state)).V
+    V = normal_equations(linearize(problem, state)).V
     moving = np.any(np.einsum("kff->kf", V) > 0.0, axis=0)
     least = np.linalg.eigvalsh(V[:, moving][:, :, moving])[:, 0]
     return np.asarray(least * (_OPEN * state.mean_length) ** 2 > 1.0)
@@ -73,7 +73,7 @@ def with_free_poses(problem: FitProblem, state: State) -> State:
     soft = soft.with_parts((replace(legs, prior=legs.prior + near),), ())
     for seed in range(2):
         state = with_better_poses(soft, state, seed=seed)
-        loss = PseudoHuber(_loss_width(soft, linearize(soft, state)))
+        loss = PseudoHuber(_loss_width(linearize(soft, state)))
         state = minimise(soft, state, loss, max_iterations=40, must_converge=False).state
     return state
 
@@ -84,7 +84,7 @@ def with_better_poses(problem: FitProblem, state: State, part: float = 0.0, seed
     *part* of the errors of a nominal model counts as noise.
     """
     problem = _with_model_noise(problem, part, state.mean_length) if part else problem
-    loss = PseudoHuber(_loss_width(problem, linearize(problem, state)))
+    loss = PseudoHuber(_loss_width(linearize(problem, state)))
     rng, n = np.random.default_rng((_SEED, seed)), len(state.platform_pose.t)
     spread = _spread_of_starts(problem, state)
     best, least = _minimise_poses(problem, state, loss)
@@ -108,13 +108,10 @@ def in_other_assembly_modes(problem: FitProblem, state: State, part: float) -> S
     if len(rows) == 0:
         return state
     problem = _with_model_noise(problem, part, state.mean_length)
-    loss, n = (
-        PseudoHuber(_loss_width(problem, linearize(problem, state))),
-        len(state.platform_pose.t),
-    )
+    loss = PseudoHuber(_loss_width(linearize(problem, state)))
 
     def cost_at(trial: State) -> Array:
-        return _cost_of_poses(problem, linearize(problem, trial), loss, n)
+        return _cost_of_poses(linearize(problem, trial), loss)
 
     rng, now = np.random.default_rng(_SEED), state.platform_pose.frames
     several = np.tile(rows, _N_DRAWS)
@@ -141,9 +138,8 @@ def have_outliers(problem: FitProblem, state: State) -> bool:
 
 def outlier_poses(problem: FitProblem, state: State) -> BoolArray:
     """Mask of determined poses with a far larger cost than most at a minimum, (n_poses,)."""
-    linear, n = linearize(problem, state), len(state.platform_pose.t)
-    loss = PseudoHuber(_loss_width(problem, linear))
-    cost = _cost_of_poses(problem, linear, loss, n)
+    linear = linearize(problem, state)
+    cost = _cost_of_poses(linear, PseudoHuber(_loss_width(linear)))
     is_large = cost > OUTLIER_POSE_COST * np.median(cost)
     if not is_large.any():
         return np.asarray(is_large)
@@ -169,11 +165,11 @@ def _with_model_noise(problem: FitProblem, part: float, length: float) -> FitPro
     return problem.weighted(noise).with_factors(softened)
 
 
-def _loss_width(problem: FitProblem, linear: Linearization) -> float:
+def _loss_width(linear: FitLinear) -> float:
     """Width of the loss in which most residuals are inliers."""
     norms = [
         np.sqrt(linear[factor.name].squared_norms)
-        for factor in problem.factors
+        for factor in linear.problem.factors
         if factor.robust and factor.n
     ]
     together = np.concatenate(norms) if norms else np.zeros(0)
@@ -188,31 +184,31 @@ def _minimise_poses(problem: FitProblem, state: State, loss: PseudoHuber) -> tup
     constraints = LegConstraints(problem.parameters)
     step_limit = state.posture_scale
     linear = linearize(problem, state)
-    cost = _cost_of_poses(problem, linear, loss, n)
+    cost = _cost_of_poses(linear, loss)
     for _ in range(_STEPS):
         # Steps are not finite where a leg is behind its camera; such a pose stays.
-        step = np.nan_to_num(normal_equations(problem, state, linear, loss).element_step(damping))
+        step = np.nan_to_num(normal_equations(linear, loss).element_step(damping))
         scaled_step = step[problem.n_kept :].reshape(n, len(step_limit)) / step_limit
         scaled_step /= np.maximum(np.abs(scaled_step).max(axis=1, keepdims=True), 1.0)
         moved = constraints.with_poses(state, state.platform_pose.moved(scaled_step * step_limit))
-        trial_cost = _cost_of_poses(problem, linearize(problem, moved), loss, n)
+        trial_cost = _cost_of_poses(linearize(problem, moved), loss)
         better = trial_cost < cost
         if np.all(trial_cost > _SLOW * cost) and np.all(better | (damping > 1.0)):
             break
         state = state.with_chosen(better, moved.platform_pose)
         damping = np.clip(np.where(better, 0.2 * damping, 8.0 * damping), 1e-9, 1e6)
         linear = linearize(problem, state)
-        cost = _cost_of_poses(problem, linear, loss, n)
+        cost = _cost_of_poses(linear, loss)
     return state, cost
 
 
-def _cost_of_poses(problem: FitProblem, linear: Linearization, loss: PseudoHuber, n: int) -> Array:
+def _cost_of_poses(linear: FitLinear, loss: PseudoHuber) -> Array:
     """Robust cost of the measurements of each pose, (n,)."""
-    costs = np.zeros(n)
-    for factor in problem.factors:
+    costs = np.zeros(linear.problem.n_elements)
+    for factor in linear.problem.factors:
         if factor.element is None or not factor.n:
             continue
         s = linear[factor.name].squared_norms
         value = s / (1.0 + np.sqrt(1.0 + loss.k * s)) if factor.robust else 0.5 * s
-        costs += np.bincount(factor.element, value, minlength=n)
+        costs += np.bincount(factor.element, value, minlength=len(costs))
     return costs

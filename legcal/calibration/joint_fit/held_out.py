@@ -27,18 +27,9 @@ from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.problem import Residuals, linearize
-from legcal.estimation.solver import NormalEquations, information, minimise
+from legcal.estimation.solver import information, minimise
 from legcal.estimation.uncertainty import left_out_blocks, leverage
 from legcal.geometry.types import Array, IntArray
-
-
-@dataclass(frozen=True, eq=False)
-class Predicted:
-    """Prediction of a fit for held-out images."""
-
-    problem: FitProblem  # held-out outlines and readings, with the unknowns of the fit
-    state: State  # of the fit, at the poses of the held-out images
-    covariance: Array  # (n_kept, n_kept) of the fit; new biases have their prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +53,8 @@ class Posterior:
         measurements: Measurements,
         outlines: Outlines,
         T_Rb_Re: Sequence[RigidTransform],
-    ) -> Predicted:
-        """Predict other images of the same views, at given poses."""
+    ) -> Posterior:
+        """Return the same of other images of the views, at given poses; new biases have a prior."""
         problem_of_fit, legs, state = self.problem, self.problem.legs, self.state
         observed = observed_outlines(outlines, measurements, legs)
         observed = observed.with_parts_first(problem_of_fit.outlines.parts).through(state.cameras)
@@ -72,16 +63,14 @@ class Posterior:
         problem = problem_of_fit.with_measurements(measurements, observed, shifts)
         biases = self.biases
         other_radii = [legs.radii[part] for part in observed.parts[len(state.radii) :]]
-        return Predicted(
-            problem,
-            replace(
-                state,
-                radii=np.append(state.radii, other_radii),
-                biases=np.array([biases.get(name, 0.0) for name in shifts.names]),
-                platform_pose=problem.postures(state.legs, T_Rb_Re),
-            ),
-            self._covariance_of(problem, shifts),
+        predicted = replace(
+            state,
+            radii=np.append(state.radii, other_radii),
+            biases=np.array([biases.get(name, 0.0) for name in shifts.names]),
+            platform_pose=problem.postures(state.legs, T_Rb_Re),
         )
+        covariance = self._covariance_of(problem, shifts)
+        return replace(self, problem=problem, state=predicted, covariance=covariance)
 
     def _covariance_of(self, problem: FitProblem, shifts: EdgeBiases) -> Array:
         """Covariance of the unknowns of a problem with other biases."""
@@ -119,16 +108,11 @@ def compare_held_out(
     The used *outlines* of the held-out *measurements* are compared, at the poses *T_Rb_Re*
     computed from the fit and the readings.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the readings do not determine the poses.
-    NotVisible
-        If a camera is inside a leg.
+    Raises NotIdentifiable if the readings do not determine the poses; NotVisible if a camera is
+    inside a leg.
     """
     predicted = posterior.of_images(measurements, outlines, T_Rb_Re)
     problem, state = predicted.problem.weighted(posterior.noise), predicted.state
-    predicted = replace(predicted, problem=problem)
     L = np.linalg.cholesky(posterior.noise.covariance(problem.outlines.covariance))
     linear = linearize(problem, state)
     n_inside = int(np.sum(~np.isfinite(linear["outlines"].r).all(axis=1)))
@@ -137,9 +121,15 @@ def compare_held_out(
             f"The held-out images could not be compared with the fit: for {n_inside} outlines, the "
             "readings put a camera inside the leg; check the readings."
         )
-    readings = information(problem, state, linear, only=_READINGS)
-    _refuse_undetermined(readings)
-    expected = np.eye(2) + leverage(problem, linear, readings, "outlines", predicted.covariance)
+    readings = information(linear, only=_READINGS)
+    eigenvalues = np.linalg.eigvalsh(readings.V)
+    undetermined = np.flatnonzero(eigenvalues[:, 0] <= _RANK_TOLERANCE * eigenvalues[:, -1])
+    if len(undetermined):
+        raise NotIdentifiable(
+            "The held-out images could not be compared with the fit: their readings do not "
+            f"determine platform pose {undetermined[0] + 1}; leave out --holdout."
+        )
+    expected = np.eye(2) + leverage(readings, "outlines", predicted.covariance)
     offsets = (L @ linear["outlines"].r[..., None])[..., 0]
     r = linear["outlines"].r
     norm = np.sqrt(np.einsum("ni,nij,nj->n", r, np.linalg.inv(expected), r))  # Mahalanobis
@@ -161,17 +151,6 @@ def compare_held_out(
     )
 
 
-def _refuse_undetermined(readings: NormalEquations) -> None:
-    """Raise NotIdentifiable if readings do not determine a pose."""
-    eigenvalues = np.linalg.eigvalsh(readings.V)
-    undetermined = np.flatnonzero(eigenvalues[:, 0] <= _RANK_TOLERANCE * eigenvalues[:, -1])
-    if len(undetermined):
-        raise NotIdentifiable(
-            "The held-out images could not be compared with the fit: their readings do not "
-            f"determine platform pose {undetermined[0] + 1}; leave out --holdout."
-        )
-
-
 def rms(values: Array) -> float | None:
     """Root mean square of values; None without any."""
     return float(np.sqrt(np.mean(values**2))) if values.size else None
@@ -184,26 +163,15 @@ _NEARLY = 1.0  # decrease of the cost, in squared sigmas, at which these end
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """How well blocks of images are predicted that did not take part.
+    """How well blocks of images are predicted that did not take part."""
 
-    Attributes
-    ----------
-    squares : Array
-        (n_blocks,) squared Mahalanobis distances of the innovations.
-    dof : IntArray
-        (n_blocks,) their expectations.
-    gain : float or None
-        By how much the squares of the nominal model are larger, cameras and poses fitted again,
-        over what they would be with the measurements that the fit predicts; None where that could
-        not be fitted.
-    gain_sigma : float
-        Its standard deviation about one, if the claim is right.
-    """
-
-    squares: Array
-    dof: IntArray
+    squares: Array  # (n_blocks,) squared Mahalanobis distances of the innovations
+    dof: IntArray  # (n_blocks,) their expectations
+    # by how much the squares of the nominal model are larger, cameras and poses fitted again, over
+    # what they would be with the measurements that the fit predicts; None where that could not be
+    # fitted
     gain: float | None
-    gain_sigma: float = 0.0
+    gain_sigma: float = 0.0  # its standard deviation about one, if the claim is right
 
     @property
     def ratio(self) -> float:
@@ -219,8 +187,8 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     if problem.n_elements < 2:
         return None
     problem = with_weights(problem, state)
-    linear, block = linearize(problem, state), _blocks(state)
-    left_out = left_out_blocks(problem, state, linear, block)
+    block = _blocks(state)
+    left_out = left_out_blocks(linearize(problem, state), block)
     squares = np.array([one.squares for one in left_out])
     dof = np.array([one.dof for one in left_out], dtype=np.intp)
     held = problem.changed(held_directions=np.eye(problem.n_kinematic))
@@ -243,8 +211,7 @@ def _squares_near(problem: FitProblem, begin: State, block: IntArray) -> float:
     minimum = minimise(
         problem, begin, max_iterations=_STEPS_TO_NOMINAL, tolerance=_NEARLY, must_converge=False
     )
-    left_out = left_out_blocks(problem, minimum.state, minimum.linear, block)
-    return float(sum(one.squares for one in left_out))
+    return float(sum(one.squares for one in left_out_blocks(minimum.linear, block)))
 
 
 def _as_if_true(problem: FitProblem, state: State) -> FitProblem:

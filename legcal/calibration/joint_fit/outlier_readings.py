@@ -8,15 +8,16 @@ stated ones they would bias the model, and outlines would be rejected instead.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
+from pydantic import Field
 
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.documents import RedundantReadings, WrongReadingBlock
+from legcal.calibration.joint_fit.problem import FitLinear, FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State
-from legcal.estimation.problem import Linearization, linearize
-from legcal.estimation.solver import NormalEquations, information, normal_equations
+from legcal.estimation.problem import linearize
+from legcal.estimation.solver import information, normal_equations
 from legcal.estimation.uncertainty import leverage, score_test
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import few
@@ -30,37 +31,27 @@ _NO_INFORMATION = 1e-12  # floor of the information on an error
 _SIGNIFICANT = 5.0  # standard deviations of the sum of squared residuals
 
 
-@dataclass(frozen=True, eq=False)
-class WrongReading:
-    """A rejected reading."""
+class WrongReading(WrongReadingBlock):
+    """A rejected reading, with the leg and the pose in the fit."""
 
-    leg: int
-    pose: int  # index in the fit
-    motor: str  # leg, or the actuated joint at A
-    view: str
-    image: str
-    off: float  # measured minus predicted [m or rad]
-    unit: Literal["m", "rad"]
-    alike: tuple[str, ...] = ()  # other motors that may be wrong instead
+    leg: int = Field(exclude=True)
+    pose: int = Field(exclude=True)
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedReadings:
+class JudgedReadings(RedundantReadings):
     """Rejected readings of redundant motors, and the residuals of the others."""
 
     wrong: tuple[WrongReading, ...]
-    rms: float  # of the residuals of the others, over their standard deviations
-    rms_expected: float  # the same for right readings, from their redundancy
-    rms_m: float  # of the residuals as displacements of joints [m]
-    doubts: tuple[tuple[str, str], ...]  # reasons to distrust the result, each with its remedy
+    # reasons to distrust the result, each with its remedy
+    doubts: tuple[tuple[str, str], ...] = Field(exclude=True)
 
     def renumbered(self, legs: Sequence[int], poses: Mapping[int, int]) -> JudgedReadings:
         """Renumber legs and poses."""
         wrong = (
-            replace(reading, leg=legs[reading.leg], pose=poses[reading.pose])
-            for reading in self.wrong
+            one.model_copy(update={"leg": legs[one.leg], "pose": poses[one.pose]})
+            for one in self.wrong
         )
-        return replace(self, wrong=tuple(wrong))
+        return self.model_copy(update={"wrong": tuple(wrong)})
 
 
 def with_inflated_reading_noise(problem: FitProblem) -> FitProblem:
@@ -85,12 +76,11 @@ def reject_outlier_readings(problem: FitProblem, state: State) -> tuple[FitProbl
     are consistent and carry no information on the machine.
     """
     linear = linearize(problem, state)
-    normal = information(problem, state, linear, problem.loss)
-    tests = _tests(problem, linear, normal)
+    tests = _tests(information(linear, problem.loss))
     used, is_changed = _used(problem), False
     index = np.flatnonzero(used)
     for pose in np.unique(tests.pose).tolist():
-        suspects = _suspects_of_pose(problem, state, linear, tests, pose)
+        suspects = _suspects_of_pose(linear, tests, pose)
         if len(suspects) == 1 or (suspects and not _has_other_measurements(problem, pose)):
             used[index[suspects[0]]] = False
             is_changed = True
@@ -106,56 +96,62 @@ def restore_inlier_readings(
     The whitened residual of a rejected reading has the variance 1 + C, C that of its prediction.
     """
     restored = problem.with_factors(complete.factor("readings"))
-    linear = linearize(problem, state)
-    normal = information(problem, state, linear, problem.loss)
-    limit = problem.settings.rejection * _tests(problem, linear, normal).scale
+    normal = information(linearize(problem, state), problem.loss)
+    limit = problem.settings.rejection * _tests(normal).scale
     linear = linearize(restored, state)
-    predicted = leverage(restored, linear, normal, "readings")[:, 0, 0]
+    predicted = leverage(normal, "readings", linear=linear)[:, 0, 0]
     agrees = linear["readings"].r[:, 0] ** 2 <= limit**2 * (1.0 + predicted)
     restored_now = agrees & _used(complete) & ~_used(problem)
     used, is_changed = _used(problem) | restored_now, bool(restored_now.any())
     return (_using(problem, complete, used) if is_changed else problem), is_changed
 
 
-def judged_readings(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    normal: NormalEquations,
-) -> JudgedReadings | None:
+def judged_readings(normal: FitNormal) -> JudgedReadings | None:
     """Summarise rejected and used readings of a fit; None without redundant motors."""
+    problem, state = normal.problem, normal.state
     if not problem.legs.is_redundant:
         return None
     legs, wrong = problem.legs.nominal, list[WrongReading]()
     readings, used = problem.readings, _used(problem)
-    error = readings.wrong_by(problem.factor("readings").rows(state))
+    off = -readings.sign * readings.rows(state).r[:, 0]  # measured minus predicted
     for k in np.flatnonzero(~used).tolist():
         leg, pose = int(readings.leg[k]), int(readings.pose[k])
-        image, unit = _first_image(problem, pose), legs[leg].reading_unit
-        motor, alike = legs[leg].motor_label, list[str]()
+        (view, image), alike = _first_image(problem, pose), list[str]()
         if not _has_other_measurements(problem, pose):
-            problem_with = _with_used(problem, k)
-            linear_with = linearize(problem_with, state)
-            tests_with = _tests(
-                problem_with,
-                linear_with,
-                information(problem_with, state, linear_with, problem_with.loss),
-            )
+            factor = problem.factor("readings")
+            whitening = np.array(factor.whitening)
+            whitening[k] = 1.0 / readings.sigma[k]
+            restored = problem.with_factors(replace(factor, whitening=whitening))
+            linear_with = linearize(restored, state)
+            tests_with = _tests(information(linear_with, problem.loss))
             alike = [
                 legs[int(tests_with.leg[i])].motor_label
-                for i in _suspects_of_pose(problem_with, state, linear_with, tests_with, pose)
+                for i in _suspects_of_pose(linear_with, tests_with, pose)
                 if tests_with.leg[i] != leg
             ]
-        wrong.append(WrongReading(leg, pose, motor, *image, float(error[k]), unit, tuple(alike)))
-    tests = _tests(problem, linear, normal)
+        wrong.append(
+            WrongReading(
+                motor=legs[leg].motor_label,
+                view=view,
+                image=image,
+                off=float(off[k]),
+                unit=legs[leg].reading_unit,
+                alike=tuple(alike),
+                leg=leg,
+                pose=pose,
+            )
+        )
+    tests = _tests(normal)
     assumed = 1.0 / np.asarray(problem.factor("readings").whitening)[used, 0, 0]
     tests = replace(tests, r=tests.r * assumed / readings.sigma[used])  # of what is stated
     distance = np.array([1.0 / legs[j].reading_of(1.0) for j in tests.leg.tolist()])
     displacements = tests.r * readings.sigma[used] * distance
     rms, rms_m = (float(np.sqrt(np.mean(x**2))) for x in (tests.r, displacements))
     expected = float(np.sqrt(np.mean(tests.redundancy)))
-    doubts = _doubts(problem, state, linear, tests, wrong)
-    return JudgedReadings(tuple(wrong), rms, expected, rms_m, doubts)
+    doubts = _doubts(normal.linear, tests, wrong)
+    return JudgedReadings(
+        wrong=tuple(wrong), rms=rms, rms_expected=expected, rms_m=rms_m, doubts=doubts
+    )
 
 
 def reading_notes(judged: JudgedReadings | None) -> tuple[str, ...]:
@@ -186,13 +182,10 @@ def _first_image(problem: FitProblem, pose: int) -> tuple[str, str]:
 
 
 def _doubts(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    tests: ReadingTests,
-    wrong: list[WrongReading],
+    linear: FitLinear, tests: ReadingTests, wrong: list[WrongReading]
 ) -> tuple[tuple[str, str], ...]:
     """Reasons why readings put the result in doubt, each with its remedy."""
+    problem = linear.problem
     legs, doubts = problem.legs.nominal, list[tuple[str, str]]()
     for leg in dict.fromkeys(reading.leg for reading in wrong):
         of_motor = [reading for reading in wrong if reading.leg == leg]
@@ -206,7 +199,7 @@ def _doubts(
             doubts.append((what, "check the scale, zero and slip of that motor"))
     undecided = list[str]()
     for pose in np.unique(tests.pose).tolist():
-        suspects = _suspects_of_pose(problem, state, linear, tests, pose)
+        suspects = _suspects_of_pose(linear, tests, pose)
         if len(suspects) > 1:
             view, image = _first_image(problem, pose)
             labels = [legs[j].motor_label for j in tests.leg[suspects].tolist()]
@@ -232,19 +225,14 @@ def _doubts(
     return tuple(doubts)
 
 
-def _suspects_of_pose(
-    problem: FitProblem,
-    state: State,
-    linear: Linearization,
-    tests: ReadingTests,
-    pose: int,
-) -> list[int]:
+def _suspects_of_pose(linear: FitLinear, tests: ReadingTests, pose: int) -> list[int]:
     """Suspect readings of a pose, of which one is wrong, the likeliest first.
 
     A robust loss assigns a contradiction to one of several readings that explain it equally well.
     Readings that cannot be separated from the likeliest one are therefore suspects too: 1 - rho^2
     is small, with rho the correlation of their tests.
     """
+    problem = linear.problem
     suspects = tests.of_pose(pose, problem.settings.rejection, tests.scale)
     if not suspects:
         return []
@@ -255,8 +243,7 @@ def _suspects_of_pose(
     ]
     column = np.zeros((len(problem.readings), 1, len(readings_of_pose)))
     column[index[readings_of_pose], 0, np.arange(len(readings_of_pose))] = 1.0
-    columns = {"readings": column}
-    _, K = score_test(problem, linear, normal_equations(problem, state, linear), columns)
+    _, K = score_test(normal_equations(linear), {"readings": column})
     variance = np.maximum(np.diagonal(K), _NO_INFORMATION)
     unexplained = 1.0 - K[0] ** 2 / (variance[0] * variance)
     threshold = AS_LIKELY * tests.scale**2 / tests.squared[suspects[0]]
@@ -277,20 +264,12 @@ def _has_other_measurements(problem: FitProblem, pose: int) -> bool:
     )
 
 
-def _with_used(problem: FitProblem, number: int) -> FitProblem:
-    """Restore a rejected reading."""
-    factor = problem.factor("readings")
-    whitening = np.array(factor.whitening)
-    whitening[number] = 1.0 / problem.readings.sigma[number]
-    return problem.with_factors(replace(factor, whitening=whitening))
-
-
-def _tests(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> ReadingTests:
+def _tests(normal: FitNormal) -> ReadingTests:
     """Test the used readings."""
-    readings, used = problem.readings, np.flatnonzero(_used(problem))
-    share = leverage(problem, linear, normal, "readings")[used, 0, 0]
+    readings, used = normal.problem.readings, np.flatnonzero(_used(normal.problem))
+    share = leverage(normal, "readings")[used, 0, 0]
     redundancy = np.where(1.0 - share > MIN_REDUNDANCY, 1.0 - share, 0.0)
-    r = linear["readings"].r[used, 0]
+    r = normal.linear["readings"].r[used, 0]
     return ReadingTests(readings.pose[used], readings.leg[used], r, redundancy)
 
 

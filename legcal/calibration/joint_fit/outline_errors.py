@@ -81,21 +81,11 @@ _VAGUE_SIGMA = 0.25  # of ln gamma, above which it is reported as hardly determi
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Errors of single outlines.
+    """Errors of single outlines."""
 
-    Attributes
-    ----------
-    scale : float
-        Factor on the claimed standard deviations.
-    bias_px : float
-        Standard deviation of the error that is common to both ends of an outline [px].
-    tilt_px : float
-        Standard deviation of the error that is opposite at both ends [px].
-    """
-
-    scale: float = 1.0
-    bias_px: float = 0.0
-    tilt_px: float = 0.0
+    scale: float = 1.0  # factor on the claimed standard deviations
+    bias_px: float = 0.0  # standard deviation of the error common to both ends of an outline [px]
+    tilt_px: float = 0.0  # that of the error that is opposite at both ends [px]
 
     @property
     def variances(self) -> Array:
@@ -125,19 +115,10 @@ class NoiseModel:
 def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
     """Estimate the noise from the median outline, robust against less than half outliers.
 
+    *offsets* (n, 2) are those at both ends [px], *claimed* (n, 2, 2) their covariances [px^2].
+
     The difference of the offsets at both ends is independent of the bias, and their sum of the
     tilt: the smaller of their two scales is the scale, and the excess of the other is bias or tilt.
-
-    Parameters
-    ----------
-    offsets : (n, 2) array
-        Offsets at both ends [px].
-    claimed : (n, 2, 2) array
-        Claimed covariances [px^2].
-
-    Returns
-    -------
-    NoiseModel
     """
     s, d = (offsets @ _SUM) / np.sqrt(2.0), (offsets @ _DIFFERENCE) / np.sqrt(2.0)
     ss, sd, dd, turned = s * s, s * d, d * d, _turned(claimed)
@@ -149,36 +130,25 @@ def robust_noise(offsets: Array, claimed: Array) -> NoiseModel:
         (a, b, c), _ = _inverted(_covariance(noise.variances, turned))
         return float(np.median(a * ss + 2.0 * b * sd + c * dd) - MEDIAN_OF_2)
 
-    return _balanced(scale_of(ss, turned[0]), scale_of(dd, turned[2]), excess, offsets)
+    of_sums, of_differences = scale_of(ss, turned[0]), scale_of(dd, turned[2])
+    scale = max(min(of_sums, of_differences), _MIN_SCALE)
+    if of_differences <= of_sums:
+        return NoiseModel(scale, _root(lambda px: excess(NoiseModel(scale, px)), offsets))
+    return NoiseModel(scale, 0.0, _root(lambda px: excess(NoiseModel(scale, 0.0, px)), offsets))
 
 
 def estimate_noise(
-    offsets: Array,
+    offsets: Array,  # (n, 2): of the accepted outlines at both ends [px]
+    # (n, 2, 2): covariance of the predicted offsets [px^2]: errors absorbed by the fit
     explained: Array,
-    claimed: Array,
+    claimed: Array,  # (n, 2, 2): claimed covariances [px^2]
+    # (n,): of the squares of outlines; *offsets* and *explained* are weighted already
     weight: Array | None = None,
-    included: NoiseModel = NoiseModel(),
+    included: NoiseModel = NoiseModel(),  # its bias and tilt are included, significant or not
 ) -> NoiseModel:
     """Estimate the noise of outlines by restricted maximum likelihood.
 
     Bias and tilt of single outlines are included only if they are significant.
-
-    Parameters
-    ----------
-    offsets : (n, 2) array
-        Offsets of the accepted outlines at both ends [px].
-    explained : (n, 2, 2) array
-        Covariance of the predicted offsets [px^2]: errors absorbed by the fit.
-    claimed : (n, 2, 2) array
-        Claimed covariances [px^2].
-    weight : (n,) array, optional
-        Weights of the squares of outlines; *offsets* and *explained* are weighted already.
-    included : NoiseModel
-        A noise whose bias and tilt are included, significant or not.
-
-    Returns
-    -------
-    NoiseModel
     """
     weight = np.ones(len(offsets)) if weight is None else weight
     moments = _turned(offsets[:, :, None] * offsets[:, None] + explained)
@@ -279,17 +249,6 @@ def _likelihood(noise: NoiseModel, moments: Array, claimed: Array, weight: Array
     """Log-likelihood of weighted second moments (3, n) [px^2]."""
     inverse, determinant = _inverted(_covariance(noise.variances, claimed))
     return -0.5 * (float(weight @ np.log(determinant)) + _product(inverse, moments))
-
-
-def _balanced(
-    of_sums: float, of_differences: float, excess: Callable[[NoiseModel], float], offsets: Array
-) -> NoiseModel:
-    """Scale from the smaller mode, and the excess of the other as bias or tilt."""
-    if of_differences <= of_sums:
-        scale = max(of_differences, _MIN_SCALE)
-        return NoiseModel(scale, _root(lambda px: excess(NoiseModel(scale, px)), offsets))
-    scale = max(of_sums, _MIN_SCALE)
-    return NoiseModel(scale, 0.0, _root(lambda px: excess(NoiseModel(scale, 0.0, px)), offsets))
 
 
 def _root(excess: Callable[[float], float], offsets: Array) -> float:

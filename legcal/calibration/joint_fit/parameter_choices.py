@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import permutations
 from typing import Literal
 
 import numpy as np
 
+from legcal.data.dataset import Dataset
 from legcal.data.dataset_file import Action, Override
 from legcal.data.measurements import View
 from legcal.errors import DatasetError, UsageError
@@ -74,10 +75,7 @@ class Choices:
     def by_tolerances(cls, machine: Machine, only: Group | None) -> Choices:
         """Return the choices of ``--only``; no choices without it.
 
-        Raises
-        ------
-        UsageError
-            If neither the model nor the dataset states tolerances.
+        Raises UsageError if neither the model nor the dataset states tolerances.
         """
         if only is None:
             return NO_CHOICES
@@ -174,7 +172,11 @@ def known_parameters(
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
     by_name, others = _kinematic(machine), _rejected_names(machine)
-    seen: dict[str, KnownParameter] = dict(_radii(machine))
+    seen = {
+        radius_name(leg.name, part): KnownParameter(r, "m", "radius", r / _RATIO, r * _RATIO)
+        for leg in machine.legs
+        for part, r in leg.radius_of_part.items()
+    }
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
     board = {
@@ -183,6 +185,11 @@ def known_parameters(
     }
     lengths = _lengths(machine)
     return KnownParameters(by_name | seen | board, others, synonyms, lengths)
+
+
+def dataset_parameters(dataset: Dataset) -> KnownParameters:
+    """Return the parameters of the machine of a dataset, its cameras and boards."""
+    return known_parameters(dataset.machine, dataset.measurements.views, boards=dataset.boards)
 
 
 def _lengths(machine: Machine) -> dict[str, KnownParameter]:
@@ -227,14 +234,6 @@ def _kinematic(machine: Machine) -> dict[str, KnownParameter]:
             least = nominal / _RATIO
         parameters[name] = KnownParameter(nominal, unit, "kinematic", least, most)
     return parameters
-
-
-def _radii(machine: Machine) -> Iterator[tuple[str, KnownParameter]]:
-    """Yield the radii of the visible parts of the legs."""
-    for leg in machine.legs:
-        for part, radius in leg.radius_of_part.items():
-            limits = radius / _RATIO, radius * _RATIO
-            yield radius_name(leg.name, part), KnownParameter(radius, "m", "radius", *limits)
 
 
 def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[str, str]]:
@@ -289,13 +288,20 @@ def _rejected_names(machine: Machine) -> dict[str, str]:
 _PAST_TENSE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
 
 
+def choices_of(
+    dataset: Dataset, overrides: Sequence[Override] = (), only: Group | None = None
+) -> Choices:
+    """Return the choices of a dataset and of a call, with tolerances as priors for ``--only``."""
+    by_parts = Choices.by_tolerances(dataset.machine, only)
+    choices = resolve([*dataset.overrides, *overrides], dataset_parameters(dataset))
+    return replace(choices, built=by_parts.built, only=by_parts.only)
+
+
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
     """Resolve overrides to choices.
 
-    Raises
-    ------
-    UsageError, DatasetError
-        One sentence for each unknown name, implausible value, and pair of contradictory overrides.
+    Raises UsageError or DatasetError, one sentence for each unknown name, implausible value, and
+    pair of contradictory overrides.
     """
     from_file, problems_of_file = _decisions([w for w in overrides if w.in_file], known)
     from_call, problems = _decisions([w for w in overrides if not w.in_file], known)

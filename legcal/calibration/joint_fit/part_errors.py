@@ -145,57 +145,77 @@ def part_errors(
 
     *turned* [m or rad] are motors whose zero is known to be elsewhere, by their labels.
     """
-    names, kinds, stated, J, centre = _part_derivatives(legs, tuple((turned or {}).items()))
-    sigmas = [getattr(tolerance, of) or 0.0 if isinstance(of, str) else of for of in stated]
-    return PartErrors(names, kinds, np.array(sigmas, dtype=np.float64), J, centre)
+    moved, centre = part_derivatives(legs, tuple((turned or {}).items()))
+    rods = [leg.q0 for leg in legs.nominal if leg.actuator is not None]
+    of_arms = {"arm_axis": ARM_AXIS_SIGMA, "arm_point": ARM_POINT_SIGMA * float(np.mean(rods or 0))}
+    names, kinds, sigmas, columns = list[str](), list[Kind](), list[float](), list[Array]()
+    for (j, part), J in moved.items():
+        leg, kind = legs.nominal[j], "zeros" if part == "zero" else _PARTS[part][1]
+        if part == "length" and leg.kind is not LegKind.CONSTANT:  # that of its motor's zero
+            continue
+        if part == "point" and not leg.reads_angle:  # nothing turns about it
+            continue
+        stated = "angles_at_zero" if part == "zero" and leg.reads_angle else kind
+        sigma = of_arms[part] if kind == "arms" else getattr(tolerance, stated) or 0.0
+        names += [leg.motor_label if part == "zero" else leg.name] * J.shape[1]
+        kinds += [kind] * J.shape[1]
+        sigmas += [sigma] * J.shape[1]
+        columns.append(J)
+    return PartErrors(tuple(names), tuple(kinds), np.array(sigmas), np.hstack(columns), centre)
+
+
+_PARTS: Mapping[str, tuple[slice, Kind]] = {  # with their columns among the numbers of a leg
+    "A": (LegColumns.A, "joints"),
+    "B": (LegColumns.B, "joints"),
+    "length": (slice(LegColumns.LENGTH, LegColumns.LENGTH + 1), "lengths"),
+    "base_axis": (LegColumns.BASE_AXIS, "axes"),
+    "platform_axis": (LegColumns.PLATFORM_AXIS, "axes"),
+    "axis": (ActuatorColumns.AXIS, "axes"),
+    "point": (ActuatorColumns.POINT, "joints"),
+    "arm_axis": (ActuatorColumns.ARM_AXIS, "arms"),
+    "arm_point": (ActuatorColumns.ARM_POINT, "arms"),
+}
 
 
 @lru_cache(maxsize=4)  # the same for all tolerances and all fits of a machine
-def _part_derivatives(
-    legs: FittedLegs, turned: tuple[tuple[str, float], ...]
-) -> tuple[tuple[str, ...], tuple[Kind, ...], tuple[str | float, ...], Array, Array]:
-    """Return names, kinds, sigmas or the tolerances that state them, J (p, m) and x_0 (p,)."""
-    columns, nominal, first = LegColumns, legs.nominal, reading_legs(legs.nominal)
+def part_derivatives(
+    legs: FittedLegs, turned: tuple[tuple[str, float], ...] = ()
+) -> tuple[dict[tuple[int, str], Array], Array]:
+    """Return derivatives (p, d) of the parameters by moves of single parts, and x_0 (p,).
+
+    By the leg that has the part, or the first rod on a motor, and the part: joint centres along
+    the axes of R_b or R_e, axes about the two directions across them, the zero of the motor.
+    *turned* are motors whose zero is elsewhere.
+    """
+    nominal, first, found = legs.nominal, reading_legs(legs.nominal), dict[tuple[int, str], Array]()
     base = with_zeros(nominal, dict(turned))
-    place = np.arange(legs.n_legs * columns.COUNT, dtype=np.intp).reshape(legs.n_legs, -1)
-    place[:, columns.ACTUATOR] = place[list(first)][:, columns.ACTUATOR]  # rods share their motor
-    rods = [leg.q0 for leg in nominal if leg.actuator is not None]
+    place = np.arange(legs.n_legs * LegColumns.COUNT, dtype=np.intp).reshape(legs.n_legs, -1)
+    actuators = LegColumns.ACTUATOR
+    place[:, actuators] = place[list(first)][:, actuators]  # rods share their motor
     size = legs.length_at_home or float(np.mean([leg.q0 for leg in nominal]))
 
     def vector(moved: Sequence[Leg]) -> Array:
         framed = in_joint_frames(moved, legs.frame_legs)
         return vector_of(legs.parametrization, framed, nominal)
 
-    errors = list[tuple[str, Kind, str | float, list[tuple[Leg, ...]], float]]()
     for j, leg in enumerate(nominal):
-        own = first[j] == j and leg.actuator is not None
-        arm = own and leg.actuator is not None and leg.actuator.arm is not None
-        kind: Kind
-        stated: str | float
-        for part, kind, stated, exists in (
-            (columns.A, "joints", "joints", True),
-            (columns.B, "joints", "joints", True),
-            (columns.LENGTH, "lengths", "lengths", leg.kind is LegKind.CONSTANT),
-            (columns.BASE_AXIS, "axes", "axes", leg.base_axis is not None),
-            (columns.PLATFORM_AXIS, "axes", "axes", leg.platform_axis is not None),
-            (ActuatorColumns.AXIS, "axes", "axes", own),
-            (ActuatorColumns.POINT, "joints", "joints", own and leg.reads_angle),
-            (ActuatorColumns.ARM_AXIS, "arms", ARM_AXIS_SIGMA, arm),
-            (ActuatorColumns.ARM_POINT, "arms", ARM_POINT_SIGMA * float(np.mean(rods or 0)), arm),
-        ):
-            for at in np.atleast_1d(place[j, part]).tolist() if exists else ():
-                step = np.zeros(place.size)
-                step[at] = h = _STEP * (size if kind in ("joints", "lengths") else 1.0)
-                moved = [moved_legs(base, place, side * step) for side in (1.0, -1.0)]
-                errors.append((leg.name, kind, stated, moved, h))
+        actuator = leg.actuator if first[j] == j else None
+        parts = ["A", "B", *["length"] * (leg.kind is not LegKind.PASSIVE)]
+        parts += ["base_axis"] * (leg.base_axis is not None)
+        parts += ["platform_axis"] * (leg.platform_axis is not None)
+        parts += ["axis", "point"] * (actuator is not None)
+        parts += ["arm_axis", "arm_point"] * (actuator is not None and actuator.arm is not None)
+        for columns, kind, part in ((*_PARTS[part], part) for part in parts):
+            h = _STEP * (size if kind in ("joints", "lengths") else 1.0)
+            steps = h * np.equal.outer(place[j, columns], np.arange(place.size))
+            moved = [[moved_legs(base, place, by) for by in (step, -step)] for step in steps]
+            slopes = [(vector(plus) - vector(minus)) / (2.0 * h) for plus, minus in moved]
+            found[j, part] = np.column_stack(slopes)
         if leg.is_motor and first[j] == j:
-            stated = "angles_at_zero" if leg.reads_angle else "zeros"
             h = leg.reading_of(_STEP * size)
-            moved = [with_zeros(base, {leg.motor_label: side * h}) for side in (1.0, -1.0)]
-            errors.append((leg.motor_label, "zeros", stated, moved, h))
-    J = [(vector(plus) - vector(minus)) / (2.0 * h) for *_, (plus, minus), h in errors]
-    names, kinds, sigmas = zip(*(one[:3] for one in errors), strict=True)
-    return names, kinds, sigmas, np.array(J).T, vector(base)
+            plus, minus = (vector(with_zeros(base, {leg.motor_label: by})) for by in (h, -h))
+            found[j, "zero"] = (plus - minus)[:, None] / (2.0 * h)
+    return found, vector(base)
 
 
 def with_zeros(legs: Sequence[Leg], zeros: Mapping[str, float]) -> tuple[Leg, ...]:

@@ -79,10 +79,7 @@ def platform_by_parameters(
 
     Rotation vectors in R_b come first [rad], displacements of the origin of R_e second [m].
 
-    Raises
-    ------
-    NotIdentifiable
-        If the readings do not determine a pose.
+    Raises NotIdentifiable if the readings do not determine a pose.
     """
     return pose_sensitivity(legs, parametrization, frame_legs, *Frames.of(T_Rb_Re))
 
@@ -139,10 +136,8 @@ def platform_accuracy(
 ) -> PlatformAccuracy | None:
     """Return the accuracy of calibrated legs at the platform.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the readings of a pose do not determine it: the machine is singular there.
+    Raises NotIdentifiable if the readings of a pose do not determine it: the machine is singular
+    there.
     """
     if not machine.is_determined:
         return None

@@ -145,17 +145,10 @@ class Contributions:
         is_own = np.array([": " in name for name in self.names])
         shared, with_own = np.flatnonzero(~is_own), self.known[:, is_own].any(axis=1)
         rows = marginal_rows(np.concatenate([self.all_gains(), self.known[with_own]]), shared)
-        return self._stacked(
-            tuple(self.names[i] for i in shared), rows, self.known[~with_own][:, shared]
-        )
-
-    def _stacked(self, names: tuple[str, ...], rows: Array, known: Array) -> Contributions:
-        """Return rows (m, n) as those of one image."""
-        nothing = np.zeros((1, len(rows)))
-        site = np.zeros(1, dtype=np.intp)
-        return Contributions(
-            names, rows[None], known, self.basis, nothing, site, np.zeros((1, len(rows), 0))
-        )
+        names, known = tuple(self.names[i] for i in shared), self.known[~with_own][:, shared]
+        nothing, site = np.zeros((1, len(rows), 0)), np.zeros(1, dtype=np.intp)
+        no_errors = np.zeros((1, len(rows)))  # all rows count as those of one image
+        return Contributions(names, rows[None], known, self.basis, no_errors, site, nothing)
 
     def repeated(self, times: float) -> Contributions:
         """Return the information of *times* photographs in place of each one."""
@@ -264,7 +257,7 @@ def information_of_images(
     problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
     state = problem.begin(start)
     images = _Images(problem.weighted(NoiseModel()), state, noise)
-    return images.contributions([v.name for v in measurements.views], known_length, is_fit=is_fit)
+    return images.contributions(measurements.view_names, known_length, is_fit=is_fit)
 
 
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
@@ -467,30 +460,17 @@ class PredictedNoise:
 
     By default shared errors are about the largest of a simulated machine
     (``benchmarks/shared_errors.py``): plans that count on less rely on it.
-
-    Attributes
-    ----------
-    sigma_px : float
-        Standard deviation of an edge in one pixel of length; that of an outline at both of its
-        ends falls with the root of its length [px].
-    correlation : float
-        Of the errors at both ends: -0.5 where errors of pixels are independent.
-    common_px : tuple of float
-        Standard deviations of the common-mode edge biases, in the order of their kinds [px].
-    places_px : tuple of float
-        Standard deviations of bias and tilt of an edge at a place [px].
-    gamma_px : float
-        How far an outline moves with the logarithm of the gamma, which counts as not known [px].
-    source : str
-        Where it is from, in words.
     """
 
+    # Standard deviation of an edge in one pixel of length [px]; that of an outline at both of its
+    # ends falls with the root of its length
     sigma_px: float = 0.35
-    correlation: float = 0.0
+    correlation: float = 0.0  # of errors at both ends: -0.5 where those of pixels are independent
+    # standard deviations of the common-mode edge biases, in the order of their kinds [px]
     common_px: tuple[float, ...] = (0.045, 0.003, 0.033, 0.009, 0.014, 0.005)
-    places_px: tuple[float, ...] = (0.024, 0.023)
-    gamma_px: float = 0.1
-    source: str = "what photographs of simulated machines show"
+    places_px: tuple[float, ...] = (0.024, 0.023)  # of bias and tilt of an edge at a place [px]
+    gamma_px: float = 0.1  # motion of an outline with ln gamma, which counts as not known [px]
+    source: str = "what photographs of simulated machines show"  # where it is from, in words
 
     def of(self, outlines: Outlines) -> Outlines:
         """Return outlines with the covariance and the dependence on gamma that are predicted."""

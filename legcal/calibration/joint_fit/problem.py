@@ -61,10 +61,12 @@ from legcal.estimation.problem import (
     EstimationProblem,
     Frames,
     GaussianPrior,
+    Linearization,
     Variables,
     all_free,
     fixed_at_start,
 )
+from legcal.estimation.solver import NormalEquations
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.equations import freedoms
@@ -270,6 +272,10 @@ class FitProblem(EstimationProblem[State]):
         )
 
 
+FitLinear = Linearization[FitProblem, State]
+FitNormal = NormalEquations[FitProblem, State]
+
+
 def build_fit(
     legs: FittedLegs,
     measurements: Measurements,
@@ -285,18 +291,15 @@ def build_fit(
     The images need not determine the parameters (:meth:`FitProblem.require_determined`); more may
     follow.
 
-    Raises
-    ------
-    DatasetError
-        If an outline cannot be used.
+    Raises DatasetError if an outline cannot be used.
     """
-    names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
-    owners = shared_cameras(names, given)
     cameras = tuple(
-        _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
+        _with_values(camera, owner, choices)
+        for camera, owner in zip(measurements.cameras, measurements.owners, strict=True)
     )
     observed = observed_arrays(measurements, legs, outlines, board, cameras, edges)
-    n_poses, images = measurements.n_poses, _images(measurements)
+    places = zip(measurements.view.tolist(), measurements.pose.tolist(), strict=True)
+    images, n_poses = dict(zip(places, row_names(measurements), strict=True)), measurements.n_poses
     return _build_problem(legs, observed, cameras, n_poses, images, settings, choices)
 
 
@@ -308,12 +311,6 @@ def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
         if f"{owner}.{key}" in choices.values
     }
     return with_intrinsics(camera, given) if given else camera
-
-
-def _images(measurements: Measurements) -> dict[tuple[int, int], str]:
-    """Return the names of images by view and pose."""
-    places = zip(measurements.view.tolist(), measurements.pose.tolist(), strict=True)
-    return dict(zip(places, row_names(measurements), strict=True))
 
 
 def _build_problem(

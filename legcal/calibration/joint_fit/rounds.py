@@ -153,10 +153,10 @@ def first_minimum(
     determined = of_determined_poses(claimed, minimum.state, all_outlines)
     problem = original.weighted(NoiseModel(), determined)
     linear = linearize(problem, minimum.state)
-    cost = robust_cost(problem, linear, loss)
+    cost = robust_cost(linear, loss)
     if is_rough:  # one wrong reading would outweigh all else
         rough = with_inflated_reading_noise(problem)
-        cost = robust_cost(rough, linearize(rough, minimum.state), loss)
+        cost = robust_cost(linearize(rough, minimum.state), loss)
     return Minimum(minimum.state, linear, cost, minimum.iterations)
 
 
@@ -168,10 +168,8 @@ def fit_in_rounds(problem: FitProblem, first: Minimum[State], held: HeldDirectio
     each other in many images bend a fit until outlines contradict it: they get rough standard
     deviations then, so that what is wrong with them can be named.
 
-    Raises
-    ------
-    DidNotConverge
-        If a minimisation fails, most outlines are outliers, or the rounds do not converge.
+    Raises DidNotConverge if a minimisation fails, most outlines are outliers, or the rounds do not
+    converge.
     """
     if len(held.basis):
         problem, state = held_at_nominal(problem, first.state, held)
@@ -272,7 +270,7 @@ def _linearized(fit: Fit) -> Fit:
 
 def _scores_of_biases(fit: Fit, possible: EdgeBiases) -> tuple[Array, Array]:
     """Scores of all candidate biases at the minimum for the noise of a fit."""
-    return scores_of_block(*with_edge_biases(fit.problem, fit.state, possible), "biases")
+    return scores_of_block(linearize(*with_edge_biases(fit.problem, fit.state, possible)), "biases")
 
 
 def _without_wrong_readings(
@@ -304,16 +302,15 @@ def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], 
     there anyway. In photographs, biases of a leg in a view have a least size beside their estimate,
     and edges of bodies errors that they keep in all images of a view.
     """
-    problem, state, linear = fit.problem, fit.state, fit.minimum.linear
+    problem, linear = fit.problem, fit.minimum.linear
     whitening, o = problem.factor("outlines").whitening, problem.outlines
     sizes, shifts = dict[str, float](), [np.zeros((len(o), 2, 0))]
     if fit.edge_biases.are_shown or o.polished:
         at_places = shifts_at_places(o, fit.accepted)
         sigma = least_at_places(o, at_places)
         if fit.edge_biases.are_shown and at_places.size:
-            plain = normal_equations(problem, state, linear)
             columns = {"outlines": whitening @ at_places}
-            shown = sigmas_at_places(*score_test(problem, linear, plain, columns))
+            shown = sigmas_at_places(*score_test(normal_equations(linear), columns))
             sigma = np.maximum(np.repeat(shown, at_places.shape[2] // len(shown)), sigma)
         if sigma.any():
             shifts.append(at_places * sigma)
@@ -333,10 +330,8 @@ def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], 
         columns["edges"] = EDGE_SHARE * problem.edges.lines_in_views(of_edges > 0.0)
     if not columns:
         return None
-    normal = information(problem, state, linear, problem.loss)
-    moved = np.concatenate(
-        [response(problem, linear, normal, {name: c}) for name, c in columns.items()], axis=1
-    )
+    normal = information(linear, problem.loss)
+    moved = np.concatenate([response(normal, {name: c}) for name, c in columns.items()], axis=1)
     return sizes, moved @ moved.T
 
 
@@ -381,9 +376,9 @@ def _noise(fit: Fit, included: NoiseModel) -> NoiseModel:
     if not fit.accepted.any():
         return fit.noise
     claimed, used = problem.outlines.covariance, weight > 0.0
-    normal = information(problem, fit.state, linear, problem.loss)
+    normal = information(linear, problem.loss)
     L = np.linalg.cholesky(fit.noise.covariance(claimed))[used]
-    share = leverage(problem, linear, normal, "outlines")[used]
+    share = leverage(normal, "outlines")[used]
     explained = L @ share @ np.swapaxes(L, -1, -2)  # weighted, as the squares are
     offsets = np.einsum("nij,nj->ni", L, linear["outlines"].r[used])
     return estimate_noise(offsets, explained, claimed[used], weight[used], included)
@@ -397,9 +392,7 @@ def _with_edge_noise(fit: Fit) -> Fit:
     edges, settings = fit.problem.edges, fit.problem.settings
     if not len(edges):
         return fit
-    linear = fit.minimum.linear
-    normal = information(fit.problem, fit.state, linear, fit.problem.loss)
-    share = leverage(fit.problem, linear, normal, "edges")[:, 0, 0]
+    share = leverage(information(fit.minimum.linear, fit.problem.loss), "edges")[:, 0, 0]
     offsets = edges.rows(fit.problem.keys, fit.state).r[:, 0] / edges.sigma
     scale = _scale_by_median(offsets**2, MEDIAN_OF_1, share)
     agrees = np.abs(offsets) <= settings.rejection * scale
@@ -442,12 +435,11 @@ def _refuse_disagreement(fit: Fit) -> None:
 def _with_corner_noise(problem: FitProblem, state: State) -> FitProblem:
     """Estimate the noise of corners from their residuals, and reject outliers."""
     linear, settings = linearize(problem, state), problem.settings
-    normal = information(problem, state, linear, problem.loss)
-    judged = problem
+    normal, judged = information(linear, problem.loss), problem
     for board in problem.boards:
         if not len(board):
             continue
-        rows, share = linear[board.name], leverage(problem, linear, normal, board.name)
+        rows, share = linear[board.name], leverage(normal, board.name)
         norms = rows.squared_norms
         scale = _scale_by_median(norms, MEDIAN_OF_2, 0.5 * np.einsum("nqq->n", share))
         agrees = norms <= (scale * settings.rejection) ** 2
@@ -535,10 +527,7 @@ def check_convergence(
 
     *claimed* are the covariances (n, 2, 2) of the outlines [px^2].
 
-    Raises
-    ------
-    DidNotConverge
-        If these changes are large.
+    Raises DidNotConverge if these changes are large.
     """
     if changes.converged(settings):
         return ()

@@ -19,12 +19,11 @@ from legcal.calibration.joint_fit.diagnostics import stated_parameters
 from legcal.calibration.joint_fit.factors import measured_lengths
 from legcal.calibration.joint_fit.held_out import Posterior, with_weights
 from legcal.calibration.joint_fit.parameter_choices import board_scale, joints_of_length
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitLinear, FitProblem
 from legcal.calibration.joint_fit.sensitivity import kinematic_steps
-from legcal.calibration.joint_fit.variables import State
 from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.estimation.problem import Linearization, linearize
+from legcal.estimation.problem import linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
 from legcal.estimation.uncertainty import residual_changes, response, score_test, size_left
 from legcal.files.schema import few
@@ -79,9 +78,7 @@ def explaining_missing_scale(problem: FitProblem) -> Iterator[None]:
         ) from None
 
 
-def sensitivity_to_scale(
-    problem: FitProblem, state: State, linear: Linearization, covariance: Array
-) -> dict[str, Array]:
+def sensitivity_to_scale(linear: FitLinear, covariance: Array) -> dict[str, Array]:
     """Return the change of parameters with one sigma of a scale that no sigma of the fit contains.
 
     *covariance* is of the kept unknowns. Where radii alone say the scale, it is the relative change
@@ -89,12 +86,13 @@ def sensitivity_to_scale(
     Where motors slide, their readings are exact in the fit, but screws and belts are not: they
     share an error of which boards and stated lengths say as much as they know, by its score.
     """
+    problem, state = linear.problem, linear.state
     if (travel := _travel(problem)).any():
         columns = {"readings": _whitened_travel(problem, travel)[..., None]}
-        normal = normal_equations(problem, state, linear)
-        (score,), ((information,),) = score_test(problem, linear, normal, columns)
+        normal = normal_equations(linear)
+        (score,), ((information,),) = score_test(normal, columns)
         off = size_left(score, information, problem.legs.sigma_travel)
-        moved = kinematic_steps(problem, response(problem, linear, normal, columns))
+        moved = kinematic_steps(problem, response(normal, columns))
         return {ALL_READINGS: off * moved}
     parametrization = problem.legs.parametrization
     column = parametrization.place[:, LegColumns.LENGTH]
@@ -181,21 +179,11 @@ def single_witness(problem: FitProblem) -> str:
 
 @dataclass(frozen=True)
 class NominalSize:
-    """What the nominal model says of the size of the machine.
+    """What the nominal model says of the size of the machine."""
 
-    Attributes
-    ----------
-    by_parameter : Array
-        (p,) relative size of the machine by changes of parameters, those of the problem.
-    excess : float
-        By how much the fitted machine is larger than the nominal one, relatively.
-    sigma : float
-        Standard deviation of the size of a machine built to its model, relative.
-    """
-
-    by_parameter: Array
-    excess: float
-    sigma: float
+    by_parameter: Array  # (p,) relative size by changes of parameters, those of the problem
+    excess: float  # by how much the fitted machine is larger than the nominal one, relatively
+    sigma: float  # standard deviation of the size of a machine built to its model, relative
 
 
 @dataclass(frozen=True)
@@ -210,23 +198,12 @@ class Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class ScaleComparison:
-    """How large the machine is by each witness, the radii and the nominal model.
+    """How large the machine is by each witness, the radii and the nominal model."""
 
-    Attributes
-    ----------
-    witnesses : tuple of str
-        In words.
-    size : Array
-        (n,) relative sizes, up to a common one.
-    covariance : Array
-        (n, n) of their differences.
-    steps : Array
-        (p, n) error of the fitted kinematic parameters by a witness that is too large by one unit.
-    """
-
-    witnesses: tuple[str, ...]
-    size: Array
-    covariance: Array
+    witnesses: tuple[str, ...]  # in words
+    size: Array  # (n,) relative sizes, up to a common one
+    covariance: Array  # (n, n) of their differences
+    # (p, n) error of the fitted kinematic parameters by a witness that is too large by one unit
     steps: Array
 
     @property
@@ -280,13 +257,12 @@ def compare_scales(posterior: Posterior, nominal: NominalSize) -> ScaleCompariso
     of the fit, without another fit; as the size of the machine is open then, the first one's is
     zero. The nominal model has no part in the fit.
     """
-    state = posterior.state
-    problem = with_weights(posterior.problem, state)
-    linear = linearize(problem, state)
-    errors = _errors(problem, state, linear)
+    problem = with_weights(posterior.problem, posterior.state)
+    linear = linearize(problem, posterior.state)
+    errors = _errors(linear)
     if not errors:
         return None
-    normal = normal_equations(problem, state, linear)
+    normal = normal_equations(linear)
     stacked = {
         factor.name: np.stack(
             [e.factors.get(factor.name, np.zeros((factor.n, factor.n_rows))) for e in errors], -1
@@ -294,10 +270,10 @@ def compare_scales(posterior: Posterior, nominal: NominalSize) -> ScaleCompariso
         for factor in problem.factors
     }
     priors = np.stack([e.priors for e in errors], axis=-1)
-    score, information = score_test(problem, linear, normal, stacked)
+    score, information = score_test(normal, stacked)
     by_priors = linear.prior_J.T @ priors
     moved_by_priors = -normal.moved_by(by_priors)
-    moved = response(problem, linear, normal, stacked)
+    moved = response(normal, stacked)
     crossed = by_priors.T @ moved
     score = score + priors.T @ linear.prior_r
     information = (
@@ -327,9 +303,9 @@ def compare_scales(posterior: Posterior, nominal: NominalSize) -> ScaleCompariso
     )
 
 
-def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_Error]:
+def _errors(linear: FitLinear) -> list[_Error]:
     """Return the errors of all witnesses in a fit, those of radii last."""
-    priors = problem.priors
+    problem, priors = linear.problem, linear.problem.priors
     names = [problem.named[i] for i in priors.unknown.tolist()]
     by_mean = -priors.mean / priors.sigma
     no_prior = np.zeros(len(names))
@@ -343,7 +319,7 @@ def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_E
     boards = [board_scale(corners.link) for corners in problem.boards if len(corners)]
     if fixed := [name for name in boards if problem.choices.holds(name)]:
         size = np.array([[float(board_scale(link) in fixed)] for link in LINKS])
-        by_size = residual_changes(problem, linear, "board_scale", size)
+        by_size = residual_changes(linear, "board_scale", size)
         errors.append(_Error(BOARD, by_size, of_priors(boards)))
     elif set(boards) & set(names):
         errors.append(_Error(BOARD, {}, of_priors(boards)))
@@ -355,7 +331,7 @@ def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_E
             error = np.where(at, -distances.length / distances.sigma, 0.0)[:, None]
             errors.append(_Error(words, {"lengths": error}, no_prior))
         else:
-            held = _of_held(problem, state, linear, stated)
+            held = _of_held(linear, stated)
             if held or set(stated) & set(names):
                 errors.append(_Error(words, held, of_priors(stated)))
     radii = problem.block("radii").labels
@@ -366,12 +342,10 @@ def _errors(problem: FitProblem, state: State, linear: Linearization) -> list[_E
     return errors
 
 
-def _of_held(
-    problem: FitProblem, state: State, linear: Linearization, names: Collection[str]
-) -> dict[str, Array]:
+def _of_held(linear: FitLinear, names: Collection[str]) -> dict[str, Array]:
     """Return the changes of residuals by held parameters that are too large by one unit."""
-    parametrization, held = problem.legs.parametrization, problem.choices.fixed
-    values = problem.legs.vector(state.legs)
+    legs, held = linear.problem.legs, linear.problem.choices.fixed
+    parametrization, values = legs.parametrization, legs.vector(linear.state.legs)
     lengths = [
         value if name in names and name in held else 0.0
         for name, value in zip(parametrization.names, values.tolist(), strict=True)
@@ -380,4 +354,4 @@ def _of_held(
         return {}
     place = parametrization.place
     error = np.where(place >= 0, np.array(lengths)[place], 0.0)
-    return residual_changes(problem, linear, "legs", error)
+    return residual_changes(linear, "legs", error)

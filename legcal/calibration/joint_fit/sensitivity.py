@@ -15,10 +15,9 @@ from typing import Literal
 import numpy as np
 
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.problem import FitLinear, FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State, intrinsic_of
-from legcal.estimation.problem import Linearization
-from legcal.estimation.solver import NormalEquations, normal_equations
+from legcal.estimation.solver import normal_equations
 from legcal.estimation.uncertainty import Projected, Scores, response, size_left
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import ParameterId
@@ -36,7 +35,7 @@ _SIGNIFICANT = 5.0  # standard deviations
 
 
 def sensitivity_to_cameras(
-    cameras: CameraResiduals, normal: NormalEquations, contradicted: Sequence[WrongIntrinsic]
+    cameras: CameraResiduals, normal: FitNormal, contradicted: Sequence[WrongIntrinsic]
 ) -> dict[str, Array]:
     """Return how the corrections of contradicted intrinsics change the parameters, if any are.
 
@@ -45,17 +44,18 @@ def sensitivity_to_cameras(
     """
     if not contradicted:
         return {}
-    problem, linear, place = cameras.problem, cameras.linear, _camera_columns(cameras.problem)
+    problem, place = cameras.problem, _camera_columns(cameras.problem)
     error = np.sum([one.error for one in contradicted], axis=0)
     of_priors = np.zeros(problem.n_kept + 1)
     of_priors[place] = error
     pull = problem.priors.whitened(of_priors[problem.priors.unknown])
-    changes = {
-        name: _efficiency(problem, name) * change[..., None]
-        for name, change in cameras.changes(np.where(place == problem.n_kept, error, 0.0)).items()
-    }
-    steps = response(problem, linear, normal, changes)
-    steps += normal.kept_covariance() @ linear.prior_J.T @ pull[:, None]
+    changes = dict[str, Array]()
+    for name, change in cameras.changes(np.where(place == problem.n_kept, error, 0.0)).items():
+        factor = problem.factor(name)
+        weight = problem.loss.efficiency(factor.n_rows) if factor.robust else 1.0
+        changes[name] = weight * change[..., None]
+    steps = response(normal, changes)
+    steps += normal.kept_covariance() @ normal.linear.prior_J.T @ pull[:, None]
     return {FITTED_CAMERA: kinematic_steps(problem, steps)}
 
 
@@ -101,12 +101,6 @@ def _camera_columns(problem: FitProblem) -> IntArray:
         if key in problem.keys:
             place[:, k] = problem.columns["cameras"][:, problem.keys.index(key)]
     return place
-
-
-def _efficiency(problem: FitProblem, name: str) -> float:
-    """Efficiency of the loss for a factor."""
-    factor = problem.factor(name)
-    return problem.loss.efficiency(factor.n_rows) if factor.robust else 1.0
 
 
 def _camera_error(state: State, relative: Mapping[str, float], added: Mapping[str, float]) -> Array:
@@ -207,9 +201,17 @@ class WrongIntrinsic:
 class CameraResiduals:
     """Score tests of the cameras of a fit, from the residuals at its minimum."""
 
-    problem: FitProblem
-    state: State
-    linear: Linearization
+    linear: FitLinear
+
+    @property
+    def problem(self) -> FitProblem:
+        """The joint fit."""
+        return self.linear.problem
+
+    @property
+    def state(self) -> State:
+        """Its minimum."""
+        return self.linear.state
 
     @cached_property
     def derivatives(self) -> dict[str, Array]:
@@ -229,9 +231,9 @@ class CameraResiduals:
         }
 
     @cached_property
-    def _plain(self) -> NormalEquations:
+    def _plain(self) -> FitNormal:
         """The normal equations of plain squares."""
-        return normal_equations(self.problem, self.state, self.linear)
+        return normal_equations(self.linear)
 
     def changes(self, error: Array) -> dict[str, Array]:
         """Return the change of whitened residuals (n, q) by errors (n_views, 5) of cameras."""
@@ -245,7 +247,7 @@ class CameraResiduals:
     def response(self, error: Array) -> Array:
         """Return the steps (n_kept, 1) of the unknowns with errors (n_views, 5) of cameras."""
         columns = {name: change[..., None] for name, change in self.changes(error).items()}
-        return response(self.problem, self.linear, self._plain, columns)
+        return response(self._plain, columns)
 
     def zoomed(self, view: int) -> dict[str, Array]:
         """Return the change of whitened residuals (n, q) by an error of a view's focal length."""
@@ -353,5 +355,4 @@ class CameraResiduals:
             name: np.stack([change[name] for change in changes], axis=-1)
             for name in self.derivatives
         }
-        projected = Projected.of(self.problem, self.linear, self._plain, columns)
-        return projected.at(np.arange(len(errors)))
+        return Projected.of(self._plain, columns).at(np.arange(len(errors)))

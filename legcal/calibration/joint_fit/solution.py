@@ -30,8 +30,8 @@ from legcal.calibration.joint_fit.outline_errors import (
     NoiseModel,
     notes_on_blur,
 )
-from legcal.calibration.joint_fit.parameter_choices import known_parameters
-from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.parameter_choices import dataset_parameters
+from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
 from legcal.calibration.joint_fit.scale import sensitivity_to_scale
 from legcal.calibration.joint_fit.sensitivity import (
@@ -44,11 +44,13 @@ from legcal.calibration.joint_fit.sensitivity import (
 from legcal.calibration.joint_fit.variables import State
 from legcal.data.dataset import Dataset
 from legcal.data.image_tables import Order, inverse, reorder_measurements
-from legcal.data.outlines import Outlines
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, polished_parts
 from legcal.data.reasons import Reason, Rejection
 from legcal.estimation.problem import linearize
-from legcal.estimation.solver import NormalEquations, robust_cost
+from legcal.estimation.solver import robust_cost
 from legcal.estimation.uncertainty import WorstDirection, named_covariance, worst_directions
+from legcal.geometry.motions import components
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import (
     Leg,
@@ -56,7 +58,10 @@ from legcal.machine.leg import (
     radius_name,
     with_platform_points,
 )
+from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries, parametrize, vector_of
+from legcal.machine.rods import ends_in_base, measured_readings
+from legcal.perception.placement import Placement, placed_arms
 from legcal.vision.camera import Camera
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
@@ -124,10 +129,6 @@ class Estimates:
     def vector(self, names: Sequence[str]) -> Array:
         """Return the values of named parameters, (len(names),)."""
         return np.array([self.values[name] for name in names])
-
-    def with_values(self, values: Mapping[str, float]) -> Estimates:
-        """Replace the values of named parameters."""
-        return replace(self, values={**self.values, **values})
 
     def transformed(
         self, values: Mapping[str, float], free: Collection[str], C: Array, by_fit: Array
@@ -225,28 +226,51 @@ class Solution:
         """Return T_base_camera of every view, with R_b at its nominal pose in the base."""
         return tuple(T_base_Rb * T.inv() for T in self.T_camera_Rb)
 
+    def shown_cameras(
+        self, measurements: Measurements, T_base_Rb: RigidTransform
+    ) -> tuple[RigidTransform | None, ...]:
+        """Return T_base_camera of the views with an outline in the fit, None of others."""
+        shown = np.unique(measurements.view[self.outlines.row[self.outlines.used]])
+        cameras = self.cameras_in_base(T_base_Rb)
+        return tuple(T if v in shown else None for v, T in enumerate(cameras))
+
+    def placement(
+        self,
+        machine: Machine,
+        measurements: Measurements,
+        T_Rb_Re: Sequence[RigidTransform] | None = None,
+        blur: Sequence[float] = (),
+    ) -> Placement:
+        """Return the legs and cameras of the fit, with R_b on the nominal one.
+
+        At its own poses, or at those of other images of the same views.
+        """
+        T_base_Rb, poses = machine.T_base_Rb, components(T_Rb_Re or self.T_Rb_Re)
+        q = measured_readings(self.legs, *poses, measurements.q_of_poses)
+        A, B = (ends[measurements.pose] for ends in ends_in_base(self.legs, T_base_Rb, *poses, q))
+        arms = placed_arms(self.legs, q, measurements.pose, T_base=T_base_Rb, radii=self.radii)
+        cameras, polished = self.cameras_in_base(T_base_Rb), polished_parts(self.outlines)
+        return Placement.of_fit(A, B, cameras, blur, arms, polished)
+
 
 def assemble_solution(
     fit: Fit,
-    normal: NormalEquations,
+    normal: FitNormal,
     held: HeldDirections,
     outlines: Outlines,
     label: str,
 ) -> Solution:
     """Assemble the solution; *normal* is the information at the minimum.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the inliers do not determine the parameters.
+    Raises NotIdentifiable if the inliers do not determine the parameters.
     """
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     kept = normal.kept_covariance()
     if fit.absorbed is not None:
         kept = kept + fit.absorbed[1]
-    covariance = named_covariance(problem, state, kept)
+    covariance = named_covariance(linear, kept)
     quality = _goodness_of_fit(fit, normal, len(held.basis))
-    cameras = CameraResiduals(problem, state, linear)
+    cameras = CameraResiduals(linear)
     contradicted = tuple(cameras.contradicted())
     gammas = _gammas(problem, state, kept, outlines)
     return Solution(
@@ -270,7 +294,7 @@ def assemble_solution(
         gammas=gammas,
         sensitivities=sensitivity_to_cameras(cameras, normal, contradicted)
         | sensitivity_to_exact_cameras(cameras)
-        | sensitivity_to_scale(problem, state, linear, kept)
+        | sensitivity_to_scale(linear, kept)
         | sensitivity_to_intrinsics(problem, kept),
         outlines=_with_rejections(outlines, fit),
         start=label,
@@ -286,24 +310,24 @@ def assemble_solution(
             *reversed_motors(problem, state),
             *map(str, gammas),
             *notes_on_blur(fit.edge_biases, problem.outlines.covariance[fit.accepted]),
-            *contradicted_radii(problem, state, normal),
+            *contradicted_radii(normal),
             *map(str, contradicted),
         ),
     )
 
 
-def _goodness_of_fit(fit: Fit, normal: NormalEquations, n_held: int) -> GoodnessOfFit:
+def _goodness_of_fit(fit: Fit, normal: FitNormal, n_held: int) -> GoodnessOfFit:
     """Residual statistics of a fit with *n_held* held directions."""
     problem, state, linear = fit.problem, fit.state, fit.minimum.linear
     offsets = problem.offsets(state)
     used = offsets[fit.accepted]
-    readings = judged_readings(problem, state, linear, normal)
+    readings = judged_readings(normal)
     n_rejected = offsets.size - used.size + (0 if readings is None else len(readings.wrong))
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
     claimed = problem.weighted(NoiseModel())
     return GoodnessOfFit(
-        cost=robust_cost(claimed, linearize(claimed, state), claimed.loss),
+        cost=robust_cost(linearize(claimed, state), claimed.loss),
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
         dof=n_residuals - problem.n_unknowns + n_held,
         rms_px=rms(used),
@@ -357,7 +381,9 @@ def _estimates(
     status |= dict.fromkeys(held.names, "weak")
     names = tuple(name for name in values if status[name] == "estimated")
     indices = [problem.named.index(name) for name in names]
-    estimated, prior_sigma = covariance[np.ix_(indices, indices)], _prior_sigma(problem)
+    estimated, of_files = covariance[np.ix_(indices, indices)], set(problem.calibrated.tolist())
+    stated = zip(problem.priors.unknown.tolist(), problem.priors.sigma.tolist(), strict=True)
+    prior_sigma = {problem.named[i]: sigma for i, sigma in stated if i in of_files}
     ranked = [i for i, name in enumerate(names) if name not in prior_sigma]
     weak = worst_directions(
         estimated[np.ix_(ranked, ranked)],
@@ -373,13 +399,6 @@ def _estimates(
         prior_sigma,
         weak,
     )
-
-
-def _prior_sigma(problem: FitProblem) -> dict[str, float]:
-    """Return standard deviations of intrinsics in camera files, by name."""
-    priors, of_files = problem.priors, set(problem.calibrated.tolist())
-    stated = zip(priors.unknown.tolist(), priors.sigma.tolist(), strict=True)
-    return {problem.named[i]: sigma for i, sigma in stated if i in of_files}
 
 
 def _kinematic(
@@ -422,37 +441,25 @@ def _with_rejections(outlines: Outlines, fit: Fit) -> Outlines:
 
 
 def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solution:
-    """Reorder a solution from the order of work to the order of the dataset's files.
+    """Reorder a solution from an order of work to that of the files, in which the dataset is.
 
-    Parameters
-    ----------
-    solution : Solution
-        In the order of work.
-    order : Order
-        The order of work.
-    dataset : Dataset
-        In the order of the files.
-
-    Returns
-    -------
-    Solution
-        B of legs fixed to the platform is at the point that model files use.
+    B of legs fixed to the platform is then at the point that model files use.
     """
-    machine, measurements = dataset.machine, dataset.measurements
+    machine = dataset.machine
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
     origin = np.asarray(machine.T_platform_Re.inv().translation)
     geometry = with_platform_points([solution.legs[j] for j in legs], machine.frame_legs, origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
-    parameters = known_parameters(machine, measurements.views, boards=dataset.boards).by_name
     names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     steps = _indices_of(parametrization.names, solution.kinematic.parametrization.names)
     vector = vector_of(parametrization, geometry, geometries(machine)).tolist()
-    estimates = solution.estimates.with_values(
-        dict(zip(parametrization.names, vector, strict=True))
-    )
-    poses = _pose_order(order, dataset).tolist()
+    estimates, values = solution.estimates, dict(zip(parametrization.names, vector, strict=True))
+    estimates = replace(estimates, values={**estimates.values, **values})
+    of_rows = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
+    worked_pose = dict(zip(dataset.measurements.pose.tolist(), of_rows.tolist(), strict=True))
+    poses = [worked_pose[pose] for pose in range(dataset.measurements.n_poses)]
     file_pose = {worked: pose for pose, worked in enumerate(poses)}
     readings = solution.quality.redundant_readings
     return replace(
@@ -462,7 +469,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         cameras=tuple(solution.cameras[v] for v in views),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses),
         radii=dict(sorted(radii.items())),
-        estimates=estimates.in_order(tuple(parameters)),
+        estimates=estimates.in_order(tuple(dataset_parameters(dataset).by_name)),
         kinematic=solution.kinematic.in_order(parametrization),
         sensitivities={what: moved[steps] for what, moved in solution.sensitivities.items()},
         outlines=order.restore(solution.outlines),
@@ -477,12 +484,3 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
 def _indices_of(names: Sequence[str], among: tuple[str, ...]) -> IntArray:
     """Return the indices of names in a permutation of them."""
     return np.array([among.index(name) for name in names], dtype=np.intp)
-
-
-def _pose_order(order: Order, dataset: Dataset) -> IntArray:
-    """Index in the order of work of every pose of the dataset."""
-    pose = dataset.measurements.pose
-    pose_in_work_order = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
-    work_pose = np.empty(dataset.measurements.n_poses, dtype=np.intp)
-    work_pose[pose] = pose_in_work_order
-    return work_pose

@@ -593,26 +593,16 @@ def start_from(
 
 def platform_poses(
     geometry: Sequence[Leg],
+    # (n_poses, n_legs): s q of actuated legs [m], and q of rods on actuators [m, rad]; NaN where
+    # unknown. Others are ignored
     lengthening: Array,
-    T_Rb_Re: Sequence[RigidTransform],
+    T_Rb_Re: Sequence[RigidTransform],  # poses nearby, in the right assembly mode
     frame_legs: Sequence[int],
 ) -> tuple[RigidTransform, ...]:
     """Solve the forward kinematics for all poses.
 
     Where no pose has the readings (parameters far from the truth), the least-squares pose is
     returned: a fit can still start there.
-
-    Parameters
-    ----------
-    geometry : sequence of Leg
-        The legs in R_b and R_e.
-    lengthening : (n_poses, n_legs) array
-        s q of actuated legs [m], and q of rods on actuators [m, rad]; NaN where unknown. Others are
-        ignored.
-    T_Rb_Re : sequence of RigidTransform
-        Poses nearby, in the right assembly mode.
-    frame_legs : sequence of int
-        The legs that define R_b and R_e.
     """
     solved = solve_poses(geometry, frame_legs, *Frames.of(T_Rb_Re), lengthening)
     return Frames(solved.R, solved.t).motions

@@ -29,7 +29,6 @@ from legcal.machine.urdf import Urdf, UrdfPatch
 
 LocatedFrame = Literal["base", "tool"]
 PoseComponent = Literal["position", "orientation"]
-Direction = tuple[float, float, float]
 LocationStatus = Literal["located", "located in part", "doubtful"]
 NAMES = tuple(
     f"{frame}.{component}"
@@ -163,17 +162,12 @@ def open_parts_in_words(parts: list[OpenPart]) -> str:
 
 def direction_words(v: Array | tuple[float, ...]) -> str:
     """Return a direction as text with two digits."""
-    v = _signed(np.asarray(v) / np.linalg.norm(v))
+    v = signed(np.asarray(v) / np.linalg.norm(v))
     return "(" + ", ".join(f"{x:.3g}" for x in np.round(v, 2) + 0.0) + ")"
 
 
-def direction_of(v: Array) -> Direction:
-    """Return a unit vector (3,) with its largest component positive, as numbers."""
-    x, y, z = _signed(v).tolist()
-    return x, y, z
-
-
-def _signed(v: Array) -> Array:
+def signed(v: Array) -> Array:
+    """Return a vector (3,) or its opposite, with its largest component positive."""
     return np.asarray(v if v[np.argmax(np.abs(v))] > 0.0 else -v)
 
 

@@ -22,8 +22,8 @@ from legcal.calibration.location.document import (
     LocatedFrame,
     OpenPart,
     PoseComponent,
-    direction_of,
     open_parts_in_words,
+    signed,
 )
 from legcal.calibration.location.frames import (
     N_STEP,
@@ -417,21 +417,6 @@ def _open_directions(
     return V[:, (s < RANK_TOLERANCE * s[0]) | (s * _MAX_SIGMA < 1.0)]
 
 
-def _shown_elsewhere(
-    basis: Array,  # (12, k): undetermined directions of the measured poses
-    # (m, 12): derivatives of poses all over the workspace by a step, both in units of the machine's
-    # length and radians; the noise does not enter
-    jacobian: Array,
-    *,
-    oriented: bool,
-) -> Array:
-    """Return the undetermined directions (12, k) that other poses of the machine determine."""
-    s, V = _directions(jacobian, oriented)
-    undetermined = V[:, s < _MACHINE_TOLERANCE * s[0]]
-    U, s, _ = np.linalg.svd(basis - undetermined @ (undetermined.T @ basis), full_matrices=False)
-    return np.asarray(U[:, s > 0.5])
-
-
 def _least_determined(measurements: ToolMeasurements, fit: FrameFit, k: int) -> Array:
     """Return the k least determined directions (12, k) of a fit."""
     V = _directions(fit.frame_design, measurements.is_oriented)[1]
@@ -453,7 +438,7 @@ def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
         if frame == "base":
             rows = frames[0, :, :3].T @ rows
         U, s, _ = np.linalg.svd(rows, full_matrices=False)
-        directions = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
+        directions = [signed(u).tolist() for u in U[:, s > _PART_TOLERANCE].T]
         if directions:
             parts.append(OpenPart(frame=frame, kind=kind, directions=directions))
     return parts
@@ -476,10 +461,13 @@ def _workspace(measurements: ToolMeasurements) -> PosePairs:
 def _check_machine(measurements: ToolMeasurements, fit: FrameFit, basis: Array, name: str) -> None:
     """Refuse directions that other poses would determine or that holding the tool does not fix."""
     pairs = measurements.pairs
+    # Derivatives of poses all over the workspace; the noise does not enter
     design = jacobian(fit.frames, _workspace(measurements)) * pairs.unit[:, None] * pairs.scale
-    resolvable = _shown_elsewhere(
-        basis, design.reshape(-1, N_STEP), oriented=measurements.is_oriented
-    )
+    s, V = _directions(design.reshape(-1, N_STEP), measurements.is_oriented)
+    open_everywhere = V[:, s < _MACHINE_TOLERANCE * s[0]]
+    shown = basis - open_everywhere @ (open_everywhere.T @ basis)
+    U, s, _ = np.linalg.svd(shown, full_matrices=False)
+    resolvable = np.asarray(U[:, s > 0.5])
     start = f"{name}: base and tool could not be located, because"
     if resolvable.shape[1]:
         raise NotIdentifiable(

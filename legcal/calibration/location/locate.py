@@ -258,10 +258,10 @@ def _judge(
     determined: Determinacy,
     held_at: Array,  # (3,): position of the tool in the platform where it is not determined [m]
 ) -> Location:
-    frame_fit = determined.fit
+    frame_fit, oriented = determined.fit, measurements.is_oriented
     p_value, too_large = _tested(frame_fit)
     base, tool = transforms(frame_fit.frames)
-    if not measurements.is_oriented:
+    if not oriented:
         tool = RigidTransform.from_translation(tool.translation)
     tool_position, tool_angle = _at_the_tool(measurements, determined)
     left_out = measurements.poses.numbers[~inliers.is_inlier].tolist()
@@ -273,12 +273,18 @@ def _judge(
         poses=name,
         T_world_base=base,
         T_platform_tool=tool,
-        has_tool_orientation=measurements.is_oriented,
+        has_tool_orientation=oriented,
         covariance=0.5 * (determined.covariance + determined.covariance.T),
         held=determined.held,
         held_at=(float(held_at[0]), float(held_at[1]), float(held_at[2])),
         held_words=determined.words,
-        noise=_noise(measurements, frame_fit),
+        noise=MeasurementNoise(
+            position=float(frame_fit.noise.sigma[0]),
+            angle=float(frame_fit.noise.sigma[1]) if oriented else None,
+            position_stated=measurements.noise.stated[0],
+            angle_stated=measurements.noise.stated[1] and oriented,
+            model=measurements.by_model is not None,
+        ),
         rows=tuple(_rows(measurements, inliers, frame_fit)),
         chi2=frame_fit.chi2,
         dof=frame_fit.dof,
@@ -310,17 +316,6 @@ def _tested(frame_fit: FrameFit) -> tuple[float | None, str]:
         if ratios[k] > 1.0
     ]
     return p_value, " and ".join(large) if p_value < _MIN_P else ""
-
-
-def _noise(measurements: ToolMeasurements, frame_fit: FrameFit) -> MeasurementNoise:
-    sigma, oriented = frame_fit.noise.sigma, measurements.is_oriented
-    return MeasurementNoise(
-        position=float(sigma[0]),
-        angle=float(sigma[1]) if oriented else None,
-        position_stated=measurements.noise.stated[0],
-        angle_stated=measurements.noise.stated[1] and oriented,
-        model=measurements.by_model is not None,
-    )
 
 
 def _rows(

@@ -110,7 +110,8 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     joints = machine.motor_names
     sheet = read = None
     columns: dict[str, str] = {}  # meaning of the other headings
-    header = _first_line(path)
+    text = content_of(path, "table of tool poses").decode("utf-8-sig", errors="replace")
+    header = next((line for line in text.splitlines() if line.strip()), "")
     if not any(re.search(rf"\b{re.escape(joint)}\b", header) for joint in joints):
         sheet = ReadingsSheet(path, machine, "pose")
         read = sheet.readings()
@@ -160,12 +161,6 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         columns={} if sheet is None else {**sheet.taken, **columns},
         unit="m and rad" if read is None else f"{read.unit}, {read.unit_from}",
     )
-
-
-def _first_line(path: Path) -> str:
-    """Return the first line of a file that is not blank."""
-    text = content_of(path, "table of tool poses").decode("utf-8-sig", errors="replace")
-    return next((line for line in text.splitlines() if line.strip()), "")
 
 
 def _tool_columns(
