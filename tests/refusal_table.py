@@ -875,14 +875,15 @@ def _outside() -> Iterable[Refusal]:
 
 def _formats() -> Iterable[Refusal]:
     """What another format cannot mean."""
-    connect = '<connect body1="leg1_end" body2="leg1_seat" anchor="0 0 0"/>'
+    connect = '<connect name="loop_1" solref="0.001 1" site1="loop_1_1" site2="loop_1_2"/>'
+    by_bodies = '<connect body1="leg1_end" body2="leg1_seat" anchor="0 0 0"/>'
     joint = '<freejoint name="platform_free"/>'
     slide = '<joint name="leg1_prismatic" type="slide"'
-    motor, world = '<position joint="leg1_prismatic"/>', "<worldbody>"
-    body_2, size = '<body name="leg2_end"', 'type="capsule" size="0.01"'
+    motor = '<position name="leg1_prismatic" joint="leg1_prismatic" kp="10000.0"/>'
+    world, body_2, size = "<worldbody>", '<body name="leg2_end"', 'type="capsule" size="0.01"'
 
     def tied(old: str, new: str) -> tuple[str, str]:
-        return connect, connect.replace(old, new)
+        return connect, by_bodies.replace(old, new)
 
     def added(text: str) -> tuple[str, str]:
         return world, f"{world}{text}"
@@ -909,7 +910,7 @@ def _formats() -> Iterable[Refusal]:
         ("two-turns", (body_2, body_2 + ' euler="0 0 1"'), ("one orientation",)),
         ("quat", ('quat="1.0 0.0 0.0 0.0"', 'quat="0 0 0 0"'), ("no orientation",)),
         ("range", ('range="-0.004 0.144"', 'range="1 -1"'),
-         (", line 9: joint 'leg1_prismatic'", "1 to -1")),
+         (", line 17: joint 'leg1_prismatic'", "1 to -1")),
         ("grad", (world, f'<compiler angle="grad"/>{world}'), ("angle='grad'", "degree")),
         ("eulerseq", (world, f'<compiler eulerseq="xyw"/>{world}'), ("eulerseq='xyw'",)),
         ("class", added('<body childclass="no"/>'), ("default class 'no'",)),
@@ -979,8 +980,7 @@ def _in_utf_16(folder: Path) -> None:
 def _second_mechanism(folder: Path) -> None:
     path = folder / "machine.xml"
     text = path.read_text()
-    second = text.replace('="leg', '="second_leg').replace('"platform', '"second_platform')
-    second = second.replace('"base"', '"second_base"')
+    second = re.sub('="(leg|loop|platform)', r'="second_\1', text)
     body = second[second.index("<body") : second.index("</worldbody>")]
     tail = second[second.index("<equality>") : second.index("</mujoco>")]
     text = text.replace("</worldbody>", f"{body}</worldbody>")

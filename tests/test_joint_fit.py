@@ -304,12 +304,6 @@ def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(small: Mach
     assert not found.left_out
 
 
-def noisy(name: str) -> MachineSession:
-    session = machine_session(name)
-    measurements, outlines = session.noisy(0)
-    return replace(session, measurements=measurements, outlines=outlines)
-
-
 def in_the_hand(session: MachineSession, start: Start) -> tuple[Measurements, Start]:
     """Return the session with a camera position of its own for every image."""
     m = session.measurements

@@ -58,18 +58,11 @@ def _concurrent() -> MachineSpec:
     return MachineSpec(tuple(legs), RigidTransform.identity(), frame_legs=(0, 3), normal=z)
 
 
-REDUNDANT: dict[str, Callable[[], MachineSpec]] = {
-    "7-UPS": lambda: of_types(["US"] * 7),
+MACHINES: dict[str, Callable[[], MachineSpec]] = {
     "4-RPR": lambda: planar(kinds=("actuated",) * 4),
     "2-RPS + 2-SPS + rod": lambda: of_types(
         ["RS", "RS", "SS", "SS", "SS"], ["actuated"] * 4 + ["constant"]
     ),
-}
-SEVERAL: dict[str, Callable[[], MachineSpec]] = {
-    "4-UPS + 2-SPS + RPS": lambda: of_types(["US"] * 4 + ["SS"] * 2 + ["RS"]),
-}
-OTHERS: dict[str, Callable[[], MachineSpec]] = {
-    "5-UPS": lambda: of_types(["US"] * 5),
     "three motors about a point": _concurrent,
 }
 
@@ -77,8 +70,7 @@ OTHERS: dict[str, Callable[[], MachineSpec]] = {
 @cache
 def machine_of(name: str) -> Machine:
     """Return a machine that is written and loaded once."""
-    spec = (REDUNDANT | SEVERAL | OTHERS)[name]()
-    return load_mechanism(write_machine(Path(mkdtemp()), spec, Layout()))
+    return load_mechanism(write_machine(Path(mkdtemp()), MACHINES[name](), Layout()))
 
 
 def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose() -> None:
