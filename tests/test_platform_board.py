@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import yaml
 from dataset_folder import Folder, folder
-from fit_sessions import T_RE_BOARD, MachineSession, machine_session, with_boards
+from fit_sessions import T_RE_BOARD, machine_session, with_boards
 from simulated import settings
 
 from legcal import calibrate, evaluate, identifiability, load_dataset, load_mechanism, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
-from legcal.calibration.joint_fit.fit import refine
 from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError
@@ -37,25 +36,20 @@ CHESSBOARD: dict[str, Any] = {
 ON_PLATFORM = {"on": "platform"}
 
 
-def _off(session: MachineSession, legs: Any) -> float:
-    fitted, true = session.legs, session.truth.legs
-    return float(np.abs(fitted.vector(legs) - fitted.vector(true)).max())
-
-
 def test_a_board_alone_gives_the_machine_exactly_without_noise() -> None:
     """From joints that are 3 mm and axes that are 1 degree off; no image shows a leg."""
     session = machine_session("hexapod", n_poses=8)
-    assert _off(session, session.start.legs) > 0.002
+    assert session.off(session.start.legs) > 0.002
     seen, start = with_boards(session, base=False)
-    found = refine(session.legs, session.measurements, no_outlines(), start, board=seen)
-    assert _off(session, found.legs) < 1e-7
+    found = replace(session, outlines=no_outlines()).fit(start, board=seen)
+    assert session.off(found.legs) < 1e-7
     assert found.radii == {}
     place = T_RE_BOARD.inv() * found.T_frame_board["platform"]
     assert np.linalg.norm(place.translation) < 1e-7
 
 
 def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_own() -> None:
-    session = machine_session("hexapod", n_poses=15)
+    session = replace(machine_session("hexapod", n_poses=15), outlines=no_outlines())
     m = session.measurements
     seen, start = with_boards(session, seed=3)
     fixed = seen.boards[1]
@@ -64,14 +58,14 @@ def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_o
     px = seen.corners.px + np.where(wrong[:, None], [4.0, -3.0], 0.0)
     sigma = np.where(moved, 0.5, 1.0) * seen.corners.sigma_px  # said to be better than they are
     corners = replace(seen.corners, px=px, sigma_px=sigma)
-    found = refine(session.legs, m, no_outlines(), start, board=replace(seen, corners=corners))
+    found = session.fit(start, board=replace(seen, corners=corners))
     rows = np.unique(seen.corners.row[wrong])
     assert set(found.rejected_corners) == {
         (m.views[m.view[row]].name, int(m.pose[row]), fixed.first + 5) for row in rows
     }
     said = next(note for note in found.notes if "disagree with the fit" in note)
     assert f"{fixed.first + 5} in c1, {row_names(m)[0]}" in said
-    right = refine(session.legs, m, no_outlines(), start, board=seen)
+    right = session.fit(start, board=seen)
     np.testing.assert_allclose(found.estimates.sigma, right.estimates.sigma, rtol=0.1)
     assert found.quality.rms_corners_px["platform"] == pytest.approx(0.05, rel=0.1)
 
