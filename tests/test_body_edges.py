@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_sessions import MachineSession, body_edges, machine_session
-from machines import ROOT
+from machines import copied_model
 from simulated import settings, small_camera, standing
 
 from legcal import calibrate, load_dataset, load_mechanism, simulate
@@ -102,17 +102,12 @@ def test_wrong_edges_are_rejected_and_bodies_may_lean() -> None:
 @pytest.fixture(scope="module")
 def with_bodies(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a hexapod whose legs have square bodies, the second one nothing else."""
-    folder = tmp_path_factory.mktemp("bodies")
-    text = (ROOT / "urdf/hexapod.urdf").read_text()
-    first = re.compile(r'(<link name="leg2_[^"]*">)<visual>.*?</visual>(</link>)')
-    text = first.sub(r"\1\2", text)
-    for j in range(1, 7):
-        text = text.replace(f'<link name="leg{j}_tube">', f'<link name="leg{j}_tube">{BODY}')
-    for kind, content in (("urdf", text), ("models", None)):
-        (folder / kind).mkdir()
-        file = folder / kind / f"hexapod.{'urdf' if content else 'yaml'}"
-        file.write_text(content or (ROOT / "models/hexapod.yaml").read_text())
-    return folder / "models/hexapod.yaml"
+
+    def with_boxes(text: str) -> str:
+        text = re.sub(r'(<link name="leg2_[^"]*">)<visual>.*?</visual>(</link>)', r"\1\2", text)
+        return re.sub(r'<link name="leg\d_tube">', rf"\g<0>{BODY}", text)
+
+    return copied_model(tmp_path_factory.mktemp("bodies"), "hexapod", with_boxes)
 
 
 def test_a_leg_with_a_body_alone_is_identified_and_calibrated(

@@ -8,8 +8,8 @@ import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from csv_rows import read_rows, write_rows
 from dataset_folder import dataset_of_readings
+from edits import GONE, cell, keyed
 from machines import ROOT
-from refusal_table import GONE, cell, keyed
 from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 

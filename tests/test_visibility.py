@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from machines import ROOT
+from machines import copied_model
 
 import legcal
 from legcal.geometry.motions import components, look_at
@@ -146,26 +146,21 @@ def with_solids(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Mac
     Of their meshes one, on both ends, is not convex, the other surrounds the last leg.
     """
     root = tmp_path_factory.mktemp("solids")
-    (root / "models").mkdir()
-    (root / "urdf").mkdir()
     parts = [trimesh.creation.box((0.1, 0.1, 0.01)), trimesh.creation.box((0.01, 0.1, 0.1))]
     angle: Any = trimesh.util.concatenate(parts)
+    (root / "urdf").mkdir()
     angle.export(root / "urdf/angle.stl")
     trimesh.creation.annulus(0.013, 0.02, 0.2).export(root / "urdf/hollow.stl")
 
-    @cache
-    def machine(name: str) -> Machine:
-        text = (ROOT / f"urdf/{name}.urdf").read_text()
+    def with_more(text: str) -> str:
         for link in ("base", "platform"):
             text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{ON_ENDS}</link>')
         for j in range(1, 7):
             stage = f'<link name="leg{j}_tube">'
             text = text.replace(stage, f"{stage}{HOLLOW if j == 6 else HOUSING}{MOTOR}")
-        (root / f"urdf/{name}.urdf").write_text(text)
-        (root / f"models/{name}.yaml").write_text((ROOT / f"models/{name}.yaml").read_text())
-        return legcal.load_mechanism(root / f"models/{name}.yaml")
+        return text
 
-    return machine
+    return cache(lambda name: legcal.load_mechanism(copied_model(root, name, with_more)))
 
 
 def with_hidden(machine: Machine) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
