@@ -48,13 +48,25 @@ def remove(name: str) -> Edit:
     return edit
 
 
-def keyed(name: str, /, **values: Any) -> Edit:
-    """Set keys of a YAML or JSON file; ``a__b`` is b in a, numbers count entries of lists."""
+def document(name: str, change: Callable[[Any], object]) -> Edit:
+    """Change the content of a YAML or JSON file in place."""
 
     def edit(folder: Path) -> None:
         path = folder / name
         is_json = path.suffix == ".json"
         content = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
+        change(content)
+        path.write_text(
+            json.dumps(content) if is_json else yaml.safe_dump(content, sort_keys=False)
+        )
+
+    return edit
+
+
+def keyed(name: str, /, **values: Any) -> Edit:
+    """Set keys of a YAML or JSON file; ``a__b`` is b in a, numbers count entries of lists."""
+
+    def change(content: Any) -> None:
         for key, value in values.items():
             *parents, last = [int(k) if k.isdigit() else k for k in key.split("__")]
             place: Any = content
@@ -64,11 +76,8 @@ def keyed(name: str, /, **values: Any) -> Edit:
                 del place[last]
             else:
                 place[last] = value
-        path.write_text(
-            json.dumps(content) if is_json else yaml.safe_dump(content, sort_keys=False)
-        )
 
-    return edit
+    return document(name, change)
 
 
 def cell(name: str, row: int | None, /, **cells: str) -> Edit:
@@ -161,3 +170,8 @@ def each_row(name: str, change: Callable[[dict[str, str]], object]) -> Edit:
         write_rows(folder / name, rows)
 
     return edit
+
+
+def added(name: str, column: str, amount: float) -> Edit:
+    """Add an amount to a column of a table."""
+    return each_row(name, lambda row: row.update({column: repr(float(row[column]) + amount)}))

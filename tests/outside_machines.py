@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from layouts import EYE, Layout, LegLayout, MachineSpec, Text, numbers, write_machine
-from machines import of_types, planar
+from machines import exechon, of_types, planar
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
@@ -183,6 +184,20 @@ def _axis_off(types: str, angle: float) -> MachineSpec:
     return _with_leg(machine, 0, base_inner=np.cos(angle) * inner + np.sin(angle) * towards)
 
 
+def _turned_exechon(angle: float) -> MachineSpec:
+    """Return an Exechon whose first axis at the base is off its place [rad]."""
+    machine = exechon()
+    axis = np.array(machine.legs[0].base_axis) + angle * Z
+    return _with_leg(machine, 0, base_axis=axis / np.linalg.norm(axis))
+
+
+def _of_nine_decimals(folder: Path) -> Path:
+    path = write_machine(folder, exechon(), Layout())
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(re.sub(r"-?\d\.\d{9,}", lambda x: f"{float(x[0]):.9f}", urdf.read_text()))
+    return path
+
+
 def scaled(machine: MachineSpec, scale: float) -> MachineSpec:
     legs = tuple(replace(leg, A=scale * leg.A, B_home=scale * leg.B_home) for leg in machine.legs)
     home = RigidTransform.from_components(
@@ -319,6 +334,15 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         _specified(partial(scaled, of_types(["US"] * 6), 1e3), Layout(home=False)),
         ("write all lengths",),
     ),
+    "exechon-nearly": (
+        _specified(partial(_turned_exechon, 1e-6)),
+        ("'machine'", "2 of the 5 constraints of its joints follow from the others to 1 mrad"),
+    ),
+    "exechon-off": (
+        _specified(partial(_turned_exechon, 0.02)),
+        ("'machine'", "overconstrained machine (1 of the 5 constraints", "mobility 2"),
+    ),
+    "exechon-digits": (_of_nine_decimals, ("2 of the 5 constraints", "with all digits")),
     "on-one-line": (_specified(_on_one_line), ("base joints of leg1, leg2, leg3",)),
 }
 """What each of them must be told: the reason, the joint or leg, and the amount."""

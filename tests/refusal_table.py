@@ -223,7 +223,13 @@ def _datasets() -> Iterable[Refusal]:
         return keyed("dataset.yaml", **values)
 
     rows: Rows = [
-        ("version", entry(legcal_dataset=2), ("legcal_dataset", "2", "1")),
+        *((f"version-{one!r}", entry(legcal_dataset=one),
+           ("legcal_dataset", f"{one}", "needed version 1; use the legcal that wrote it"))
+          for one in (0, 2, "2")),
+        ("model-gone", entry(mechanism="../models/own.yaml"),
+         ("mechanism could not be used: found '../models/own",)),
+        ("model-misspelt", entry(mechanism="hexapd"),
+         ("found 'hexapd', no file there", "mean 'hexapod'")),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
         ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
         ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
@@ -269,7 +275,7 @@ def _datasets() -> Iterable[Refusal]:
         "dictionary": "DICT_4X4_50",
     }  # fmt: skip
     april = {"kind": "aprilgrid", "tags_x": 6, "tags_y": 6, "tag_size": 0.088, "tag_spacing": 0.3}
-    boards: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+    boards: list[tuple[str, Any, tuple[str, ...]]] = [
         ("square", {**chess, "square": 30}, ("board.square", "30 m", "0.03")),
         ("kind", {**chess, "kind": "chess"}, ("board.kind", "'chess'")),
         ("half-turn", {**chess, "squares_x": 8}, ("8 x 6",)),
@@ -280,6 +286,20 @@ def _datasets() -> Iterable[Refusal]:
         ("few-squares", {**char, "squares_x": 2, "squares_y": 3}, ("2 x 3",)),
         ("tags", {**april, "tags_x": 60, "tags_y": 60}, ("60 x 60", "587")),
     ]
+    up = {"on": "platform"}
+    pose = {"xyz": [0, 0, 0], "quat_xyzw": [0, 0, 0, 1]}
+    two: list[tuple[str, Any, tuple[str, ...]]] = [
+        ("on-tube", char | {"on": "leg1_tube"}, ("board.on", "'leg1_tube'", "base or platform")),
+        ("on-none", char | {"on": None}, ("board.on", "base or platform")),
+        ("two-on-base", [char, chess], ("two boards on the base", "on the platform")),
+        ("same-markers", [char, char | up | {"square": 0.05}], ("DICT_4X4", "apart")),
+        ("same-bits", [char, char | up | {"dictionary": "DICT_4X4_100"}], ("DICT_4X4",)),
+        ("same-squares", [chess, chess | up | {"square": 0.02}], ("numbers of squares",)),
+        ("pose-of-base", char | up | {"T_base_board": pose}, ("T_base_board", "T_platform_board")),
+        ("none", [], ("empty list",)),
+        ("text", [char, "chessboard"], ("'chessboard'", "mapping")),
+    ]
+    boards += [(name, board, ("dataset.yaml", "needed", *named)) for name, board, named in two]
     of_boards = [(name, entry(board=board), named) for name, board, named in boards]
     yield from _spoiled("board", "calibrate {in} -o {out}", "plain", of_boards)
 
@@ -314,6 +334,8 @@ def _in_hand() -> Iterable[Refusal]:
         ("corners-alone", corners(("c1,images/c1_1.png", 6)), ("corners.csv", "no board")),
         ("no-legs", entry(views__c1__legs=[], views__c2__legs=[]),
          ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
+        ("no-legs-on-base", entry(board=board, views__c1__legs=[]),
+         ("views.c1.legs", "no board on the platform, needed")),
     ]  # fmt: skip
     yield from _spoiled("in-hand", "calibrate {in} -o {out}", "plain", rows)
 
@@ -501,6 +523,11 @@ def _tables() -> Iterable[Refusal]:
             ("'up'", "'none'", "'0'", "'x'", "'y'", "row 1", "row 4"),
         ),
         ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
+        (
+            "reach",
+            cell("measurements.csv", 4, **dict.fromkeys(JOINTS[:3], "0.0001")),
+            ("readings of view c1, image p04 could not be used", "needed at most"),
+        ),
     ]
     yield from _spoiled("outlines", "calibrate {in} -o {out}", "3-rpr-outlines", outlines)
 
@@ -519,6 +546,14 @@ def _tables() -> Iterable[Refusal]:
         yield Refusal(
             f"corners-{name}", "calibrate {in} -o {out}", (*said, "row 2"), "plain", edits
         )
+    other = "".join(good.replace(",0,", f",{k},") for k in range(60))
+    yield Refusal(
+        "corners-of-another",
+        "calibrate {in} -o {out}",
+        ("corners up to 59,", "40 on the base"),
+        "plain",
+        (board, text(c, line + other)),
+    )
     yield Refusal(
         "corners-none", "calibrate {in} -o {out}", ("no row",), "plain", (board, text(c, line))
     )
@@ -692,6 +727,15 @@ def _models() -> Iterable[Refusal]:
     )
     yield Refusal(
         "model-written", "inspect {in}/models/hexapod.yaml --write {in}", ("hexapod.yaml",), "model"
+    )
+    half = (text("calibrated.yaml", "closed_loop: []\n"),
+            text("result.json", '{"legcal_result": 1, "mach'))  # fmt: skip
+    yield Refusal(
+        "model-half-a-result",
+        "inspect {in}",
+        ("no whole result.json of a calibration, needed both",),
+        "",
+        half,
     )
     for file, content, named in (
         ("other.xml", b"<a/>", "other.xml"),
@@ -903,6 +947,11 @@ def _new() -> Iterable[Refusal]:
             f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
             (text("m.csv", content),),
         )  # fmt: skip
+    for name, start in (("xlsx", b"PK\x03\x04none"), ("xls", b"\xd0\xcf\x11\xe0none")):
+        yield Refusal(
+            f"workbook-{name}", "new {in}/own.xls --unit mm -o {out}",
+            ("workbook", "save the sheet as CSV"), "", (text("own.xls", start),),
+        )  # fmt: skip
     families: Words = [
         ("6-sps", "6-SPS", ("--family 6-SPS", "--family hexapod --type SPS", "--template")),
         ("3-upu", "3-UPU", ("--family 3-UPU", "hexapod or delta", "--template")),
@@ -1041,6 +1090,10 @@ def _scenes() -> Iterable[Refusal]:
     command = "simulate hexapod -o {out} --level outlines --poses 1"
     far = text("p.csv", f"{','.join(JOINTS)}\n{','.join(['0.5'] * 6)}\n")
     yield Refusal("readings-travel", f"{command} --poses {{in}}/p.csv", ("0.5",), "", (far,))
+    for name, content in (("cut", "{"), ("list", "[]"), ("empty", "{}")):
+        yield Refusal(f"plan-{name}", "simulate 3-rpr --plan {in} --level outlines -o {out}",
+                      ("found no plan.json in it that can be read",), "",
+                      (text("plan.json", content),))  # fmt: skip
     wide = keyed("camera_info.yaml", image_width=20000, image_height=20000)
     yield Refusal("scene-huge", f"{command} --camera {{in}}/camera_info.yaml",
                   ("20000 x 20000", "100000000"), "plain", (wide,))  # fmt: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from edits import keyed
 from fit_sessions import LENS, PINHOLE, MachineSession, irregular_hexapod, machine_session
 from simulated import simulated
 from thinned import thinned
@@ -27,6 +27,7 @@ from legcal.calibration.joint_fit.sensitivity import (
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
+from legcal.vision.camera_file import read_camera
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -220,18 +221,18 @@ def state_covariance(folder: Path, seen: float = 1.0) -> Path:
     Boards were seen in the left part of the image, *seen* of its width.
     """
     (path,) = set(load_dataset(folder).camera_paths)
-    document, names = yaml.safe_load(path.read_text()), ["fy", "fx", "k3"]
+    camera = read_camera(path)
     rows = [[9.0, 8.5, 0.0], [8.5, 9.0, 0.0], [0.0, 0.0, 0.0]]
-    right, bottom = seen * document["image_width"], document["image_height"]
+    right, bottom = seen * camera.width, camera.height
     covered = [[-1.0, -1.0], [right, -1.0], [right, bottom], [-1.0, bottom]]
     block = {
         "version": 1,
         "sigma": {"fx": 3.0},
-        "names": names,
+        "names": ["fy", "fx", "k3"],
         "covariance": rows,
         "covered": covered,
     }
-    path.write_text(yaml.safe_dump(document | {"legcal_camera": block}))
+    keyed(path.name, legcal_camera=block)(path.parent)
     return folder
 
 

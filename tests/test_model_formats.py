@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
+from edits import document
 from model_formats import FORMATS, write_format
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -80,9 +80,7 @@ def test_a_copied_model_says_how_well_the_machine_is_built(
     stated: dict[str, Any], tmp_path: Path
 ) -> None:
     path, _ = write_model(machine_of("hexapod"), tmp_path / "from")
-    document = yaml.safe_load(path.read_text())
-    document["legcal"] |= stated
-    path.write_text(yaml.safe_dump(document))
+    document(path.name, lambda content: content["legcal"].update(stated))(path.parent)
     machine = load_mechanism(path)
     copied = load_mechanism(write_model(machine, tmp_path / "to")[0])
     assert machine.tolerance != machine_of("hexapod").tolerance

@@ -124,11 +124,6 @@ def test_the_expected_error_is_that_of_a_calibration(planned: Plan, shot: Path) 
     assert planned.error is not None
     stated = found.platform.workspace.mean_displacement
     assert planned.error.mean_displacement == pytest.approx(stated, rel=0.25)
-    for text in ("{", "[]", "{}"):
-        (shot / "shot" / "plan.json").write_text(text)
-        settings = SimulationSettings(plan=shot / "shot", level=Level.OUTLINES)
-        with pytest.raises(UsageError, match=r"found no plan\.json in it that can be read"):
-            simulate(load_mechanism("3-rpr"), shot / "again", settings)
 
 
 def tripods(**positions: list[float]) -> list[Place]:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from dataset_folder import Folder, folder
+from dataset_folder import folder
+from edits import keyed
 from fit_sessions import T_RE_BOARD, machine_session, with_boards
 from simulated import settings
 
@@ -18,10 +18,8 @@ from legcal import calibrate, evaluate, identifiability, load_dataset, load_mech
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
-from legcal.errors import DatasetError
 from legcal.simulation.dataset import SimulatedDataset
 from legcal.simulation.settings import Level
-from legcal.vision.board import parse_boards
 
 __all__ = ["folder"]
 
@@ -70,28 +68,6 @@ def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_o
     assert found.quality.rms_corners_px["platform"] == pytest.approx(0.05, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("board", "words"),
-    [
-        (CHARUCO | {"on": "leg1_tube"}, ("board.on", "'leg1_tube'", "base or platform")),
-        (CHARUCO | {"on": None}, ("board.on", "base or platform")),
-        ([CHARUCO, CHESSBOARD], ("two boards on the base", "on the platform")),
-        ([CHARUCO, CHARUCO | ON_PLATFORM | {"square": 0.04}], ("DICT_4X4", "apart")),
-        ([CHARUCO, CHARUCO | ON_PLATFORM | {"dictionary": "DICT_4X4_100"}], ("DICT_4X4",)),
-        ([CHESSBOARD, CHESSBOARD | ON_PLATFORM | {"square": 0.02}], ("numbers of squares",)),
-        (CHARUCO | ON_PLATFORM | {"T_base_board": {"xyz": [0, 0, 0], "quat_xyzw": [0, 0, 0, 1]}},
-         ("T_base_board", "T_platform_board")),
-        ([], ("empty list",)),
-        ([CHARUCO, "chessboard"], ("'chessboard'", "mapping")),
-    ],
-)  # fmt: skip
-def test_boards_that_cannot_be_used_are_refused(board: Any, words: tuple[str, ...]) -> None:
-    with pytest.raises(DatasetError) as caught:
-        parse_boards(board, PATH)
-    (problem,) = caught.value.problems
-    assert [word for word in (str(PATH), "needed", *words) if word not in problem] == []
-
-
 # Datasets
 
 
@@ -105,10 +81,7 @@ def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
     )  # fmt: skip
     made = simulate("hexapod", folder, chosen)
     (folder / "observations.csv").unlink()
-    entry = yaml.safe_load((folder / "dataset.yaml").read_text())
-    for view in entry["views"].values():
-        view["legs"] = []
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(entry))
+    keyed("dataset.yaml", views__c1__legs=[])(folder)
     return made
 
 
@@ -146,10 +119,3 @@ def test_identify_says_what_a_board_on_the_platform_determines() -> None:
     found = identifiability(machine, [["leg1"]], 8, platform_board=True)
     assert found.identifiable
     assert found.platform_board
-
-
-def test_views_without_legs_need_a_board_on_the_platform(folder: Folder) -> None:
-    folder.entry["views"]["c1"]["legs"] = []
-    folder.entry["board"] = CHARUCO
-    with pytest.raises(DatasetError, match=r"views.c1.legs .* no board on the platform, needed"):
-        load_dataset(folder.write())
