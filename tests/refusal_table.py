@@ -469,7 +469,7 @@ def _units() -> Iterable[Refusal]:
     def given(readings: np.ndarray, stated: dict[str, Any]) -> Edit:
         return cast(Edit, partial(dataset_of_readings, readings=readings, entry=stated))
 
-    units: Rows = [(name, given(*of), named) for name, *of, named in rows]
+    units: Rows = [(name, given(q, stated), named) for name, q, stated, named in rows]
     one_gone = given(angles, sigma), cell("measurements.csv", None, servo1="")
     units = [*units, ("open", one_gone, ("servo1", "moves joints at the base"))]
     yield from _cases("units", CALIBRATE, units)
