@@ -93,20 +93,28 @@ def _rod(at: Array, end: Array, tangent: Array) -> list[Joint]:
     return [("revolute", at, tangent), ("revolute", at, inner / np.linalg.norm(inner))]
 
 
+def _arm(
+    drawing: Drawing, j: int, points: Array, axis: Array, on: tuple[str, Array] | None = None
+) -> None:
+    """Add an arm that turns about an axis at the first of points, and two rods to the last."""
+    pivot, elbow, end = points
+    drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+    drawing.motors.append(f"j_arm{j}")
+    for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+        rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+        at = on or ("platform", HEIGHT * Z)
+        drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
+        drawing.legs[name] = f"j_{name}_0"
+
+
 def _couplers() -> Drawing:
     """Return a Delta whose parallelograms end on bars that turn on the platform."""
     drawing = Drawing()
     for j in range(3):
         (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
         end = _around(j, 0.05, HEIGHT)[0]
-        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
         drawing.add(f"bar{j}", "revolute", "platform", end - HEIGHT * Z, axis)
-        drawing.motors.append(f"j_arm{j}")
-        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
-            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
-            on = f"bar{j}", end
-            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=on)
-            drawing.legs[name] = f"j_{name}_0"
+        _arm(drawing, j, np.array([pivot, elbow, end]), axis, (f"bar{j}", end))
     return drawing
 
 
@@ -116,21 +124,14 @@ def _bars(joint: str, n_bars: int) -> Drawing:
     With two hinges they are those of an H4, with one guide those of an I4.
     """
     drawing = Drawing()
+    at = [np.array([0.0, 0.1 * i - 0.05, HEIGHT]) for i in range(n_bars)]
     for i in range(n_bars):
-        drawing.add(f"bar{i}", joint, "platform", np.array([0.0, 0.1 * i - 0.05, 0.0]), Z)
+        drawing.add(f"bar{i}", joint, "platform", at[i] - HEIGHT * Z, Z)
     for j in range(4):
-        turn = Rotation.from_euler("z", 90.0 * j + 45.0, degrees=True)
-        pivot, elbow, end = turn.apply([[0.2, 0, 0], [0.35, 0, 0.1], [0.05, 0, HEIGHT]])
-        axis = turn.apply([0.0, 1.0, 0.0])
-        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
-        drawing.motors.append(f"j_arm{j}")
-        i = j // 2
-        on = (f"bar{i}", np.array([0.0, 0.1 * i - 0.05, HEIGHT])) if i < n_bars else None
-        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
-            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
-            at = ("platform", HEIGHT * Z) if on is None else on
-            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
-            drawing.legs[name] = f"j_{name}_0"
+        turn, i = Rotation.from_euler("z", 90.0 * j + 45.0, degrees=True), j // 2
+        points = turn.apply([[0.2, 0, 0], [0.35, 0, 0.1], [0.05, 0, HEIGHT]])
+        on = (f"bar{i}", at[i]) if i < n_bars else None
+        _arm(drawing, j, points, turn.apply([0.0, 1.0, 0.0]), on)
     return drawing
 
 

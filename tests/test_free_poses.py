@@ -9,10 +9,9 @@ import pytest
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
 from layouts import Layout, MachineSpec, write_machine
-from leg_pictures import clutter, edges, segments
+from leg_pictures import clutter, edges, motion, segments
 from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
 from outline_sessions import made
-from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
@@ -96,18 +95,9 @@ def test_poses_are_found_by_clicks(tmp_path: Path) -> None:
         look_at(1.1 * np.array([np.cos(a), np.sin(a), 0.4]), np.array([0.0, 0.0, 0.2]))
         for a in (0.4, 2)
     ]
-    rough = [
-        T
-        * RigidTransform.from_components(
-            rng.normal(0.0, 0.01, 3), Rotation.from_rotvec(rng.normal(0.0, 0.015, 3))
-        )
-        for T in true
-    ]
+    rough = [T * motion(rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.015, 3)) for T in true]
     T = [
-        machine.home
-        * RigidTransform.from_components(
-            rng.uniform(-0.06, 0.06, 3), Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3))
-        )
+        machine.home * motion(rng.uniform(-0.06, 0.06, 3), rng.uniform(-0.2, 0.2, 3))
         for _ in range(3)
     ]
     B = np.array([one.apply(machine.B_platform) for one in T])[[0, 1, 2, 2]]
