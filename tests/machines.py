@@ -121,6 +121,13 @@ def copied_model(folder: Path, name: str, change: Callable[[str], str] = str) ->
     return model
 
 
+def by_hand(folder: Path, motors: Sequence[str] = ()) -> Path:
+    """Copy the files of the shipped hexapod with some of its motors, and return the YAML."""
+    path = copied_model(folder, "hexapod")
+    keyed(path.name, name_mot=list(motors))(path.parent)
+    return path
+
+
 def written_with(
     nominal: Machine, legs: Sequence[Leg], folder: Path, home: RigidTransform | None = None
 ) -> Machine:

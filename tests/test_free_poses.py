@@ -1,7 +1,6 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,12 @@ from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
 from layouts import Layout, MachineSpec, write_machine
 from leg_pictures import clutter, edges, motion, segments
-from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
+from machines import by_hand, of_types
 from outline_sessions import made
 from simulated import settings, small_camera
 
 import legcal
-from legcal import LegcalError, Machine, load_mechanism, simulate
+from legcal import LegcalError, load_mechanism, simulate
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
@@ -47,16 +46,6 @@ def drawn(kind: str) -> MachineSpec:
     return of_types(types, kinds)
 
 
-def without_motors(machine: Path, *left: str) -> Path:
-    """Write a model with some of its motors only."""
-    text = machine.read_text()
-    for line in text.split("name_mot:")[1].split("\njoint_name")[0].splitlines():
-        if line.strip(" -") and line.strip(" -") not in left:
-            text = text.replace(f"{line}\n", "", 1)
-    machine.write_text(text if left else text.replace("name_mot:\n", "name_mot: []\n"))
-    return machine
-
-
 # --- ranks --------------------------------------------------------------------------------------
 
 
@@ -80,17 +69,8 @@ def test_ranks_are_those_of_a_dense_jacobian(
 # --- recognition --------------------------------------------------------------------------------
 
 
-@cache
-def by_hand(n_motors: int, folder: Path) -> Machine:
-    """The shipped hexapod with some of its motors."""
-    path = folder / "hexapod.yaml"
-    path.write_text(SHIPPED_YAML.read_text().replace("../urdf/hexapod.urdf", str(SHIPPED_URDF)))
-    motors = [f"leg{j}_prismatic" for j in range(1, n_motors + 1)]
-    return load_mechanism(without_motors(path, *motors))
-
-
 def test_poses_are_found_by_clicks(tmp_path: Path) -> None:
-    machine, rng = by_hand(0, tmp_path), np.random.default_rng(0)
+    machine, rng = load_mechanism(by_hand(tmp_path)), np.random.default_rng(0)
     true = [
         look_at(1.1 * np.array([np.cos(a), np.sin(a), 0.4]), np.array([0.0, 0.0, 0.2]))
         for a in (0.4, 2)
@@ -216,7 +196,7 @@ def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
 
 def free_set(folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Return a dataset of a hexapod of three motors, of whose views one has no rough camera."""
-    machine = by_hand(3, tmp_path)
+    machine = load_mechanism(by_hand(tmp_path, [f"leg{j}_prismatic" for j in (1, 2, 3)]))
     monkeypatch.setattr("legcal.data.dataset.load_mechanism", lambda path: machine)
     folder.columns = folder.columns[:5]
     folder.entry["views"]["c2"].pop("legs")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from command_line import run
 from csv_rows import read_rows
+from edits import keyed
 from pool_work import OtherProcess
 from scipy.spatial.transform import RigidTransform
 
@@ -238,10 +239,7 @@ def test_a_session_by_hand_is_shot_with_its_board_where_the_plan_lays_it(
     assert all(view.hand_held for view in shot.measurements.views)
     assert shot.corners is not None
     assert len(shot.corners.row) == 4 * held.board.board.n_corners
-    wide = held.document()["tolerance"] | {"camera_rad": 3.0}
-    (tmp_path / "session" / "plan.json").write_text(
-        json.dumps(held.document() | {"tolerance": wide})
-    )
+    keyed("plan.json", tolerance__camera_rad=3.0)(tmp_path / "session")
     with pytest.raises(
         DatasetError, match=r"tolerance.camera_rad .* found 3.0, needed 0.8 or less"
     ):
