@@ -16,9 +16,10 @@ from outline_sessions import NONCOPLANAR, closed_poses, moved_poses, true_machin
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners
-from legcal.calibration.joint_fit.fit import DEFAULT_SETTINGS, refine
+from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import (
+    DEFAULT_SETTINGS,
     FittedLegs,
     RefinementSettings,
     Start,

@@ -42,8 +42,10 @@ def assert_same_analysis(found: Machine, expected: Machine) -> None:
         assert (leg.prismatic, leg.travel) == (wanted.prismatic, wanted.travel)
         for key in ("A", "B", "q0", "base_axis", "platform_axis", "twist"):
             assert _difference(getattr(leg, key), getattr(wanted, key)) < 1e-9, key
-        pieces = [[(c.radius, c.start, c.end) for c in one.cylinders] for one in (leg, wanted)]
-        np.testing.assert_allclose(*pieces, atol=1e-9)
+        parts, others = (
+            np.array([(c.radius, c.start, c.end) for c in one.cylinders]) for one in (leg, wanted)
+        )
+        np.testing.assert_allclose(parts, others, atol=1e-9)
     np.testing.assert_allclose(found.home.as_matrix(), expected.home.as_matrix(), atol=1e-9)
 
 
