@@ -288,11 +288,6 @@ def found() -> Location:
     return locate(shipped("hexapod"), made("hexapod", 5).poses)
 
 
-@pytest.fixture(scope="module")
-def in_part() -> Location:
-    return locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
-
-
 def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(tmp_path: Path) -> None:
     hexapod = made("hexapod", 5)
     position = hexapod.poses.position.copy()
@@ -351,9 +346,8 @@ def _machine_with(folder: Path, extra: str) -> Path:
 JOINT = '<joint name="{0}_j" type="fixed"><parent link="{1}"/><child link="{0}"/>{2}</joint>\n'
 
 
-def test_links_of_another_meaning_are_refused(
-    found: Location, in_part: Location, tmp_path: Path
-) -> None:
+def test_links_of_another_meaning_are_refused(found: Location, tmp_path: Path) -> None:
+    in_part = locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
     for link in ("world", "tool"):
         links = f'<link name="{link}"/>' + JOINT.format(link, "base", "")
         with pytest.raises(UsageError, match=f"found a link '{link}' that is not"):

@@ -18,7 +18,6 @@ from legcal import calibrate, evaluate, identifiability, load_dataset, load_mech
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
-from legcal.simulation.dataset import SimulatedDataset
 from legcal.simulation.settings import Level
 
 __all__ = ["folder"]
@@ -71,31 +70,26 @@ def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_o
 # Datasets
 
 
-@pytest.fixture(scope="module")
-def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
-    """A dataset with corners of both boards, whose views name no leg and have no rough pose."""
-    folder = tmp_path_factory.mktemp("boards") / "d"
+@pytest.mark.system
+def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
+    tmp_path: Path,
+) -> None:
+    """No view names a leg."""
+    folder = tmp_path / "d"
     chosen = settings(
         level=Level.OUTLINES, poses=15, views=1, board="charuco", platform_board="charuco",
         sigma_px=0.02, hints=False, seed=1,
     )  # fmt: skip
-    made = simulate("hexapod", folder, chosen)
+    of_boards = simulate("hexapod", folder, chosen)
     (folder / "observations.csv").unlink()
     keyed("dataset.yaml", views__c1__legs=[])(folder)
-    return made
-
-
-@pytest.mark.system
-def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
-    of_boards: SimulatedDataset, tmp_path: Path
-) -> None:
-    assert identifiability_of_dataset(load_dataset(of_boards.folder)).platform_board
-    calibration = calibrate(of_boards.folder, output=tmp_path / "r")
+    assert identifiability_of_dataset(load_dataset(folder)).platform_board
+    calibration = calibrate(folder, output=tmp_path / "r")
     assert "steps need legs in sight: there is no staged.yaml" in calibration.summary()
     result = json.loads((tmp_path / "r/result.json").read_text())
-    truth = json.loads((of_boards.folder / "truth/truth.json").read_text())
+    truth = json.loads((folder / "truth/truth.json").read_text())
     error, nominal = (
-        evaluate(model, of_boards.truth_path, dataset=of_boards.folder).displacement.mean()
+        evaluate(model, of_boards.truth_path, dataset=folder).displacement.mean()
         for model in (tmp_path / "r/calibrated.yaml", of_boards.nominal)
     )
     assert error < 3.0 * result["platform"]["sigma_dX_m"]
