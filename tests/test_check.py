@@ -78,6 +78,15 @@ def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path)
     assert files_of(images) == before
 
 
+def test_many_images_contradict_a_result_of_few_by_no_more_than_its_errors(
+    result: Path, images: Path, tmp_path: Path
+) -> None:
+    calibrate(images, output=tmp_path / "few")
+    found = check(result.parent / "set", tmp_path / "few")
+    assert not found.movement.moved
+    assert found.movement.p_value > found.movement.significance
+
+
 def test_an_encoder_that_slipped_is_found_with_its_size(
     result: Path, images: Path, tmp_path: Path
 ) -> None:
