@@ -513,11 +513,6 @@ def _tables() -> Iterable[Refusal]:
             ("'up'", "'none'", "'0'", "'x'", "'y'", "row 1", "row 4"),
         ),
         ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
-        (
-            "reach",
-            cell("measurements.csv", 4, **dict.fromkeys(JOINTS[:3], "0.0001")),
-            ("readings of view c1, image p04 could not be used", "needed at most"),
-        ),
     ]
     yield from _cases("outlines", CALIBRATE, outlines, "3-rpr-outlines")
 
@@ -820,6 +815,8 @@ def _formats() -> Iterable[Refusal]:
          (swap("machine.xml", motor, '<position joint="leg1"/>'),
           swap("machine.xml", connect, '<connect body1="x" body2="y" anchor="0 0 0"/>')),
          ("'leg1'", "'x'", "'y'")),
+        ("no-sites", swap("machine.xml", "<site ", "<camera ", -1),
+         ("the site 'loop_1_1' as site1", "there are none")),
         ("inactive", swap("machine.xml", "<connect ", '<connect active="false" ', -1),
          ("without <connect> or <weld>",)),
         ("two-mechanisms", _second_mechanism,

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from csv_rows import read_rows, write_rows
-from edits import keyed
+from edits import cell, keyed
 from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 import legcal
 from legcal import Calibration, Machine, calibrate
-from legcal.errors import DidNotConverge, NotVisible
+from legcal.errors import DatasetError, DidNotConverge, NotVisible
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -80,6 +80,19 @@ def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_pa
     calibrated = tmp_path / "out" / "calibrated.yaml"
     apart = legcal.evaluate(calibrated, made_set.truth_path, dataset=made_set.folder)
     assert apart.displacement.max() < 2e-4
+
+
+def test_a_reading_out_of_reach_is_named(tmp_path: Path) -> None:
+    model = legcal.load_mechanism("3-rpr")
+    poses = with_pose(tmp_path, model, READINGS[0])
+    folder = simulated(tmp_path / "set", "3-rpr", poses=poses, views=1).folder
+    cell("measurements.csv", 4, **dict.fromkeys(model.motor_names, "0.0001"))(folder)
+    with pytest.raises(
+        DatasetError, match=r"readings of view c1, image p04 could not be used"
+    ) as refused:
+        calibrate(folder)
+    assert "needed at most" in str(refused.value)
+    assert len(refused.value.problems) == 1
 
 
 @pytest.mark.usefixtures("without_remedies")
