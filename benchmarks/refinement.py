@@ -49,7 +49,8 @@ def shortest_ms(call: Callable[[], object], repeats: int = REPEATS) -> float:
 def measure(n_images: int, with_scipy: bool) -> None:
     """Print one row: sizes and times of a session; then what SciPy needs."""
     session = irregular_hexapod(n_images // 3)
-    (measurements, outlines), start = session.noisy(0), session.start
+    noisy, start = session.noisy(0), session.start
+    measurements, outlines = noisy.measurements, noisy.outlines
     building = shortest_ms(lambda: build_fit(session.legs, measurements, outlines))
     problem = build_fit(session.legs, measurements, outlines)
     begin = problem.begin(start)

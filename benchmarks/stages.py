@@ -99,7 +99,7 @@ def _print_times() -> None:
     """Print how long the default steps take, and the largest memory of the process until then."""
     print(f"{'images':>8} {'median':>10} {'an image':>10} {'memory':>10}")
     for n_images, n_runs in ((45, 7), (450, 3)):
-        session = machine_session(COPLANAR, n_poses=n_images // 3).with_noise(1.0, 0)
+        session = machine_session(COPLANAR, n_poses=n_images // 3).noisy(0)
         seconds = []
         for _ in range(n_runs):
             begin = perf_counter()
@@ -129,7 +129,7 @@ def _print_errors(n_draws: int) -> None:
 
 def _errors(name: str, noise: float, seed: int) -> dict[str, tuple[float, float]]:
     """Return the platform errors of the nominal model and of each criterion that ends."""
-    session = machine_session(name, n_poses=15).with_noise(noise, seed)
+    session = machine_session(name, n_poses=15).noisy(seed, noise)
     found = {"nominal": _platform_error(name, session.nominal.legs)}
     for criteria in CRITERIA:
         try:

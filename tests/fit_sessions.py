@@ -9,13 +9,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from outline_sessions import NONCOPLANAR, closed_poses, moved_poses, true_machine
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners
-from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.variables import (
+    DEFAULT_SETTINGS,
+    FittedLegs,
+    RefinementSettings,
+    Start,
+    fitted_legs,
+    start_from,
+)
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, unmeasured
@@ -79,18 +89,37 @@ class MachineSession:
     truth: Start
     start: Start
 
-    def noisy(self, seed: int | np.random.Generator) -> tuple[Measurements, Outlines]:
-        """Return readings and outlines with the errors that they claim."""
-        rng, m = np.random.default_rng(seed), self.measurements
+    def noisy(self, seed: int | np.random.Generator, noise: float = 1.0) -> MachineSession:
+        """Return the session with the errors that it claims, those of outlines times a factor."""
+        rng, m, o = np.random.default_rng(seed), self.measurements, self.outlines
         q = m.q + m.sigma_q * rng.standard_normal(m.q.shape)
-        return replace(m, q=q), observe.noisy_outlines(self.outlines, m.views[0].camera, rng)
+        claimed = replace(o, covariance=noise**2 * o.covariance)
+        outlines = observe.noisy_outlines(claimed, m.views[0].camera, rng)
+        return replace(self, measurements=replace(m, q=q), outlines=outlines)
 
-    def with_noise(self, noise: float, seed: int) -> MachineSession:
-        """Return the session with the errors of its readings and outlines, times a factor."""
-        covariance = noise**2 * self.outlines.covariance
-        claimed = replace(self, outlines=replace(self.outlines, covariance=covariance))
-        measurements, outlines = claimed.noisy(seed)
+    def with_readings(self, q: Array) -> MachineSession:
+        """Return the session with other readings (n_poses, n_legs)."""
+        return replace(self, measurements=replace(self.measurements, q=q))
+
+    def moved(self, offsets: Array) -> MachineSession:
+        """Return the session with outlines moved across themselves by (n, 2) pixels at ends."""
+        camera = self.measurements.views[0].camera
+        return replace(self, outlines=moved_outlines(self.outlines, camera, offsets))
+
+    def with_camera(self, camera: Camera) -> MachineSession:
+        """Return the same pixels, taken for those of another camera."""
+        measurements, outlines = with_camera(self.measurements, self.outlines, camera)
         return replace(self, measurements=measurements, outlines=outlines)
+
+    def fit(
+        self,
+        start: Start | Sequence[Start] | None = None,
+        settings: RefinementSettings = DEFAULT_SETTINGS,
+        **others: Any,
+    ) -> Solution:
+        """Return the fit of all data, from the start of the session where none is given."""
+        begin = self.start if start is None else start
+        return refine(self.legs, self.measurements, self.outlines, begin, settings, **others)
 
     @property
     def nominal(self) -> NominalMachine:
@@ -113,10 +142,16 @@ class MachineSession:
         """Return the errors of the kinematic parameters of legs [m, rad]."""
         return self.legs.vector(tuple(legs)) - self.legs.vector(self.truth.legs)
 
+    def off(self, legs: Sequence[Leg]) -> float:
+        """Return the largest of these errors."""
+        return float(np.abs(self.errors(legs)).max())
 
-def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outlines:
-    """Return outlines moved across themselves by (n, 2) pixels at their ends."""
-    return moved_outlines(outlines, session.measurements.views[0].camera, offsets)
+    def squares(self, found: Solution) -> float:
+        """Return e' C^-1 e of the kinematic parameters over their number: 1 by rights."""
+        e, C = self.errors(found.legs), found.kinematic.value_covariance
+        sigma = np.sqrt(np.diagonal(C))
+        z = e / sigma
+        return float(z @ np.linalg.solve(C / np.outer(sigma, sigma), z)) / len(e)
 
 
 @cache

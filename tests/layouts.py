@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
@@ -162,10 +163,7 @@ def write_machine(folder: Path, description: MachineSpec, layout: Layout) -> Pat
     if len(names) >= len(description.frame_legs):
         block["base_frame"] = [names[j] for j in description.frame_legs]
     if layout.home:
-        block["home"] = {
-            "xyz": [float(x) for x in description.home.translation],
-            "quat_xyzw": [float(x) for x in description.home.rotation.as_quat()],
-        }
+        block["home"] = motion_to_xyz_quat(description.home)
     document = {
         "closed_loop": loops,
         "type": kinds,

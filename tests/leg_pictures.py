@@ -53,10 +53,13 @@ def platform(rng: np.random.Generator | None = None) -> RigidTransform:
     """Return where a platform stands: anywhere, or right above the base."""
     if rng is None:
         return RigidTransform.from_translation([0.0, 0.0, 0.38])
-    turn = Rotation.from_rotvec(rng.uniform(-0.25, 0.25, 3))
-    return RigidTransform.from_components(
-        [*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.36, 0.42)], turn
-    )
+    turn = rng.uniform(-0.25, 0.25, 3)
+    return motion([*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.36, 0.42)], turn)
+
+
+def motion(xyz: Sequence[float] | Array, turn: Sequence[float] | Array) -> RigidTransform:
+    """Return the motion of a translation [m] and a rotation vector [rad]."""
+    return RigidTransform.from_components(xyz, Rotation.from_rotvec(turn))
 
 
 def camera(rng: np.random.Generator) -> RigidTransform:

@@ -6,15 +6,18 @@ from typing import Any
 
 import numpy as np
 import yaml
+from edits import GONE, keyed
 from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
 from legcal.descriptions.new_model import Created, Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
+from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegKind, main_cylinders
+from legcal.machine.leg import Leg, LegKind, main_cylinders
 from legcal.machine.model import Machine
+from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -103,19 +106,36 @@ def displaced(T: RigidTransform, step: Sequence[float] | Array) -> RigidTransfor
 
 def write_home(folder: Path, name: str, home: RigidTransform | None) -> Path:
     """Write the YAML of a shipped model with another home, or none, and return it."""
-    document = yaml.safe_load((ROOT / "models" / f"{name}.yaml").read_text())
-    block = document["legcal"]
-    block["urdf"] = str(ROOT / "urdf" / f"{name}.urdf")
-    if home is None:
-        del block["home"]
-    else:
-        block["home"] = {
-            "xyz": [float(x) for x in home.translation],
-            "quat_xyzw": [float(x) for x in home.rotation.as_quat()],
-        }
-    path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    path = copied_model(folder, name)
+    keyed(path.name, legcal__home=GONE if home is None else motion_to_xyz_quat(home))(path.parent)
     return path
+
+
+def copied_model(folder: Path, name: str, change: Callable[[str], str] = str) -> Path:
+    """Copy the files of a shipped model, its URDF changed, and return the YAML."""
+    model, urdf = folder / f"models/{name}.yaml", folder / f"urdf/{name}.urdf"
+    for path in (model, urdf):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes((ROOT / path.relative_to(folder)).read_bytes())
+    urdf.write_text(change(urdf.read_text()))
+    return model
+
+
+def by_hand(folder: Path, motors: Sequence[str] = ()) -> Path:
+    """Copy the files of the shipped hexapod with some of its motors, and return the YAML."""
+    path = copied_model(folder, "hexapod")
+    keyed(path.name, name_mot=list(motors))(path.parent)
+    return path
+
+
+def written_with(
+    nominal: Machine, legs: Sequence[Leg], folder: Path, home: RigidTransform | None = None
+) -> Machine:
+    """Write a model with other legs as a calibration writes it, and load it again."""
+    folder.mkdir(exist_ok=True)
+    write_urdf(nominal, legs, folder / "calibrated.urdf")
+    write_calibrated_yaml(nominal, folder / "calibrated.yaml", "calibrated.urdf", home, legs)
+    return reload_and_check(folder / "calibrated.yaml")
 
 
 # Machines from tables

@@ -11,6 +11,7 @@ from pathlib import Path
 from command_line import run
 from dataset_folder import small_folder
 from located import located, write_poses
+from machines import copied_model
 from model_formats import write_format
 from simulated import simulated
 
@@ -57,9 +58,7 @@ def _plain(folder: Path) -> None:
 
 def _model(folder: Path) -> None:
     """Copy the files of the shipped hexapod."""
-    for name in ("models/hexapod.yaml", "urdf/hexapod.urdf"):
-        (folder / name).parent.mkdir()
-        shutil.copy(ROOT / name, folder / name)
+    copied_model(folder, "hexapod")
 
 
 def _with_motors(folder: Path) -> None:

@@ -1,32 +1,26 @@
 """One machine written in every format that is read, for tests."""
 
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from layouts import numbers, origin
+from layouts import origin
 from lxml import etree
-from scipy.spatial.transform import RigidTransform
 
-from legcal.machine.model import Machine
+from legcal import Machine, export
+from legcal.exports.subject import Subject
 
-FORMATS = (
-    "mjcf",
-    "loop_joint",
-    "isaac",
-    "gepetto",
-)
+FORMATS = "mjcf", "loop_joint", "isaac", "gepetto"
 
 
 def write_format(machine: Machine, name: str, folder: Path) -> Path:
     """Write a machine in a format and return the path that means it."""
     folder.mkdir(parents=True, exist_ok=True)
     if name == "mjcf":
-        path = folder / "machine.xml"
-        path.write_text(mjcf(machine))
-        return path
+        return _mjcf(machine, folder / "machine.xml")
     if name == "gepetto":
         return _gepetto(machine, folder / "machine")
     path = folder / "machine.urdf"
@@ -34,76 +28,18 @@ def write_format(machine: Machine, name: str, folder: Path) -> Path:
     return path
 
 
-def _pose(T: RigidTransform) -> str:
-    quat = np.roll(T.rotation.as_quat(), 1)
-    return f'pos="{numbers(T.translation)}" quat="{numbers(quat)}"'
+def _mjcf(machine: Machine, path: Path) -> Path:
+    """Write what is exported, which MuJoCo itself reads in test_exports.py, with capsules."""
+    export(Subject(machine, "machine"), "mjcf", path)
 
+    def capsule(found: re.Match[str]) -> str:
+        half, middle = float(found[2]), float(found[3])
+        ends = f"0 0 {middle - half!r} 0 0 {middle + half!r}"
+        return f'type="capsule" size="{found[1]}" fromto="{ends}"'
 
-def _cylinders(machine: Machine) -> dict[str, list[tuple[RigidTransform, str, str]]]:
-    """Return the visual cylinders of every link: pose, radius and length as text."""
-    robot = etree.fromstring(machine.urdf.content)
-    found: dict[str, list[tuple[RigidTransform, str, str]]] = {}
-    for visual in robot.iterfind("link/visual"):
-        place, cylinder = visual.find("origin"), visual.find("geometry/cylinder")
-        assert place is not None
-        assert cylinder is not None
-        assert place.get("rpy") == "0 0 0"
-        T = RigidTransform.from_translation([float(x) for x in place.get("xyz", "").split()])
-        link = str(visual.getparent().get("name"))  # type: ignore[union-attr]
-        entry = T, cylinder.get("radius", ""), cylinder.get("length", "")
-        found.setdefault(link, []).append(entry)
-    return found
-
-
-def mjcf(machine: Machine) -> str:
-    """Return a machine as MJCF, closed between bodies, in its home configuration."""
-    chain, configuration = machine.chain, machine.home_configuration
-    urdf, cylinders = machine.urdf, _cylinders(machine)
-
-    def joint(entry: Any) -> str:
-        if entry.type in ("floating", "planar"):
-            return f'<freejoint name="{entry.name}"/>'
-        value = float(configuration[chain.q_index(entry.name)])
-        axis = f'axis="{numbers(entry.axis)}"'
-        if entry.type == "prismatic":
-            limits = f'range="{numbers(np.array(entry.limits))}"'
-            return f'<joint name="{entry.name}" type="slide" {axis} ref="{value!r}" {limits}/>'
-        degrees = float(np.degrees(value))
-        return f'<joint name="{entry.name}" type="hinge" {axis} ref="{degrees!r}"/>'
-
-    def geoms(link: str) -> str:
-        text = ""
-        for T, radius, length in cylinders.get(link, []):
-            half = 0.5 * float(length)
-            ends = numbers([T.apply([0, 0, -half]), T.apply([0, 0, half])])
-            text += f'<geom type="capsule" size="{radius}" fromto="{ends}"/>'
-        return text
-
-    def body(link: str, parent: str | None) -> str:
-        T = RigidTransform.identity()
-        above = ""
-        if parent is not None:
-            T = chain.pose(configuration, parent, link)
-            entry = next(j for j in urdf.joints.values() if j.child == link)
-            above = joint(entry) if entry.moves else ""
-        children = [j for j in urdf.joints.values() if j.parent == link]
-        held = [j.child for j in children if j.type not in ("floating", "planar")]
-        free = [j.child for j in children if j.type in ("floating", "planar")]
-        inside = above + geoms(link) + "".join(body(child, link) for child in held)
-        beside = "".join(body(child, link) for child in free)
-        return f'<body name="{link}" {_pose(T)}>{inside}</body>\n{beside}'
-
-    equalities = ""
-    for closure in chain.closures:
-        tag = "connect" if closure.kind == "3d" else "weld"
-        ends = f'body1="{closure.frame_1}" body2="{closure.frame_2}"'
-        ends += ' anchor="0 0 0"' * (tag == "connect")
-        equalities += f"<{tag} {ends}/>\n"
-    motors = "".join(f'<position joint="{machine.legs[j].prismatic}"/>' for j in machine.motors)
-    return (
-        f'<mujoco model="machine">\n<worldbody>{body(urdf.root, None)}</worldbody>\n'
-        f"<equality>{equalities}</equality>\n<actuator>{motors}</actuator></mujoco>\n"
-    )
+    cylinder = r'type="cylinder" size="(\S+) (\S+)"[^>]* pos="0.0 0.0 (\S+)" quat="[^"]*"'
+    path.write_text(re.sub(cylinder, capsule, path.read_text()))
+    return path
 
 
 def _with_loops(machine: Machine, style: str) -> str:

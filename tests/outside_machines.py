@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from layouts import EYE, Layout, LegLayout, MachineSpec, Text, numbers, write_machine
-from machines import of_types, planar
+from machines import exechon, of_types, planar
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
@@ -92,20 +93,28 @@ def _rod(at: Array, end: Array, tangent: Array) -> list[Joint]:
     return [("revolute", at, tangent), ("revolute", at, inner / np.linalg.norm(inner))]
 
 
+def _arm(
+    drawing: Drawing, j: int, points: Array, axis: Array, on: tuple[str, Array] | None = None
+) -> None:
+    """Add an arm that turns about an axis at the first of points, and two rods to the last."""
+    pivot, elbow, end = points
+    drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+    drawing.motors.append(f"j_arm{j}")
+    for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
+        rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+        at = on or ("platform", HEIGHT * Z)
+        drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
+        drawing.legs[name] = f"j_{name}_0"
+
+
 def _couplers() -> Drawing:
     """Return a Delta whose parallelograms end on bars that turn on the platform."""
     drawing = Drawing()
     for j in range(3):
         (pivot, axis), (elbow, _) = _around(j, 0.2, 0.0), _around(j, 0.35, 0.1)
         end = _around(j, 0.05, HEIGHT)[0]
-        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
         drawing.add(f"bar{j}", "revolute", "platform", end - HEIGHT * Z, axis)
-        drawing.motors.append(f"j_arm{j}")
-        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
-            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
-            on = f"bar{j}", end
-            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=on)
-            drawing.legs[name] = f"j_{name}_0"
+        _arm(drawing, j, np.array([pivot, elbow, end]), axis, (f"bar{j}", end))
     return drawing
 
 
@@ -115,21 +124,14 @@ def _bars(joint: str, n_bars: int) -> Drawing:
     With two hinges they are those of an H4, with one guide those of an I4.
     """
     drawing = Drawing()
+    at = [np.array([0.0, 0.1 * i - 0.05, HEIGHT]) for i in range(n_bars)]
     for i in range(n_bars):
-        drawing.add(f"bar{i}", joint, "platform", np.array([0.0, 0.1 * i - 0.05, 0.0]), Z)
+        drawing.add(f"bar{i}", joint, "platform", at[i] - HEIGHT * Z, Z)
     for j in range(4):
-        turn = Rotation.from_euler("z", 90.0 * j + 45.0, degrees=True)
-        pivot, elbow, end = turn.apply([[0.2, 0, 0], [0.35, 0, 0.1], [0.05, 0, HEIGHT]])
-        axis = turn.apply([0.0, 1.0, 0.0])
-        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
-        drawing.motors.append(f"j_arm{j}")
-        i = j // 2
-        on = (f"bar{i}", np.array([0.0, 0.1 * i - 0.05, HEIGHT])) if i < n_bars else None
-        for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
-            rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
-            at = ("platform", HEIGHT * Z) if on is None else on
-            drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
-            drawing.legs[name] = f"j_{name}_0"
+        turn, i = Rotation.from_euler("z", 90.0 * j + 45.0, degrees=True), j // 2
+        points = turn.apply([[0.2, 0, 0], [0.35, 0, 0.1], [0.05, 0, HEIGHT]])
+        on = (f"bar{i}", at[i]) if i < n_bars else None
+        _arm(drawing, j, points, turn.apply([0.0, 1.0, 0.0]), on)
     return drawing
 
 
@@ -181,6 +183,20 @@ def _axis_off(types: str, angle: float) -> MachineSpec:
     inner /= np.linalg.norm(inner)
     towards = leg.base_axis if types == "US" else np.cross(leg.base_axis, inner)
     return _with_leg(machine, 0, base_inner=np.cos(angle) * inner + np.sin(angle) * towards)
+
+
+def _turned_exechon(angle: float) -> MachineSpec:
+    """Return an Exechon whose first axis at the base is off its place [rad]."""
+    machine = exechon()
+    axis = np.array(machine.legs[0].base_axis) + angle * Z
+    return _with_leg(machine, 0, base_axis=axis / np.linalg.norm(axis))
+
+
+def _of_nine_decimals(folder: Path) -> Path:
+    path = write_machine(folder, exechon(), Layout())
+    urdf = path.with_suffix(".urdf")
+    urdf.write_text(re.sub(r"-?\d\.\d{9,}", lambda x: f"{float(x[0]):.9f}", urdf.read_text()))
+    return path
 
 
 def scaled(machine: MachineSpec, scale: float) -> MachineSpec:
@@ -319,6 +335,15 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         _specified(partial(scaled, of_types(["US"] * 6), 1e3), Layout(home=False)),
         ("write all lengths",),
     ),
+    "exechon-nearly": (
+        _specified(partial(_turned_exechon, 1e-6)),
+        ("'machine'", "2 of the 5 constraints of its joints follow from the others to 1 mrad"),
+    ),
+    "exechon-off": (
+        _specified(partial(_turned_exechon, 0.02)),
+        ("'machine'", "overconstrained machine (1 of the 5 constraints", "mobility 2"),
+    ),
+    "exechon-digits": (_of_nine_decimals, ("2 of the 5 constraints", "with all digits")),
     "on-one-line": (_specified(_on_one_line), ("base joints of leg1, leg2, leg3",)),
 }
 """What each of them must be told: the reason, the joint or leg, and the amount."""

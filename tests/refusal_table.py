@@ -7,29 +7,38 @@ be left behind.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
-import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 
-import cv2
 import numpy as np
 import yaml
 from clicked_joints import camera_beside, seen_from, write_clicks
 from command_line import run, words_of
 from dataset_folder import JOINTS, SERVOS, dataset_of_readings
+from edits import (
+    GONE,
+    Edit,
+    cell,
+    cut,
+    doubled,
+    header,
+    kept,
+    keyed,
+    picture,
+    remove,
+    swap,
+    text,
+)
 from machines import TRIPOD
 from made_inputs import ROOT, copy_of
 from outside_machines import OUTSIDE
 
-Edit = Callable[[Path], None]
-GONE = object()  # of a key: take it out
 CORNER_COLUMNS = "view,image,corner,u,v,sigma,verdict,reason,source"
 
 
@@ -90,163 +99,26 @@ def _files(folder: Path) -> dict[str, str]:
     }
 
 
-# --- ways to spoil an input ---------------------------------------------------------------------
-
-
-def text(name: str, content: str | bytes) -> Edit:
-    """Write a file."""
-    data = content if isinstance(content, bytes) else content.encode()
-
-    def edit(folder: Path) -> None:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-
-    return edit
-
-
-def swap(name: str, old: str, new: str, count: int = 1) -> Edit:
-    """Replace text in a file."""
-
-    def edit(folder: Path) -> None:
-        content = (folder / name).read_text()
-        assert old in content, f"{name} has no {old!r}"
-        (folder / name).write_text(content.replace(old, new, count))
-
-    return edit
-
-
-def remove(name: str) -> Edit:
-    """Delete a file or folder."""
-
-    def edit(folder: Path) -> None:
-        path = folder / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-    return edit
-
-
-def keyed(name: str, /, **values: Any) -> Edit:
-    """Set keys of a YAML or JSON file; ``a__b`` is b in a, numbers count entries of lists."""
-
-    def edit(folder: Path) -> None:
-        path = folder / name
-        is_json = path.suffix == ".json"
-        content = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
-        for key, value in values.items():
-            *parents, last = [int(k) if k.isdigit() else k for k in key.split("__")]
-            place: Any = content
-            for parent in parents:
-                place = place[parent]
-            if value is GONE:
-                del place[last]
-            else:
-                place[last] = value
-        path.write_text(
-            json.dumps(content) if is_json else yaml.safe_dump(content, sort_keys=False)
-        )
-
-    return edit
-
-
-def cell(name: str, row: int | None, /, **cells: str) -> Edit:
-    """Change cells of a row of a table, counted from 1; of all rows without one."""
-
-    def edit(folder: Path) -> None:
-        header, rows = _table(folder / name)
-        for number, line in enumerate(rows, start=1):
-            if row in {None, number}:
-                for column, value in cells.items():
-                    line[header.index(column)] = value
-        _write_table(folder / name, [header, *rows])
-
-    return edit
-
-
-def header(name: str, old: str, new: str | None) -> Edit:
-    """Rename a column of a table, or take it out."""
-
-    def edit(folder: Path) -> None:
-        names, rows = _table(folder / name)
-        k = names.index(old)
-        lines = [names, *rows]
-        if new is None:
-            lines = [[*line[:k], *line[k + 1 :]] for line in lines]
-        else:
-            names[k] = new
-        _write_table(folder / name, lines)
-
-    return edit
-
-
-def doubled(name: str) -> Edit:
-    """Write the first row of a table once more."""
-
-    def edit(folder: Path) -> None:
-        names, rows = _table(folder / name)
-        _write_table(folder / name, [names, *rows, rows[0]])
-
-    return edit
-
-
-def kept(name: str, n: int) -> Edit:
-    """Keep the first rows of a table."""
-
-    def edit(folder: Path) -> None:
-        names, rows = _table(folder / name)
-        _write_table(folder / name, [names, *rows[:n]])
-
-    return edit
-
-
-def _table(path: Path) -> tuple[list[str], list[list[str]]]:
-    with path.open(newline="") as file:
-        names, *rows = csv.reader(file)
-    return names, rows
-
-
-def _write_table(path: Path, lines: list[list[str]]) -> None:
-    with path.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(lines)
-
-
-def picture(name: str, width: int, height: int) -> Edit:
-    """Write a grey picture."""
-
-    def edit(folder: Path) -> None:
-        cv2.imwrite(str(folder / name), np.full((height, width), 90, dtype=np.uint8))
-
-    return edit
-
-
-def cut(name: str, by: int) -> Edit:
-    """Cut off the end of a file."""
-
-    def edit(folder: Path) -> None:
-        path = folder / name
-        path.write_bytes(path.read_bytes()[:-by])
-
-    return edit
-
-
 # --- the table ----------------------------------------------------------------------------------
 
-Rows = Iterable[tuple[str, tuple[Edit, ...] | Edit, tuple[str, ...]]]
-Words = Iterable[tuple[str, str, tuple[str, ...]]]
+Part = str | Edit  # words of the command, or what spoils the input
+Rows = Iterable[tuple[str, Part | tuple[Part, ...], tuple[str, ...]]]
+CALIBRATE = "calibrate {in} -o {out}"
+entry = partial(keyed, "dataset.yaml")
 
 
-def _spoiled(group: str, command: str, given: str, rows: Rows) -> Iterable[Refusal]:
-    for name, edits, named in rows:
-        chosen = edits if isinstance(edits, tuple) else (edits,)
-        yield Refusal(f"{group}-{name}", command, named, given, chosen)
-
-
-def _worded(group: str, command: str, rows: Words, given: str = "") -> Iterable[Refusal]:
-    for name, words, named in rows:
-        yield Refusal(f"{group}-{name}", f"{command} {words}", named, given)
+def _cases(group: str, command: str, rows: Rows, given: str = "") -> Iterable[Refusal]:
+    """Return cases by rows of a name, words (where {words} is, or at the end), edits, and needs."""
+    for name, what, named in rows:
+        parts = what if isinstance(what, tuple) else (what,)
+        words = " ".join(part for part in parts if isinstance(part, str))
+        edits = tuple(part for part in parts if not isinstance(part, str))
+        line = command.replace("{words}", words) if "{words}" in command else f"{command} {words}"
+        yield Refusal(f"{group}-{name}", line, named, given, edits)
 
 
 def _use() -> Iterable[Refusal]:
-    rows: Words = [
+    rows: Rows = [
         ("unknown-command", "frobnicate", ("frobnicate",)),
         ("no-dataset", "calibrate nowhere -o {out}", ("nowhere",)),
         ("no-output", "calibrate nowhere", ("--output",)),
@@ -259,7 +131,7 @@ def _use() -> Iterable[Refusal]:
         ("no-workers", "detect x -o y --workers 0", ("found 0, needed 1 to 256 processes",)),
         ("two-datasets", "calibrate a b -o out", ("Expected one dataset", "docs/python.md")),
     ]
-    yield from _worded("use", "", rows)
+    yield from _cases("use", "", rows)
     existing = [text("thesis.tex", "years of work")]
     for name, command in {
         "calibrate": "calibrate {in} -o {in}",
@@ -273,7 +145,7 @@ def _use() -> Iterable[Refusal]:
 
 
 def _options() -> Iterable[Refusal]:
-    identify: Words = [
+    identify: Rows = [
         ("leg", "--view leg1,lge2", ("1", "'lge2'", "'leg2'")),
         ("no-leg", "--view ,", ("1",)),
         ("empty", "--view leg1,,leg2", ("1", "''")),
@@ -283,16 +155,17 @@ def _options() -> Iterable[Refusal]:
         ("many-views", "--view leg1 " * 51, ("51", "50")),
         ("hand-held", "--view leg1,leg2,leg3 --hand-held", ("--board",)),
     ]
-    yield from _worded("identify", "identify hexapod", identify)
-    yield Refusal("identify-dataset-view", "identify {in} --view leg1", ("--view",), "plain")
-
-    checks: Words = [
+    yield from _cases("identify", "identify hexapod", identify)
+    yield from _cases(
+        "identify", "identify", [("dataset-view", "{in} --view leg1", ("--view",))], "plain"
+    )
+    checks: Rows = [
         ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
     ]
-    yield from _worded("check", "calibrate {in}/set", checks, "result")
+    yield from _cases("check", "calibrate {in}/set", checks, "result")
 
-    simulate: Words = [
+    simulate: Rows = [
         ("poses-file", "--poses none.csv", ("none.csv",)),
         ("error-negative", "--error joints=-2mm", ("--error", "joints", "-2")),
         ("error-no-kind", "--error 2mm", ("2mm", "KIND=SIZE")),
@@ -308,51 +181,46 @@ def _options() -> Iterable[Refusal]:
         ("board", "--board chess", ("chess",)),
         ("hand-held", "--hand-held", ("--board",)),
     ]
-    yield from _worded("simulate", "simulate hexapod -o {out}", simulate)
+    yield from _cases("simulate", "simulate hexapod -o {out}", simulate)
 
-    locate: Words = [
+    locate: Rows = [
         ("tool-position", "-o {out} --tool-position 1,2", ("--tool-position",)),
         ("tool-text", "-o {out} --tool-position 1,2,x", ("--tool-position", "'x'")),
         ("angle", "-o {out} --angle-sigma 3mm", ("--angle-sigma", "3mm")),
         ("folder", "-o none/a.yaml", ("none",)),
     ]
-    yield from _worded("locate", "locate hexapod {in}/hexapod.csv", locate, "tool-poses")
+    yield from _cases("locate", "locate hexapod {in}/hexapod.csv", locate, "tool-poses")
 
-    camera: Words = [
+    camera: Rows = [
         ("kind", "chessbord:9x6", ("chessbord", "chessboard:9x6:25mm")),
         ("dictionary", "charuco:7x5:40mm:29mm", ("charuco:7x5:40mm:29mm:DICT_4X4_50",)),
         ("legacy", "charuco:7x5:40mm:29mm:DICT_4X4_50:old", ("old", "legacy")),
         ("gap", "aprilgrid:6x6:88mm:wide", ("wide",)),
         ("gap-size", "aprilgrid:6x6:88mm:9", ("9", "0.05", "2")),
     ]
-    for name, spec, named in camera:
-        command = f"camera {{in}}/images -o {{out}} --board {spec}"
-        yield Refusal(f"camera-{name}", command, named, "plain")
-    spec = "--board chessboard:9x6:25mm"
-    yield Refusal("camera-none", f"camera {{in}}/images {spec} -o {{out}}", ("4",), "plain")
-    yield Refusal("camera-missing", f"camera no*.png {spec} -o {{out}}", ("no*.png",))
-    yield Refusal("camera-no-board", "camera {in}/images -o {out}", ("--board",), "plain")
-    yield Refusal(
-        "camera-other", f"camera {{in}}/images {spec} -o {{in}}/camera_info.yaml",
-        ("camera_info.yaml",), "plain",
-    )  # fmt: skip
-    yield Refusal(
-        "camera-sizes", f"camera {{in}}/images {spec} -o {{out}}",
-        ("64 x 48", "48 x 64", "c1_1.png", "turned.png"), "plain",
-        (picture("images/turned.png", 48, 64),),
-    )  # fmt: skip
-    yield Refusal(
-        "camera-cut", f"camera {{in}}/images {spec} -o {{out}}", ("c1_2.png",), "plain",
-        (cut("images/c1_2.png", 30),),
-    )  # fmt: skip
+    yield from _cases("camera", "camera {in}/images -o {out} --board", camera, "plain")
+    images, out = "{in}/images --board chessboard:9x6:25mm", "-o {out}"
+    searched: Rows = [
+        ("none", (images, out), ("4",)),
+        ("missing", ("no*.png --board chessboard:9x6:25mm", out), ("no*.png",)),
+        ("no-board", ("{in}/images", out), ("--board",)),
+        ("other", (images, "-o {in}/camera_info.yaml"), ("camera_info.yaml",)),
+        ("sizes", (images, out, picture("images/turned.png", 48, 64)),
+         ("64 x 48", "48 x 64", "c1_1.png", "turned.png")),
+        ("cut", (images, out, cut("images/c1_2.png", 30)), ("c1_2.png",)),
+    ]  # fmt: skip
+    yield from _cases("camera", "camera", searched, "plain")
 
 
 def _datasets() -> Iterable[Refusal]:
-    def entry(**values: Any) -> Edit:
-        return keyed("dataset.yaml", **values)
-
     rows: Rows = [
-        ("version", entry(legcal_dataset=2), ("legcal_dataset", "2", "1")),
+        *((f"version-{one!r}", entry(legcal_dataset=one),
+           ("legcal_dataset", f"{one}", "needed version 1; use the legcal that wrote it"))
+          for one in (0, 2, "2")),
+        ("model-gone", entry(mechanism="../models/own.yaml"),
+         ("mechanism could not be used: found '../models/own",)),
+        ("model-misspelt", entry(mechanism="hexapd"),
+         ("found 'hexapd', no file there", "mean 'hexapod'")),
         ("sigma-nan", entry(encoder_sigma=float("nan")), ("encoder_sigma", "nan")),
         ("sigma-large", entry(encoder_sigma=90), ("encoder_sigma", "90 m", "to 1 m")),
         ("view-name", entry(**{"views__ c3": {"camera": "camera_info.yaml"}}), ("views",)),
@@ -378,7 +246,7 @@ def _datasets() -> Iterable[Refusal]:
         ("gone", remove("dataset.yaml"), ("dataset.yaml",)),
         ("no-date", text("dataset.yaml", "a: 1\nb: 2001-99-99\n"), ("line 2, column 4",)),
     ]  # fmt: skip
-    yield from _spoiled("dataset", "calibrate {in} -o {out}", "plain", rows)
+    yield from _cases("dataset", CALIBRATE, rows, "plain")
 
     prior = "parameters"
     choices: Rows = [
@@ -390,7 +258,7 @@ def _datasets() -> Iterable[Refusal]:
             ("leg1.offset",),
         ),
     ]
-    yield from _spoiled("parameters", "calibrate {in} -o {out}", "plain", choices)
+    yield from _cases("parameters", CALIBRATE, choices, "plain")
 
     chess = {"kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03}
     char = {
@@ -398,7 +266,7 @@ def _datasets() -> Iterable[Refusal]:
         "dictionary": "DICT_4X4_50",
     }  # fmt: skip
     april = {"kind": "aprilgrid", "tags_x": 6, "tags_y": 6, "tag_size": 0.088, "tag_spacing": 0.3}
-    boards: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+    boards: list[tuple[str, Any, tuple[str, ...]]] = [
         ("square", {**chess, "square": 30}, ("board.square", "30 m", "0.03")),
         ("kind", {**chess, "kind": "chess"}, ("board.kind", "'chess'")),
         ("half-turn", {**chess, "squares_x": 8}, ("8 x 6",)),
@@ -409,8 +277,22 @@ def _datasets() -> Iterable[Refusal]:
         ("few-squares", {**char, "squares_x": 2, "squares_y": 3}, ("2 x 3",)),
         ("tags", {**april, "tags_x": 60, "tags_y": 60}, ("60 x 60", "587")),
     ]
+    up = {"on": "platform"}
+    pose = {"xyz": [0, 0, 0], "quat_xyzw": [0, 0, 0, 1]}
+    two: list[tuple[str, Any, tuple[str, ...]]] = [
+        ("on-tube", char | {"on": "leg1_tube"}, ("board.on", "'leg1_tube'", "base or platform")),
+        ("on-none", char | {"on": None}, ("board.on", "base or platform")),
+        ("two-on-base", [char, chess], ("two boards on the base", "on the platform")),
+        ("same-markers", [char, char | up | {"square": 0.05}], ("DICT_4X4", "apart")),
+        ("same-bits", [char, char | up | {"dictionary": "DICT_4X4_100"}], ("DICT_4X4",)),
+        ("same-squares", [chess, chess | up | {"square": 0.02}], ("numbers of squares",)),
+        ("pose-of-base", char | up | {"T_base_board": pose}, ("T_base_board", "T_platform_board")),
+        ("none", [], ("empty list",)),
+        ("text", [char, "chessboard"], ("'chessboard'", "mapping")),
+    ]
+    boards += [(name, board, ("dataset.yaml", "needed", *named)) for name, board, named in two]
     of_boards = [(name, entry(board=board), named) for name, board, named in boards]
-    yield from _spoiled("board", "calibrate {in} -o {out}", "plain", of_boards)
+    yield from _cases("board", CALIBRATE, of_boards, "plain")
 
 
 def _in_hand() -> Iterable[Refusal]:
@@ -419,9 +301,6 @@ def _in_hand() -> Iterable[Refusal]:
         "kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,
         "dictionary": "DICT_4X4_50",
     }  # fmt: skip
-
-    def entry(**values: Any) -> Edit:
-        return keyed("dataset.yaml", **values)
 
     def corners(*places: tuple[str, int]) -> Edit:
         lines = [
@@ -443,8 +322,10 @@ def _in_hand() -> Iterable[Refusal]:
         ("corners-alone", corners(("c1,images/c1_1.png", 6)), ("corners.csv", "no board")),
         ("no-legs", entry(views__c1__legs=[], views__c2__legs=[]),
          ("views.c1.legs and views.c2.legs could not be used", "no leg and no board")),
+        ("no-legs-on-base", entry(board=board, views__c1__legs=[]),
+         ("views.c1.legs", "no board on the platform, needed")),
     ]  # fmt: skip
-    yield from _spoiled("in-hand", "calibrate {in} -o {out}", "plain", rows)
+    yield from _cases("in-hand", CALIBRATE, rows, "plain")
 
 
 def _measurements() -> Iterable[Refusal]:
@@ -487,15 +368,13 @@ def _measurements() -> Iterable[Refusal]:
             ("row 1", "row 2", "row 3", "row 4"),
         ),
     ]  # fmt: skip
-    yield from _spoiled("measurements", "calibrate {in} -o {out}", "plain", rows)
+    yield from _cases("measurements", CALIBRATE, rows, "plain")
 
 
 def _cameras() -> Iterable[Refusal]:
     file = "camera_info.yaml"
 
-    def content(**values: Any) -> Edit:
-        return keyed(file, **values)
-
+    content = partial(keyed, file)
     K = [80.0, 0.0, 31.5, 0.0, 80.0, 23.5, 0.0, 0.0, 1.0]
     five = {"rows": 1, "cols": 5, "data": [0.0] * 5}
 
@@ -545,7 +424,7 @@ def _cameras() -> Iterable[Refusal]:
         ("storage-xml", text(file, "<?xml version='1.0'?><opencv_storage><a>"), ("OpenCV",)),
         ("bytes", text(file, b"a: \xff\xfe\xfd"), ("UTF-8",)),
     ]  # fmt: skip
-    yield from _spoiled("lens", "calibrate {in} -o {out}", "plain", rows)
+    yield from _cases("lens", CALIBRATE, rows, "plain")
 
 
 def _units() -> Iterable[Refusal]:
@@ -578,18 +457,22 @@ def _units() -> Iterable[Refusal]:
          ("28.6 deg", "0.5deg")),
         ("sigma-number", angles, {"encoder_sigma": 1e-4}, ("one number [m]", "'servo1' turns")),
     ]  # fmt: skip
-    for hidden, said in (
-        ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
-        (r"leg\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
-    ):
-        yield Refusal(f"unseen-{hidden}", "calibrate {in} -o {out}", said, "motors",
-                      (partial(_without_rods, hidden=hidden),))  # fmt: skip
-    for name, readings, entry, named in rows:
-        edits = (cast(Edit, partial(dataset_of_readings, readings=readings, entry=entry)),)
-        yield Refusal(f"units-{name}", "calibrate {in} -o {out}", named, "", edits)
-    given = cast(Edit, partial(dataset_of_readings, readings=angles, entry=sigma))
-    yield Refusal("units-open", "calibrate {in} -o {out}", ("servo1", "moves joints at the base"),
-                  "", (given, cell("measurements.csv", None, servo1="")))  # fmt: skip
+    unseen: Rows = [
+        (hidden, partial(_without_rods, hidden=hidden), said)
+        for hidden, said in (
+            ("leg[12]_", ("motor 'arm1'", "no cylinder along leg1, leg2", "<visual>")),
+            (r"leg\d_", ("view c1 could not be used", "found no leg", "visible cylinder")),
+        )
+    ]
+    yield from _cases("unseen", CALIBRATE, unseen, "motors")
+
+    def given(readings: np.ndarray, stated: dict[str, Any]) -> Edit:
+        return cast(Edit, partial(dataset_of_readings, readings=readings, entry=stated))
+
+    units: Rows = [(name, given(q, stated), named) for name, q, stated, named in rows]
+    one_gone = given(angles, sigma), cell("measurements.csv", None, servo1="")
+    units = [*units, ("open", one_gone, ("servo1", "moves joints at the base"))]
+    yield from _cases("units", CALIBRATE, units)
 
 
 def _without_rods(folder: Path, hidden: str) -> None:
@@ -631,7 +514,7 @@ def _tables() -> Iterable[Refusal]:
         ),
         ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
     ]
-    yield from _spoiled("outlines", "calibrate {in} -o {out}", "3-rpr-outlines", outlines)
+    yield from _cases("outlines", CALIBRATE, outlines, "3-rpr-outlines")
 
     c = "corners.csv"
     line = f"{CORNER_COLUMNS}\n"
@@ -639,18 +522,19 @@ def _tables() -> Iterable[Refusal]:
     board = keyed("dataset.yaml", board={
         "kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03,
     })  # fmt: skip
-    corners: Words = [
-        ("many", "c1,images/c1_2.png,99,1,2,0.1,used,,detected", ("corner", "99")),
-        ("image", "c2,images/c1_2.png,3,1,2,0.1,used,,detected", ("column image", "c1_2.png")),
-    ]
-    for name, row, said in corners:
-        edits = (board, text(c, f"{line}{good}{row}\n"))
-        yield Refusal(
-            f"corners-{name}", "calibrate {in} -o {out}", (*said, "row 2"), "plain", edits
+    other = "".join(good.replace(",0,", f",{k},") for k in range(60))
+    corners: Rows = [
+        (name, (board, text(c, line + rows)), named)
+        for name, rows, named in (
+            ("many", f"{good}c1,images/c1_2.png,99,1,2,0.1,used,,detected\n",
+             ("corner", "99", "row 2")),
+            ("image", f"{good}c2,images/c1_2.png,3,1,2,0.1,used,,detected\n",
+             ("column image", "c1_2.png", "row 2")),
+            ("of-another", other, ("corners up to 59,", "40 on the base")),
+            ("none", "", ("no row",)),
         )
-    yield Refusal(
-        "corners-none", "calibrate {in} -o {out}", ("no row",), "plain", (board, text(c, line))
-    )
+    ]  # fmt: skip
+    yield from _cases("corners", CALIBRATE, corners, "plain")
 
 
 def clicks(*left_out: str) -> Edit:
@@ -683,12 +567,12 @@ def _landmarks() -> Iterable[Refusal]:
         (name, (clicks(), *(edits if isinstance(edits, tuple) else (edits,))), named)
         for name, edits, named in rows
     ]
-    yield from _spoiled("clicks", "calibrate {in} -o {out}", "plain", spoiled)
+    yield from _cases("clicks", CALIBRATE, spoiled, "plain")
 
 
 def _overrides() -> Iterable[Refusal]:
     """Choices of parameters by options."""
-    priors: Words = [
+    priors: Rows = [
         ("sigma-0", "leg1.offset=0.35±0", ("sigma 0",)),
         ("one-unit", "leg1.offset=350mm±0.1", ("unit",)),
         ("unit", "leg1.offset=350±1furlong", ("'furlong'", "mm")),
@@ -699,18 +583,15 @@ def _overrides() -> Iterable[Refusal]:
         ("fixed", "leg1.offset=0.35±0.1' --set '*.offset", ("leg1.offset",)),
         ("camera", "c1.fx=79±3' --set 'c2.fx=78±3", ("c1.fx", "c2.fx")),
     ]
-    command = "calibrate {in} -o {out}"
-    for name, words, named in priors:
-        yield Refusal(f"prior-{name}", f"{command} --set '{words}'", named, "plain")
-    others: Words = [
-        ("freed", "--set leg1.offset --set leg1.offset=free", ("leg1.offset",)),
-        ("values", "--set leg1.offset=0.35 --set leg1.offset=0.36", ("leg1.offset",)),
-        ("everything", "--set '*.base.?' --set '*.platform.?' --set '*.offset'", ()),
-    ]  # fmt: skip
-    for name, words, named in others:
-        yield Refusal(f"fix-{name}", f"{command} {words}", named, "plain")
-    yield Refusal("planar-axis", f"{command} --set leg1.base_axis.1", ("leg1.base_axis.1", "RPR"),
-                  "3-rpr-outlines")  # fmt: skip
+    yield from _cases("prior", f"{CALIBRATE} --set '{{words}}'", priors, "plain")
+    others: Rows = [
+        ("freed", "leg1.offset --set leg1.offset=free", ("leg1.offset",)),
+        ("values", "leg1.offset=0.35 --set leg1.offset=0.36", ("leg1.offset",)),
+        ("everything", "'*.base.?' --set '*.platform.?' --set '*.offset'", ()),
+    ]
+    yield from _cases("fix", f"{CALIBRATE} --set", others, "plain")
+    axis: Rows = [("axis", "leg1.base_axis.1", ("leg1.base_axis.1", "RPR"))]
+    yield from _cases("planar", f"{CALIBRATE} --set", axis, "3-rpr-outlines")
 
 
 def _models() -> Iterable[Refusal]:
@@ -809,32 +690,37 @@ def _models() -> Iterable[Refusal]:
         ("utf-16", _in_utf_16, ("UTF-8",)),
     ]  # fmt: skip
     placed = [(name, edits, ("{in}", *named)) for name, edits, named in rows]
-    yield from _spoiled("model", "inspect {in}/models/hexapod.yaml", "model", placed)
-    yield Refusal("model-urdf-alone", "inspect {in}/arm.urdf", ("arm.urdf",), "model",
-                  (_alone,))  # fmt: skip
-    yield Refusal("model-table", "inspect {in}/3-rps.yaml", ("3-rps.yaml", "legcal new"), "tables")
-    yield Refusal(
-        "model-csv", "inspect {in}/tripod.csv", ("tripod.csv", "legcal new", "-o DIR"), "tables"
-    )
-    yield Refusal(
-        "model-dataset", "inspect {in}", ("dataset", "legcal calibrate {in} -o OUT"), "plain"
-    )
-    yield Refusal(
-        "model-written", "inspect {in}/models/hexapod.yaml --write {in}", ("hexapod.yaml",), "model"
-    )
-    for file, content, named in (
-        ("other.xml", b"<a/>", "other.xml"),
-        ("entity.xml", b'<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "entity.xml"),
-        ("gazebo.sdf", b'<?xml version="1.0"?>\n<sdf version="1.6"><model/></sdf>', "an SDF"),
-        ("m.hal", b"# hexapod\nloadrt genhexkins\nsetp x 1\n", "m.hal -o DIR"),
-    ):
-        yield Refusal(
-            f"file-{file}", f"inspect {{in}}/{file}", (named,), "", (text(file, content),)
+    yield from _cases("model", "inspect {in}/models/hexapod.yaml", placed, "model")
+    half = (text("calibrated.yaml", "closed_loop: []\n"),
+            text("result.json", '{"legcal_result": 1, "mach'))  # fmt: skip
+    of_inputs: dict[str, Rows] = {
+        "model": [
+            ("urdf-alone", ("/arm.urdf", _alone), ("arm.urdf",)),
+            ("written", "/models/hexapod.yaml --write {in}", ("hexapod.yaml",)),
+        ],
+        "tables": [
+            ("table", "/3-rps.yaml", ("3-rps.yaml", "legcal new")),
+            ("csv", "/tripod.csv", ("tripod.csv", "legcal new", "-o DIR")),
+        ],
+        "plain": [("dataset", "", ("dataset", "legcal calibrate {in} -o OUT"))],
+        "": [("half-a-result", half, ("no whole result.json of a calibration, needed both",))],
+    }
+    for given, those in of_inputs.items():
+        yield from _cases("model", "inspect {in}{words}", those, given)
+    files: Rows = [
+        (file, (file, text(file, content)), (named,))
+        for file, content, named in (
+            ("other.xml", b"<a/>", "other.xml"),
+            ("entity.xml", b'<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "entity.xml"),
+            ("gazebo.sdf", b'<?xml version="1.0"?>\n<sdf version="1.6"><model/></sdf>', "an SDF"),
+            ("m.hal", b"# hexapod\nloadrt genhexkins\nsetp x 1\n", "m.hal -o DIR"),
         )
-    yield from _spoiled("motors", "inspect {in}/delta.yaml", "motors", _motors())
-    yield Refusal("motors-of-slider", "inspect {in}/3-prs.yaml",
-                  ("the slider", "on the base itself", "the joint at A moves"), "motors",
-                  (keyed("3-prs.yaml", name_mot=[]),))  # fmt: skip
+    ]
+    yield from _cases("file", "inspect {in}/{words}", files)
+    yield from _cases("motors", "inspect {in}/delta.yaml", _motors(), "motors")
+    slider: Rows = [("of-slider", keyed("3-prs.yaml", name_mot=[]),
+                     ("the slider", "on the base itself", "the joint at A moves"))]  # fmt: skip
+    yield from _cases("motors", "inspect {in}/3-prs.yaml", slider, "motors")
 
 
 def _motors() -> Rows:
@@ -868,21 +754,23 @@ def _motors() -> Rows:
 
 def _outside() -> Iterable[Refusal]:
     """Machines that the method does not cover."""
-    for name, (write, named) in OUTSIDE.items():
-        edits = (cast(Edit, write),)
-        yield Refusal(f"outside-{name}", "inspect {in}/machine.yaml", ("{in}", *named), "", edits)
+    rows: Rows = [
+        (name, cast(Edit, write), ("{in}", *named)) for name, (write, named) in OUTSIDE.items()
+    ]
+    yield from _cases("outside", "inspect {in}/machine.yaml", rows)
 
 
 def _formats() -> Iterable[Refusal]:
     """What another format cannot mean."""
-    connect = '<connect body1="leg1_end" body2="leg1_seat" anchor="0 0 0"/>'
+    connect = '<connect name="loop_1" solref="0.001 1" site1="loop_1_1" site2="loop_1_2"/>'
+    by_bodies = '<connect body1="leg1_end" body2="leg1_seat" anchor="0 0 0"/>'
     joint = '<freejoint name="platform_free"/>'
     slide = '<joint name="leg1_prismatic" type="slide"'
-    motor, world = '<position joint="leg1_prismatic"/>', "<worldbody>"
-    body_2, size = '<body name="leg2_end"', 'type="capsule" size="0.01"'
+    motor = '<position name="leg1_prismatic" joint="leg1_prismatic" kp="10000.0"/>'
+    world, body_2, size = "<worldbody>", '<body name="leg2_end"', 'type="capsule" size="0.01"'
 
     def tied(old: str, new: str) -> tuple[str, str]:
-        return connect, connect.replace(old, new)
+        return connect, by_bodies.replace(old, new)
 
     def added(text: str) -> tuple[str, str]:
         return world, f"{world}{text}"
@@ -909,7 +797,7 @@ def _formats() -> Iterable[Refusal]:
         ("two-turns", (body_2, body_2 + ' euler="0 0 1"'), ("one orientation",)),
         ("quat", ('quat="1.0 0.0 0.0 0.0"', 'quat="0 0 0 0"'), ("no orientation",)),
         ("range", ('range="-0.004 0.144"', 'range="1 -1"'),
-         (", line 9: joint 'leg1_prismatic'", "1 to -1")),
+         (", line 17: joint 'leg1_prismatic'", "1 to -1")),
         ("grad", (world, f'<compiler angle="grad"/>{world}'), ("angle='grad'", "degree")),
         ("eulerseq", (world, f'<compiler eulerseq="xyw"/>{world}'), ("eulerseq='xyw'",)),
         ("class", added('<body childclass="no"/>'), ("default class 'no'",)),
@@ -927,12 +815,14 @@ def _formats() -> Iterable[Refusal]:
          (swap("machine.xml", motor, '<position joint="leg1"/>'),
           swap("machine.xml", connect, '<connect body1="x" body2="y" anchor="0 0 0"/>')),
          ("'leg1'", "'x'", "'y'")),
+        ("no-sites", swap("machine.xml", "<site ", "<camera ", -1),
+         ("the site 'loop_1_1' as site1", "there are none")),
         ("inactive", swap("machine.xml", "<connect ", '<connect active="false" ', -1),
          ("without <connect> or <weld>",)),
         ("two-mechanisms", _second_mechanism,
          ("found 2 mechanisms, which have no moving body in common",)),
     ]  # fmt: skip
-    yield from _spoiled("mjcf", "inspect {in}/machine.xml", "mjcf", rest)
+    yield from _cases("mjcf", "inspect {in}/machine.xml", rest, "mjcf")
     link1 = '<link1 link="leg1_tube"'
     loops: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("type", ('type="spherical"', 'type="prismatic"'), ("line", "'prismatic'")),
@@ -948,10 +838,8 @@ def _formats() -> Iterable[Refusal]:
     beside = text("machine.yaml", (ROOT / "models/hexapod.yaml").read_text().replace(
         "../urdf/hexapod.urdf", "machine.urdf"
     ))  # fmt: skip
-    yield Refusal(
-        "loops-and-yaml", "inspect {in}/machine.urdf",
-        ("which is not read beside a mechanism YAML",), "loop_joint", (beside,),
-    )  # fmt: skip
+    alone: Rows = [("and-yaml", beside, ("which is not read beside a mechanism YAML",))]
+    yield from _cases("loops", "inspect {in}/machine.urdf", alone, "loop_joint")
     gepetto: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("axes", ("joint_type:\n- UJOINT_XY", "joint_type:\n- UJOINT_XX"),
          ("'UJOINT_XX'", "SPHERICAL")),
@@ -968,7 +856,7 @@ def _of_file(
 ) -> Iterable[Refusal]:
     """Put something in the place of a text of a file, which is read and must be named."""
     spoiled = [(name, swap(file, *change), ("{in}", *named)) for name, change, named in rows]
-    yield from _spoiled(group, f"inspect {{in}}/{file}", given, spoiled)
+    yield from _cases(group, f"inspect {{in}}/{file}", spoiled, given)
 
 
 def _in_utf_16(folder: Path) -> None:
@@ -979,8 +867,7 @@ def _in_utf_16(folder: Path) -> None:
 def _second_mechanism(folder: Path) -> None:
     path = folder / "machine.xml"
     text = path.read_text()
-    second = text.replace('="leg', '="second_leg').replace('"platform', '"second_platform')
-    second = second.replace('"base"', '"second_base"')
+    second = re.sub('="(leg|loop|platform)', r'="second_\1', text)
     body = second[second.index("<body") : second.index("</worldbody>")]
     tail = second[second.index("<equality>") : second.index("</mujoco>")]
     text = text.replace("</worldbody>", f"{body}</worldbody>")
@@ -990,9 +877,7 @@ def _second_mechanism(folder: Path) -> None:
 def _new() -> Iterable[Refusal]:
     file = "3-rps.yaml"
 
-    def entry(**values: Any) -> Edit:
-        return keyed(file, **values)
-
+    entry = partial(keyed, file)
     rows: Rows = [
         ("no-type", entry(type=GONE), ("type", "types")),
         ("count", entry(type="6-RPS"), ("6-RPS", "3", "6")),
@@ -1011,7 +896,7 @@ def _new() -> Iterable[Refusal]:
         ("thin", entry(radius=0.014), ("leg1", "radius")),
         ("across", entry(base_axes=[[0, 1, 0.1], None, None]), ("leg1", "90 deg")),
     ]  # fmt: skip
-    yield from _spoiled("table", f"new {{in}}/{file} -o {{out}}", "tables", rows)
+    yield from _cases("table", f"new {{in}}/{file} -o {{out}}", rows, "tables")
     head, row = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
     lines: list[tuple[str, str, str, tuple[str, ...]]] = [
         ("no-column", "type,base_x\nRPS,1\n", "--unit mm", ("'base_y'",)),
@@ -1027,12 +912,14 @@ def _new() -> Iterable[Refusal]:
         ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
         ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
     ]
-    for name, content, words, named in lines:
-        yield Refusal(
-            f"csv-{name}", f"new {{in}}/m.csv -o {{out}} {words}", named, "",
-            (text("m.csv", content),),
-        )  # fmt: skip
-    families: Words = [
+    tables: Rows = [(name, (words, text("m.csv", rows)), said) for name, rows, words, said in lines]
+    yield from _cases("csv", "new {in}/m.csv -o {out}", tables)
+    workbooks: Rows = [
+        (name, text("own.xls", start), ("workbook", "save the sheet as CSV"))
+        for name, start in (("xlsx", b"PK\x03\x04none"), ("xls", b"\xd0\xcf\x11\xe0none"))
+    ]
+    yield from _cases("workbook", "new {in}/own.xls --unit mm -o {out}", workbooks)
+    families: Rows = [
         ("6-sps", "6-SPS", ("--family 6-SPS", "--family hexapod --type SPS", "--template")),
         ("3-upu", "3-UPU", ("--family 3-UPU", "hexapod or delta", "--template")),
         ("nan", "hexapod --platform-radius nan", ("--platform-radius nan", "positive")),
@@ -1043,25 +930,22 @@ def _new() -> Iterable[Refusal]:
         ("height", "delta --height 374", ("--height 374", "negative")),
         ("thick", "delta --leg-radius 40", ("60 mm apart", "80 mm thick", "--leg-radius")),
     ]
-    for name, words, named in families:
-        command = f"new --family {words} --unit mm -o {{out}}"
-        yield Refusal(f"family-{name}", command, named)
-    for name, words, named in (
+    yield from _cases("family", "new --family {words} --unit mm -o {out}", families)
+    units: Rows = [
         ("unit", "--unit inch", ("'inch'", "mm, um, nm, cm, m, in, ft")),
         ("no-unit", "--rod-length 400", ("--rod-length", "--unit mm")),
-    ):
-        yield Refusal(f"family-{name}", f"new --family delta {words} -o {{out}}", named)
-    for name, words, named in (
+    ]
+    yield from _cases("family", "new --family delta -o {out}", units)
+    both: Rows = [
         ("both", "{in}/3-rps.yaml --family delta", ("--family",)),
         ("missing", "{in}/none.yaml", ("none.yaml",)),
         ("unit-of-two", "{in}/3-rps.yaml --unit m", ("--unit m", "'mm'")),
-    ):
-        yield Refusal(f"new-{name}", f"new {words} -o {{out}}", named, "tables")
+    ]
+    yield from _cases("new", "new -o {out}", both, "tables")
 
 
 def _described() -> Iterable[Refusal]:
     """Tables of machines that cannot be."""
-    command = "new {in}/table.yaml -o {out}"
     sps: dict[str, Any] = {"type": "SPS"}
     rod: dict[str, Any] = {"type": None, "types": ["SPU", "SPU", "SS"]}
     planar: dict[str, Any] = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
@@ -1093,9 +977,6 @@ def _described() -> Iterable[Refusal]:
          ("'leg1'", "along the leg")),
         ("plane-home", planar | {"home": turned, "offsets": 50}, ("home",)),
     ]  # fmt: skip
-    for name, changed, named in changes:
-        edits = (text("table.yaml", json.dumps(_without_none(TRIPOD | changed))),)
-        yield Refusal(f"tripod-{name}", command, ("{in}/table.yaml", *named), "", edits)
     arms: dict[str, Any] = yaml.safe_load((ROOT / "models/tables/delta.yaml").read_text())
     below = {"xyz": [0, 0, -900], "rpy_deg": [0, 0, 0]}  # farther than its rods reach
 
@@ -1124,9 +1005,16 @@ def _described() -> Iterable[Refusal]:
         ("two-readings", arm1(travel_deg=[-180, 179]), ("'arm1'", "two readings", "not two")),
         ("reading-of-arm", {"home_readings": {"arm1": 1}}, ("home_readings.arm1", "no such carri")),
     ]  # fmt: skip
-    for name, changed, named in of_motors:
-        edits = (text("table.yaml", json.dumps(_without_none(arms | changed))),)
-        yield Refusal(f"arms-{name}", command, named, "", edits)
+    for group, whole, of in (("tripod", TRIPOD, changes), ("arms", arms, of_motors)):
+        rows: Rows = [
+            (
+                name,
+                text("table.yaml", json.dumps(_without_none(whole | changed))),
+                ("{in}/table.yaml", *named),
+            )
+            for name, changed, named in of
+        ]
+        yield from _cases(group, "new {in}/table.yaml -o {out}", rows)
 
 
 def _without_none(entry: dict[str, Any]) -> dict[str, Any]:
@@ -1141,15 +1029,13 @@ def _poses() -> Iterable[Refusal]:
         ("degrees", cell(p, 2, qx="90", qy="0", qz="0", qw="0"), ("90", "degrees")),
         ("two-poses", kept(p, 2), ("2", "3")),
     ]
-    yield from _spoiled("poses", "locate hexapod {in}/hexapod.csv -o {out}", "tool-poses", rows)
+    yield from _cases("poses", "locate hexapod {in}/hexapod.csv -o {out}", rows, "tool-poses")
 
 
 def _results() -> Iterable[Refusal]:
     r = "result/result.json"
 
-    def document(**values: Any) -> Edit:
-        return keyed(r, **values)
-
+    document = partial(keyed, r)
     rows: Rows = [
         ("gone", remove(r), ("result.json",)),
         ("broken", text(r, "{"), ("result.json",)),
@@ -1163,24 +1049,27 @@ def _results() -> Iterable[Refusal]:
         ("shared", document(residuals__shared_px={"bias of nothing": 0.1}), ("bias of nothing",)),
         ("model", remove("result/calibrated.yaml"), ("calibrated.yaml",)),
     ]
-    yield from _spoiled("result", "calibrate {in}/set --check {in}/result", "result", rows)
+    yield from _cases("result", "calibrate {in}/set --check {in}/result", rows, "result")
 
 
 def _scenes() -> Iterable[Refusal]:
-    command = "simulate hexapod -o {out} --level outlines --poses 1"
     far = text("p.csv", f"{','.join(JOINTS)}\n{','.join(['0.5'] * 6)}\n")
-    yield Refusal("readings-travel", f"{command} --poses {{in}}/p.csv", ("0.5",), "", (far,))
     wide = keyed("camera_info.yaml", image_width=20000, image_height=20000)
-    yield Refusal("scene-huge", f"{command} --camera {{in}}/camera_info.yaml",
-                  ("20000 x 20000", "100000000"), "plain", (wide,))  # fmt: skip
-    yield Refusal(
-        "scene-board", f"{command} --board {{in}}/b.yaml", ("board",), "", (text("b.yaml", "a: 1"),)
-    )
-    yield Refusal(
-        "scene-invisible",
-        "simulate {in}/models/hexapod.yaml -o {out} --level outlines --poses 1",
-        ("cylinder",), "model", (_without_visuals,),
-    )  # fmt: skip
+    plans = (("cut", "{"), ("list", "[]"), ("empty", "{}"))
+    of_inputs: list[tuple[str, str, Rows]] = [
+        ("readings", "", [("travel", ("hexapod --poses {in}/p.csv", far), ("0.5",))]),
+        ("plan", "", [(name, ("3-rpr --plan {in}", text("plan.json", content)),
+                       ("found no plan.json in it that can be read",)) for name, content in plans]),
+        ("scene", "plain", [("huge", ("hexapod --camera {in}/camera_info.yaml", wide),
+                             ("20000 x 20000", "100000000"))]),
+        ("scene", "", [("board", ("hexapod --board {in}/b.yaml", text("b.yaml", "a: 1")),
+                        ("board",))]),
+        ("scene", "model", [("invisible", ("{in}/models/hexapod.yaml", _without_visuals),
+                             ("cylinder",))]),
+    ]  # fmt: skip
+    for group, given, rows in of_inputs:
+        level = "--level outlines" if group == "plan" else "--level outlines --poses 1"
+        yield from _cases(group, f"simulate -o {{out}} {level}", rows, given)
 
 
 def _micrometre(folder: Path) -> None:
@@ -1193,7 +1082,7 @@ def _micrometre(folder: Path) -> None:
 def _exports() -> Iterable[Refusal]:
     """Formats that a class does not have, and places and options that cannot be used."""
     those = "this machine has table, csv, json, urdf"
-    rows: Words = [
+    rows: Rows = [
         ("rod", "hexapod-rod --to linuxcnc -o {out}", ("leg6", those)),
         ("model", "hexapod --to correction -o {out}", ("needed a result", those)),
         ("rails", "hexaglide --to linuxcnc -o {out}", ("'rail1' moves joints at A",)),
@@ -1204,16 +1093,17 @@ def _exports() -> Iterable[Refusal]:
         ("matlab", "hexapod --to matlab -o 1-a.m", ("m_1_a.m",)),
         ("no-result", "no/result.json --to csv -o {out}", ("result",)),
     ]
-    yield from _worded("export", "export", rows)
-    for name, words, file in (("taken", "table -o {in}/a.txt", "a.txt"),
-                              ("ros", "ros -o {in}/ros", "ros/calibration.yaml")):  # fmt: skip
-        edits = (text(file, "mine"),)
-        yield Refusal(f"export-{name}", f"export hexapod --to {words}", ("--force",), "", edits)
-    of_result: Words = [
+    yield from _cases("export", "export", rows)
+    there: Rows = [
+        ("taken", ("table -o {in}/a.txt", text("a.txt", "mine")), ("--force",)),
+        ("ros", ("ros -o {in}/ros", text("ros/calibration.yaml", "mine")), ("--force",)),
+    ]
+    yield from _cases("export", "export hexapod --to", there)
+    of_result: Rows = [
         ("few-nodes", "correction --nodes 1 -o {out}", ("found 1", "needed 2 to")),
         ("itself", "json -o {in}/result/result.json --force", ("which is exported",)),
     ]
-    yield from _worded("export", "export {in}/result --to", of_result, "result")
+    yield from _cases("export", "export {in}/result --to", of_result, "result")
 
 
 def _alone(folder: Path) -> None:

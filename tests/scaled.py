@@ -3,10 +3,10 @@
 import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import yaml
-from csv_rows import read_rows, write_rows
+from edits import document, each_row
 
 
 def scaled_dataset(source: Path, folder: Path, factor: float) -> Path:
@@ -21,25 +21,30 @@ def scaled_dataset(source: Path, folder: Path, factor: float) -> Path:
     prismatic = set[str]()
     for urdf in folder.rglob("*.urdf"):
         prismatic |= _scale_urdf(urdf, factor)
-    for model in folder.glob("models/*.yaml"):
-        text = yaml.safe_load(model.read_text(encoding="utf-8"))
-        _scale_pose(text["legcal"].get("home"), factor)
-        for joint in prismatic.intersection(text["legcal"].get("home_readings", {})):
-            text["legcal"]["home_readings"][joint] *= factor
-        model.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
-    path = folder / "dataset.yaml"
-    text = yaml.safe_load(path.read_text(encoding="utf-8"))
-    sigma = text["encoder_sigma"]
-    if isinstance(sigma, dict):
-        text["encoder_sigma"] = {
-            joint: value * (factor if joint in prismatic else 1.0) for joint, value in sigma.items()
-        }
-    else:
-        text["encoder_sigma"] = factor * sigma
-    for view in text["views"].values():
-        _scale_pose(view.get("T_base_camera"), factor)
-    path.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
-    _scale_readings(folder / text["measurements"], prismatic, factor)
+
+    def model(content: dict[str, Any]) -> None:
+        _scale_pose(content["legcal"].get("home"), factor)
+        for joint in prismatic.intersection(content["legcal"].get("home_readings", {})):
+            content["legcal"]["home_readings"][joint] *= factor
+
+    def dataset(content: dict[str, Any]) -> None:
+        sigma = content["encoder_sigma"]
+        content["encoder_sigma"] = (
+            {name: x * (factor if name in prismatic else 1.0) for name, x in sigma.items()}
+            if isinstance(sigma, dict)
+            else factor * sigma
+        )
+        for view in content["views"].values():
+            _scale_pose(view.get("T_base_camera"), factor)
+
+    def readings(row: dict[str, str]) -> None:
+        for name in prismatic.intersection(row):
+            row[name] = repr(factor * float(row[name])) if row[name] else ""
+
+    for path in folder.glob("models/*.yaml"):
+        document(f"models/{path.name}", model)(folder)
+    document("dataset.yaml", dataset)(folder)
+    each_row("measurements.csv", readings)(folder)
     return folder
 
 
@@ -67,11 +72,3 @@ def _times(numbers: str, factor: float) -> str:
 def _scale_pose(pose: dict[str, list[float]] | None, factor: float) -> None:
     if pose is not None:
         pose["xyz"] = (factor * np.array(pose["xyz"])).tolist()
-
-
-def _scale_readings(path: Path, prismatic: set[str], factor: float) -> None:
-    rows = read_rows(path)
-    for row in rows:
-        for name in prismatic.intersection(row):
-            row[name] = repr(factor * float(row[name])) if row[name] else ""
-    write_rows(path, rows)

@@ -1,4 +1,7 @@
-"""Machines whose rods hang on carriages and arms: written, loaded, and by closed forms."""
+"""Machines whose rods hang on carriages and arms: written and loaded.
+
+How they move is compared with closed forms in test_firmware.py.
+"""
 
 from pathlib import Path
 
@@ -6,14 +9,12 @@ import numpy as np
 import pytest
 import yaml
 from machines import ROOT, delta_with_round_arms, read_table
-from scipy.spatial.transform import RigidTransform
 
-from legcal import Machine, export, forward_kinematics, inverse_kinematics, load_mechanism
-from legcal.descriptions.new_model import Dimensions, create_model, description_of
+from legcal import Machine, export, inverse_kinematics, load_mechanism
+from legcal.descriptions.new_model import create_model
 from legcal.descriptions.table import described_machine
 from legcal.errors import ModelError
 from legcal.exports.subject import Subject
-from legcal.geometry.types import Array
 from legcal.machine.home import home_of_legs
 from legcal.machine.leg import ARMS as ARM_KINDS
 from legcal.machine.leg import ParameterId
@@ -52,77 +53,6 @@ def test_an_arm_that_is_a_cylinder_is_a_line_of_the_first_rod_on_it(tmp_path: Pa
     of_arms = [i for i, n in enumerate(found.names) if ParameterId.parse(n).kind in ARM_KINDS]
     assert len(of_arms) == 4 * len(arms)
     assert np.abs(vector_of(found, moved, legs)[of_arms]).min() > 1e-7
-
-
-# --- closed forms -------------------------------------------------------------------------------
-
-
-def trilaterated(centres: Array, length: float) -> Array:
-    """Return the point at one distance from three, below their plane."""
-    x = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
-    to_third = centres[2] - centres[0]
-    y = to_third - (to_third @ x) * x
-    y /= np.linalg.norm(y)
-    d = float(np.linalg.norm(centres[1] - centres[0]))
-    u = 0.5 * d
-    v = (to_third @ to_third - 2.0 * u * (to_third @ x)) / (2.0 * (to_third @ y))
-    z = np.cross(x, y)
-    w = np.sqrt(length**2 - u**2 - v**2) * -np.sign(z[2])
-    return np.asarray(centres[0] + u * x + v * y + w * z)
-
-
-def outwards(k: int) -> Array:
-    """Return the direction in which motor k stands."""
-    return np.array([np.cos(2.0 * np.pi * k / 3.0), np.sin(2.0 * np.pi * k / 3.0), 0.0])
-
-
-def test_a_delta_moves_by_its_closed_forms(tmp_path: Path) -> None:
-    """Compare with three spheres, and with the equation of one arm in its plane.
-
-    Both are those of R. Clavel, Conception d'un robot parallele rapide a 4 degres de liberte
-    (1991), and R. L. Williams II, The Delta Parallel Robot (2016).
-    """
-    R, r, arm, rod = 0.14, 0.045, 0.2, 0.4
-    size = Dimensions(family="delta", unit="mm", base_radius=140.0, platform_radius=45.0)
-    machine = create_model(description_of(None, size), tmp_path).machine
-    z = np.array([0.0, 0.0, 1.0])
-    for q in np.radians([[20.0, 20.0, 20.0], [5.0, 40.0, 25.0], [-20.0, 30.0, 60.0]]):
-        elbows = [
-            (R - r + arm * np.cos(a)) * outwards(k) - arm * np.sin(a) * z for k, a in enumerate(q)
-        ]
-        wanted = trilaterated(np.array(elbows), rod)
-        T = forward_kinematics(machine, np.repeat(q, 2))
-        np.testing.assert_allclose(T.translation, wanted, atol=1e-9)
-        assert T.rotation.magnitude() < 1e-9
-        for k in range(3):
-            x, height = R - r - wanted @ outwards(k), wanted[2]
-            beside = wanted @ np.cross(z, outwards(k))
-            K = (rod**2 - arm**2 - x**2 - beside**2 - height**2) / (2.0 * arm)
-            both = np.arctan2(height, x) + np.array([1.0, -1.0]) * np.arccos(
-                K / np.hypot(x, height)
-            )
-            turned = (both - q[k] + np.pi) % (2.0 * np.pi) - np.pi
-            assert np.abs(turned).min() < 1e-9
-        found = inverse_kinematics(machine, RigidTransform.from_translation(wanted))
-        np.testing.assert_allclose(found, np.repeat(q, 2), atol=1e-9)
-
-
-def test_linear_deltas_and_orthoglides_move_by_three_spheres() -> None:
-    machine = load_mechanism("linear-delta")
-    q, z = np.array([0.02, 0.11, 0.16]), np.array([0.0, 0.0, 1.0])
-    down = np.sqrt(0.4**2 - 0.19**2)
-    carriages = [0.19 * outwards(k) + (0.15 + down + a - 0.1) * z for k, a in enumerate(q)]
-    T = forward_kinematics(machine, np.repeat(q, 2))
-    np.testing.assert_allclose(T.translation, trilaterated(np.array(carriages), 0.4), atol=1e-9)
-    machine = load_mechanism("orthoglide")
-    p = np.array([0.03, -0.04, 0.05])
-    across = np.sqrt(0.4**2 - (p @ p - p**2))
-    wanted = p - across + 0.4 + 0.1  # of the carriages, at mid-travel at home
-    found = inverse_kinematics(machine, RigidTransform.from_translation(p))
-    np.testing.assert_allclose(found, np.repeat(wanted, 2), atol=1e-9)
-    T = forward_kinematics(machine, np.repeat(wanted, 2))
-    np.testing.assert_allclose(T.translation, p, atol=1e-9)
-    assert T.rotation.magnitude() < 1e-9
 
 
 # --- tables -------------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from legcal.data.dataset import load_dataset
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import USED, Reason, Rejection
-from legcal.errors import DatasetError
 from legcal.vision.board import FixedBoard
 
 __all__ = ["folder"]
@@ -122,10 +121,3 @@ def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path)
     assert corners.used.tolist() == [True, True, False]
     write_corners(tmp_path / "again.csv", corners, MEASUREMENTS)
     assert "c2,a.png,5,,,,rejected,hidden,edited" in (tmp_path / "again.csv").read_text()
-
-
-def test_corners_of_a_board_that_is_gone_are_refused_once(tmp_path: Path) -> None:
-    lines = [f"c1,c.png,{k},{5 + k},5.0,0.1,used,,detected" for k in range(30)]
-    with pytest.raises(DatasetError, match=r"corners up to 29, .*15 on the base") as caught:
-        _read(tmp_path, *lines)
-    assert len(caught.value.problems) == 1

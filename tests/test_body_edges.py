@@ -1,6 +1,5 @@
 """Straight edges of the bodies of legs: in the joint fit, in files, in photographs, in identify."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,25 +9,22 @@ import numpy as np
 import pytest
 import trimesh
 from fit_sessions import MachineSession, body_edges, machine_session
-from machines import ROOT
-from simulated import PLACES, settings, small_camera
+from machines import copied_model
+from simulated import settings, small_camera, standing
 
-from legcal import Viewpoint, calibrate, load_dataset, load_mechanism, simulate
+from legcal import calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
-from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor
-from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data.outlines import Outlines, no_outlines
+from legcal.data.outlines import no_outlines
 from legcal.data.reasons import Reason
-from legcal.files.motions import MotionEntry
 from legcal.machine.inspection import machine_document
-from legcal.machine.parameters import geometries, vector_of
+from legcal.machine.parameters import geometries
 from legcal.machine.shapes import SECTIONS, PlacedOccluders, bodies_of
 from legcal.perception.body_edges import bodies_in_view, edges_of_body
 from legcal.perception.photographs import nominal_placement
-from legcal.simulation.cameras import mild_lens, read_lens
+from legcal.simulation.cameras import mild_lens
 from legcal.simulation.settings import Level
 
 BODY = (
@@ -37,41 +33,25 @@ BODY = (
 )
 
 
-def without_leg(session: MachineSession, leg: int) -> Outlines:
-    return session.outlines.choose(session.outlines.leg != leg)
-
-
-def fitted(session: MachineSession, edges: Outlines | None, outlines: Outlines) -> Solution:
-    return refine(session.legs, session.measurements, outlines, session.start, edges=edges)
-
-
-def error(session: MachineSession, solution: Solution) -> float:
-    """Return the largest error of a joint centre [m]."""
-    pairs = zip(solution.legs, session.truth.legs, strict=True)
-    return float(max(np.abs(a.A - b.A).max() + np.abs(a.B - b.B).max() for a, b in pairs))
-
-
-def seldom_seen(outlines: Outlines) -> Outlines:
-    """Leave out the outlines of the first two legs in three of four images."""
-    return outlines.choose((outlines.leg > 1) | (outlines.row % 4 == 0))
+def without_leg(session: MachineSession, leg: int) -> MachineSession:
+    return replace(session, outlines=session.outlines.choose(session.outlines.leg != leg))
 
 
 def test_a_leg_with_a_body_and_no_round_part_is_found_exactly() -> None:
     session = machine_session("3-rps")
-    solution = fitted(session, body_edges(session), without_leg(session, 0))
-    assert error(session, solution) < 1e-7
-    start = zip(session.start.legs, session.truth.legs, strict=True)
-    assert max(np.abs(a.A - b.A).max() for a, b in start) > 1e-3
+    assert session.off(session.start.legs) > 1e-3
+    found = without_leg(session, 0).fit(edges=body_edges(session))
+    assert session.off(found.legs) < 1e-7
 
 
 def test_edges_make_a_machine_more_certain_and_know_their_noise() -> None:
+    """The first two legs are seen in one of four images."""
     session = machine_session("hexapod")
-    measurements, outlines = session.noisy(1)
-    noisy = replace(session, measurements=measurements)
-    few = seldom_seen(outlines)
-    edges = body_edges(session, 0.1, seed=2)
+    noisy, edges = session.noisy(1), body_edges(session, 0.1, seed=2)
+    o = noisy.outlines
+    few = replace(noisy, outlines=o.choose((o.leg > 1) | (o.row % 4 == 0)))
     claimed = replace(edges, covariance=0.25 * edges.covariance)  # half of the true noise
-    with_edges, rods = fitted(noisy, claimed, few), fitted(noisy, None, few)
+    with_edges, rods = few.fit(edges=claimed), few.fit()
     problem = with_edges.posterior.problem
     whitening = np.asarray(problem.factor("edges").whitening)
     scale = 1.0 / (problem.edges.sigma * whitening[:, 0, 0])
@@ -88,9 +68,7 @@ def test_edges_in_photographs_keep_errors_in_a_view() -> None:
     sigmas = []
     for of_photographs in (True, False):
         choices = Choices(of_photographs=of_photographs)
-        estimates = refine(
-            session.legs, session.measurements, others, session.start, edges=edges, choices=choices
-        ).estimates
+        estimates = others.fit(edges=edges, choices=choices).estimates
         of_leg = [name.startswith("leg1.") for name in estimates.names]
         sigmas.append(np.asarray(estimates.sigma)[of_leg])
     assert np.all(sigmas[0] > 1.1 * sigmas[1])
@@ -98,10 +76,8 @@ def test_edges_in_photographs_keep_errors_in_a_view() -> None:
 
 def test_edges_that_add_little_are_left_out() -> None:
     session = machine_session("hexapod")
-    measurements, outlines = session.noisy(1)
-    noisy = replace(session, measurements=measurements)
-    edges = body_edges(session, 2.0, seed=2)
-    with_edges, rods = fitted(noisy, edges, outlines), fitted(noisy, None, outlines)
+    noisy = session.noisy(1)
+    with_edges, rods = noisy.fit(edges=body_edges(session, 2.0, seed=2)), noisy.fit()
     assert with_edges.edges is not None
     assert np.all(with_edges.edges.rejected_for(Reason.LITTLE_GAIN))
     np.testing.assert_array_equal(with_edges.estimates.sigma, rods.estimates.sigma)
@@ -113,19 +89,12 @@ def test_wrong_edges_are_rejected_and_bodies_may_lean() -> None:
     wrong = np.arange(0, len(edges), 9)
     ends = edges.ends.copy()
     ends[wrong, 1] += 6.0
-    solution = fitted(session, replace(edges, ends=ends), without_leg(session, 0))
+    solution = without_leg(session, 0).fit(edges=replace(edges, ends=ends))
     assert solution.edges is not None
     rejected = np.flatnonzero(solution.edges.rejected_for(Reason.DISAGREES))
     assert set(wrong) - set(rejected) == set()
     assert len(rejected) < len(wrong) + 0.02 * len(edges)
-    estimates, names = solution.estimates, session.legs.parametrization.names
-    truth = dict(
-        zip(
-            names,
-            vector_of(session.legs.parametrization, session.truth.legs, session.legs.nominal),
-            strict=True,
-        )
-    )
+    estimates, truth = solution.estimates, session.true_values
     off = [estimates.values[name] - truth[name] for name in estimates.names if name in truth]
     sigma = [s for name, s in zip(estimates.names, estimates.sigma, strict=True) if name in truth]
     assert np.abs(np.divide(off, sigma)).max() < 4.0
@@ -136,17 +105,12 @@ def test_wrong_edges_are_rejected_and_bodies_may_lean() -> None:
 @pytest.fixture(scope="module")
 def with_bodies(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a hexapod whose legs have square bodies, the second one nothing else."""
-    folder = tmp_path_factory.mktemp("bodies")
-    text = (ROOT / "urdf/hexapod.urdf").read_text()
-    first = re.compile(r'(<link name="leg2_[^"]*">)<visual>.*?</visual>(</link>)')
-    text = first.sub(r"\1\2", text)
-    for j in range(1, 7):
-        text = text.replace(f'<link name="leg{j}_tube">', f'<link name="leg{j}_tube">{BODY}')
-    for kind, content in (("urdf", text), ("models", None)):
-        (folder / kind).mkdir()
-        file = folder / kind / f"hexapod.{'urdf' if content else 'yaml'}"
-        file.write_text(content or (ROOT / "models/hexapod.yaml").read_text())
-    return folder / "models/hexapod.yaml"
+
+    def with_boxes(text: str) -> str:
+        text = re.sub(r'(<link name="leg2_[^"]*">)<visual>.*?</visual>(</link>)', r"\1\2", text)
+        return re.sub(r'<link name="leg\d_tube">', rf"\g<0>{BODY}", text)
+
+    return copied_model(tmp_path_factory.mktemp("bodies"), "hexapod", with_boxes)
 
 
 def test_the_part_of_a_mesh_that_has_one_section_is_a_body(with_bodies: Path) -> None:
@@ -181,12 +145,7 @@ def test_the_part_of_a_mesh_that_has_one_section_is_a_body(with_bodies: Path) ->
 def test_a_leg_with_a_body_alone_is_identified_and_calibrated(
     with_bodies: Path, tmp_path: Path
 ) -> None:
-    places = json.loads(PLACES.read_text())["hexapod"]
-    views = tuple(
-        Viewpoint(name, mild_lens(), MotionEntry(**places[name]["T_base_camera"]).motion())
-        for name in ("c1", "c2")
-    )
-    made = simulate(with_bodies, tmp_path / "set", settings(views=views, poses=8))
+    made = simulate(with_bodies, tmp_path / "set", settings(views=standing("hexapod"), poses=8))
     dataset = load_dataset(made.folder)
     assert dataset.observations is not None
     assert dataset.body_edges is not None
@@ -202,10 +161,9 @@ def test_a_leg_with_a_body_alone_is_identified_and_calibrated(
 
 
 def test_edges_in_photographs_point_along_their_legs(with_bodies: Path, tmp_path: Path) -> None:
-    place = json.loads(PLACES.read_text())["hexapod"]["c1"]["T_base_camera"]
-    T = MotionEntry(**place).motion()
-    lens = read_lens(small_camera(tmp_path, 1000, 750))
-    seen_from = settings(level=Level.PHOTOGRAPHS, views=(Viewpoint("c1", lens, T),), poses=1)
+    views = standing("hexapod", 1, small_camera(tmp_path, 1000, 750))
+    T, lens = views[0].T_base_camera, views[0].camera
+    seen_from = settings(level=Level.PHOTOGRAPHS, views=views, poses=1)
     made = simulate(with_bodies, tmp_path / "set", seen_from)
     dataset, truth = load_dataset(made.folder), made.truth
     m = dataset.measurements
@@ -228,8 +186,7 @@ def test_edges_in_photographs_point_along_their_legs(with_bodies: Path, tmp_path
 
 def test_plans_count_edges_of_bodies(with_bodies: Path) -> None:
     machine, lens = load_mechanism(with_bodies), mild_lens()
-    place = json.loads(PLACES.read_text())["hexapod"]["c1"]["T_base_camera"]
-    views = {"c1": MotionEntry(**place).motion()}
+    views = {view.name: view.T_base_camera for view in standing("hexapod", 1)}
     home = machine.home_of_frames
     known = []
     for occluders in (machine.occluders, ()):

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from csv_rows import read_rows, write_rows
+from edits import document
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
 from scipy.spatial.transform import RigidTransform
 from simulated import files_of, simulated
@@ -86,13 +86,9 @@ def _rotated(folder: Path) -> None:
 
     for table in ("measurements.csv", "observations.csv"):
         _change(folder / table, lambda rows: [rotated(row) for row in [*rows[1:], rows[0]]])
-    for path in (folder / "dataset.yaml", folder / f"models/{PLANAR}.yaml"):
-        entry = yaml.safe_load(path.read_text())
-        if "views" in entry:
-            entry["views"] = rotated(entry["views"])
-        else:
-            entry["legcal"]["legs"] = rotated(entry["legcal"]["legs"])
-        path.write_text(yaml.safe_dump(entry, sort_keys=False))
+    document("dataset.yaml", lambda e: e.update(views=rotated(e["views"])))(folder)
+    legs = f"models/{PLANAR}.yaml"
+    document(legs, lambda e: e["legcal"].update(legs=rotated(e["legcal"]["legs"])))(folder)
 
 
 def _by_name(calibration: Calibration) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from legcal.vision.camera import (
     with_intrinsics,
 )
 from legcal.vision.camera_file import camera_info, convert_camera, read_camera
-from legcal.vision.cylinder import EPSILON, axis_of_outlines, outlines_of_axis
+from legcal.vision.cylinder import EPSILON, axis_of_outlines, outlines_of_axis, steps_to_outlines
 from legcal.vision.distortion import CameraProgram, DistortionModel
 
 FAST = settings(deadline=None, max_examples=40)
@@ -451,8 +451,8 @@ def test_eq03_outlines_are_the_planes_that_touch_the_cylinder(seed: int, s: floa
     h = outlines_of_axis(u, M, radius)
     np.testing.assert_allclose(np.linalg.norm(h, axis=-1), 1.0, atol=1e-12)
     np.testing.assert_allclose(h @ (M + s * u), EPSILON * radius, atol=1e-12)
-    for one, epsilon in zip(h, EPSILON, strict=True):
-        P = M - epsilon * radius * one  # on the generating line, of which it is the moment
+    for one, P in zip(h, M + steps_to_outlines(h, radius), strict=True):
+        # on the generating line, of which it is the moment
         assert distance_to_line(P, u, M) == pytest.approx(radius)
         m = moment(u, P)
         np.testing.assert_allclose(one, m / np.linalg.norm(m), atol=1e-9)

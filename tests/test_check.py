@@ -1,14 +1,13 @@
 """Change detection: rare false alarms, changes found and named, results read back as written."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from csv_rows import read_rows, write_rows
+from edits import added
 from simulated import files_of, simulated
 
 from legcal import Dataset, calibrate, check, load_dataset, load_mechanism
@@ -55,16 +54,6 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _simulated(tmp_path_factory.mktemp("new") / "set")
 
 
-def _edited(images: Path, folder: Path, table: str, edit: Callable[[dict[str, str]], Any]) -> Path:
-    """Copy images with every row of a table edited in place."""
-    shutil.copytree(images, folder)
-    rows = read_rows(folder / table)
-    for row in rows:
-        edit(row)
-    write_rows(folder / table, rows)
-    return folder
-
-
 def _of_leg(dataset: Dataset, leg: int) -> Dataset:
     assert dataset.observations is not None
     shown = dataset.observations.choose(dataset.observations.leg == leg)
@@ -89,13 +78,21 @@ def test_a_machine_that_was_left_alone_has_not_moved(result: Path, images: Path)
     assert files_of(images) == before
 
 
+def test_many_images_contradict_a_result_of_few_by_no_more_than_its_errors(
+    result: Path, images: Path, tmp_path: Path
+) -> None:
+    calibrate(images, output=tmp_path / "few")
+    found = check(result.parent / "set", tmp_path / "few")
+    assert not found.movement.moved
+    assert found.movement.p_value > found.movement.significance
+
+
 def test_an_encoder_that_slipped_is_found_with_its_size(
     result: Path, images: Path, tmp_path: Path
 ) -> None:
-    def slip(row: dict[str, str]) -> None:
-        row["leg2_prismatic"] = repr(float(row["leg2_prismatic"]) - 3e-4)
-
-    found = check(_edited(images, tmp_path / "slipped", "measurements.csv", slip), result)
+    slipped = Path(shutil.copytree(images, tmp_path / "slipped"))
+    added("measurements.csv", "leg2_prismatic", -3e-4)(slipped)
+    found = check(slipped, result)
     assert found.movement.moved
     best = found.movement.explanations[0]
     assert best.what == "offset of leg2"

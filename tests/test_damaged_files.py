@@ -7,7 +7,8 @@ import pytest
 import yaml
 from fuzzing.mutations import mutate
 from fuzzing.running import count_cases, drawn_cases
-from made_inputs import ROOT, made_input
+from machines import copied_model
+from made_inputs import made_input
 
 from legcal import LegcalError, load_mechanism
 from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
@@ -55,9 +56,7 @@ def test_text_from_files_is_shown_on_one_short_line_without_control_characters()
 
 
 def test_a_hyphen_inside_a_name_is_part_of_it(tmp_path: Path) -> None:
-    for name in ("models/hexapod.yaml", "urdf/hexapod.urdf"):
-        text = (ROOT / name).read_text().replace("leg1_prismatic", "leg1-prismatic=a@b+c")
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_text(text)
-    machine = load_mechanism(tmp_path / "models/hexapod.yaml")
-    assert "leg1-prismatic=a@b+c" in machine.urdf.joints
+    name = "leg1-prismatic=a@b+c"
+    path = copied_model(tmp_path, "hexapod", lambda text: text.replace("leg1_prismatic", name))
+    path.write_text(path.read_text().replace("leg1_prismatic", name))
+    assert name in load_mechanism(path).urdf.joints

@@ -44,30 +44,6 @@ def test_a_dataset_is_named_by_its_folder_or_its_file(
         np.testing.assert_array_equal(load_dataset(name).measurements.q, expected.measurements.q)
 
 
-def test_a_dataset_that_went_without_its_model_says_so(folder: Folder) -> None:
-    folder.entry["mechanism"] = "../models/own.yaml"
-    folder.write()
-    with pytest.raises(DatasetError, match=r"mechanism could not be used: found '../models/own"):
-        load_dataset(folder.path)
-
-
-def test_a_misspelt_name_of_a_shipped_model_is_recognised(folder: Folder) -> None:
-    folder.entry["mechanism"] = "hexapd"
-    folder.write()
-    with pytest.raises(DatasetError, match=r"found 'hexapd', no file there.*mean 'hexapod'"):
-        load_dataset(folder.path)
-
-
-@pytest.mark.parametrize("version", [0, 2, "2"])
-def test_other_versions_of_a_dataset_need_the_legcal_that_wrote_them(
-    folder: Folder, version: object
-) -> None:
-    folder.entry["legcal_dataset"] = version
-    folder.write()
-    with pytest.raises(DatasetError, match="needed version 1; use the legcal that wrote it"):
-        load_dataset(folder.path)
-
-
 def test_empty_columns_at_the_end_of_a_table_are_none(folder: Folder) -> None:
     expected, table = read(folder).q, folder.path / "measurements.csv"
     table.write_text("".join(f"{line},,\n" for line in table.read_text().splitlines()))

@@ -1,7 +1,5 @@
 """Geometry that is nearly or quite degenerate: the right answer, or what is missing, by name."""
 
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from csv_rows import read_rows, write_rows
+from edits import cell, keyed
 from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
@@ -87,11 +86,7 @@ def test_a_reading_out_of_reach_is_named(tmp_path: Path) -> None:
     model = legcal.load_mechanism("3-rpr")
     poses = with_pose(tmp_path, model, READINGS[0])
     folder = simulated(tmp_path / "set", "3-rpr", poses=poses, views=1).folder
-    table = folder / "measurements.csv"
-    lines = table.read_text().splitlines()
-    typed = lines[4].split(",")
-    lines[4] = ",".join([*typed[:-3], "0.0001", "0.0001", "0.0001"])
-    table.write_text("\n".join(lines) + "\n")
+    cell("measurements.csv", 4, **dict.fromkeys(model.motor_names, "0.0001"))(folder)
     with pytest.raises(
         DatasetError, match=r"readings of view c1, image p04 could not be used"
     ) as refused:
@@ -116,29 +111,18 @@ def test_a_3_upu_near_its_constraint_singularity_is_refused_and_at_it_is_named(
     assert any("is singular at home" in note for note in models[319.9].diagnostics)
 
 
-@pytest.fixture(scope="module")
-def two_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Outlines of a hexapod in two views."""
-    folder = tmp_path_factory.mktemp("two") / "set"
-    return simulated(folder, "hexapod", poses=6, seed=1).folder
-
-
 @pytest.mark.system
-def test_a_leg_that_no_view_shows_is_found_from_its_readings(
-    two_views: Path, tmp_path: Path
-) -> None:
+def test_a_leg_that_no_view_shows_is_found_from_its_readings(tmp_path: Path) -> None:
     """Legs 1 to 5 are named in the views, leg 6 in none: its encoder says where it is."""
-    folder = Path(shutil.copytree(two_views, tmp_path / "set"))
+    folder = simulated(tmp_path / "set", "hexapod", poses=6, seed=1).folder
     rows = read_rows(folder / "observations.csv")
     write_rows(folder / "observations.csv", [row for row in rows if row["leg"] != "leg6"])
     with pytest.raises(
         NotVisible, match=r"no image has a usable outline of leg6; .* list the visible legs of each"
     ):
         calibrate(folder)
-    text = (folder / "dataset.yaml").read_text()
-    text = re.sub(r"    legs: .*\n", "", text)
-    five = "    legs: [leg1, leg2, leg3, leg4, leg5]\n    T_base_camera:"
-    (folder / "dataset.yaml").write_text(text.replace("    T_base_camera:", five))
+    five = [f"leg{j}" for j in range(1, 6)]
+    keyed("dataset.yaml", views__c1__legs=five, views__c2__legs=five)(folder)
     calibration = calibrate(folder, output=tmp_path / "out")
     before, after = errors(calibration, folder, tmp_path / "out")
     assert calibration.verdict.trustworthy

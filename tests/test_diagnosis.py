@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from csv_rows import read_rows, write_rows
+from edits import cell
 from hexapod_example import spoiled
 from simulated import settings, simulated
 from thinned import thinned
 
-from legcal import Dataset, calibrate, load_dataset, simulate
+from legcal import Dataset, calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.leg_names import _permuted
@@ -349,11 +349,8 @@ def test_readings_in_the_order_of_text_are_named(
 def test_an_encoder_that_never_moves_is_named_before_what_it_leaves_open(tmp_path: Path) -> None:
     folder = tmp_path / "set"
     simulate("delta", folder, settings(poses=2))
-    rows = read_rows(folder / "measurements.csv")
-    column = [name for name in rows[0] if name not in ("view", "image", "pose", "time")][1]
-    for row in rows:
-        row[column] = rows[0][column]
-    write_rows(folder / "measurements.csv", rows)
+    column = load_mechanism("delta").motor_names[1]
+    cell("measurements.csv", None, **{column: "0.1"})(folder)
     with pytest.raises(NotIdentifiable) as refused:
         calibrate(folder)
     assert column in refused.value.problems[0]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import run
-from csv_rows import read_rows, write_rows
+from edits import each_row
 from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg, undecodable_png
 from simulated import simulated
@@ -73,12 +73,13 @@ def test_photographs_that_cannot_be_used_are_named_and_the_others_judged(tmp_pat
 
 def test_readings_are_compared_with_their_travel(tmp_path: Path) -> None:
     folder = simulated(tmp_path / "set", "hexapod", poses=2, views=3).folder
-    rows = read_rows(folder / "measurements.csv")
-    for row in rows:
+
+    def rounded(row: dict[str, str]) -> None:
         row |= {name: f"{float(row[name]):.4f}" for name in COLUMNS}
         row["leg5_prismatic"] = "0.0500"
         row["leg3_prismatic"] = f"{float(row['leg3_prismatic']) / 50.0 + 0.02:.4f}"
-    write_rows(folder / "measurements.csv", rows)
+
+    each_row("measurements.csv", rounded)(folder)
     found = doctor(folder)
     constant, still = found_of(found, "readings", "warning")
     assert "found the same reading in all rows of leg5_prismatic" in constant.what

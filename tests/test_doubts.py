@@ -12,9 +12,8 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-import yaml
 from command_line import run
-from csv_rows import read_rows, write_rows
+from edits import GONE, Edit, document, each_row, keyed
 from hexapod_example import Run
 from lxml import html
 from rich.console import Console
@@ -52,17 +51,14 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulated(tmp_path_factory.mktemp("doubts") / "set", "3-rpr", poses=10, views=3).folder
 
 
-Spoil = Callable[[Path], None]
-
-
 @pytest.fixture(scope="module")
 def calibrated(
     session: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[Spoil], Calibration]:
+) -> Callable[[Edit], Calibration]:
     """Calibrations of that session after something was done to it, each made once."""
 
     @cache
-    def after(spoil: Spoil) -> Calibration:
+    def after(spoil: Edit) -> Calibration:
         folder = _copy(session, tmp_path_factory.mktemp("spoiled"))
         spoil(folder)
         return calibrate(folder)
@@ -75,7 +71,7 @@ def _nothing(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def healthy(calibrated: Callable[[Spoil], Calibration]) -> Calibration:
+def healthy(calibrated: Callable[[Edit], Calibration]) -> Calibration:
     """The calibration of that session."""
     return calibrated(_nothing)
 
@@ -84,31 +80,12 @@ def _copy(session: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(session, tmp_path / "set"))
 
 
-def _table(name: str, change: Callable[[dict[str, str]], None]) -> Spoil:
-    def changed(folder: Path) -> None:
-        rows = read_rows(folder / name)
-        for row in rows:
-            change(row)
-        write_rows(folder / name, rows)
-
-    return changed
-
-
-def _yaml(change: Callable[[dict[str, Any]], None]) -> Spoil:
-    def changed(folder: Path) -> None:
-        found = yaml.safe_load((folder / "dataset.yaml").read_text())
-        change(found)
-        (folder / "dataset.yaml").write_text(yaml.safe_dump(found, sort_keys=False))
-
-    return changed
-
-
-def _rejected(is_out: Callable[[dict[str, str]], bool], why: str = "faint") -> Spoil:
+def _rejected(is_out: Callable[[dict[str, str]], bool], why: str = "faint") -> Edit:
     def change(row: dict[str, str]) -> None:
         if is_out(row):
             row |= {"verdict": "rejected", "reason": why}
 
-    return _table("observations.csv", change)
+    return each_row("observations.csv", change)
 
 
 def _number(name: str) -> int:
@@ -120,7 +97,7 @@ def _backlash(row: dict[str, str]) -> None:
         row["leg1_prismatic"] = str(float(row["leg1_prismatic"]) + 1e-3)
 
 
-BACKLASH = _table("measurements.csv", _backlash)
+BACKLASH = each_row("measurements.csv", _backlash)
 
 
 def _stretched(row: dict[str, str]) -> None:
@@ -138,13 +115,13 @@ def _tolerance_and_hint(found: dict[str, Any]) -> None:
     found["views"]["c2"]["T_base_camera"]["xyz"][0] += 0.3
 
 
-_stated_wrongly = _yaml(_tolerance_and_hint)
+_stated_wrongly = document("dataset.yaml", _tolerance_and_hint)
 
 
 @pytest.mark.parametrize(
     ("code", "spoil", "said"),
     [
-        ("noise", _table("observations.csv", _overrated), "all views scatter"),
+        ("noise", each_row("observations.csv", _overrated), "all views scatter"),
         ("reading_noise", BACKLASH, "leg1 scatter"),
         ("view_left_out", _rejected(lambda row: row["view"] == "c3"), "view c3"),
         ("images_left_out", _rejected(lambda row: _number(row["image"]) % 3 == 0), "10 of 30"),
@@ -156,11 +133,11 @@ _stated_wrongly = _yaml(_tolerance_and_hint)
         ),
         ("tolerance", _stated_wrongly, "tolerance 0.02"),
         ("strayed_camera", _stated_wrongly, "view c2"),
-        ("scale", _table("measurements.csv", _stretched), "travel of the motors alone"),
+        ("scale", each_row("measurements.csv", _stretched), "travel of the motors alone"),
     ],
 )
 def test_a_doubt_is_raised_by_what_it_is_about(
-    code: str, spoil: Spoil, said: str, calibrated: Callable[[Spoil], Calibration]
+    code: str, spoil: Edit, said: str, calibrated: Callable[[Edit], Calibration]
 ) -> None:
     calibration = calibrated(spoil)
     (doubt,) = [one for one in calibration.doubts if one.code == code]
@@ -318,8 +295,8 @@ def test_the_first_screen_has_24_lines_of_80_columns(
 
 @pytest.mark.parametrize("spoil", [_nothing, BACKLASH])
 def test_exit_code_document_summary_and_page_agree(
-    spoil: Spoil,
-    calibrated: Callable[[Spoil], Calibration],
+    spoil: Edit,
+    calibrated: Callable[[Edit], Calibration],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -362,13 +339,11 @@ def test_tolerances_are_stated_with_units_or_by_the_kind_of_machine(
     folder = _copy(session, tmp_path)
     stated = {"joints": "0.3 mm", "axes": "0.5 deg", "lengths": 1e-4, "zeros": "5 deg"}
     stated["travel"] = "0.02%"
-    _yaml(lambda found: found.update(tolerance=stated))(folder)
+    keyed("dataset.yaml", tolerance=stated)(folder)
     tolerance = load_dataset(folder).machine.tolerance
     assert tolerance == Tolerance(3e-4, np.radians(0.5), 1e-4, None, np.radians(5.0), 2e-4)
     model = next((folder / "models").glob("*.yaml"))
-    mechanism = yaml.safe_load(model.read_text())
-    mechanism["legcal"]["machine_kind"] = "printed"
-    model.write_text(yaml.safe_dump(mechanism))
+    keyed(model.name, legcal__machine_kind="printed")(model.parent)
     assert load_dataset(folder).machine.tolerance == tolerance
-    _yaml(lambda found: found.pop("tolerance"))(folder)
+    keyed("dataset.yaml", tolerance=GONE)(folder)
     assert load_dataset(folder).machine.tolerance == TYPICAL["printed"]

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from dense_fit import jacobian, residuals
 
 from legcal.errors import DidNotConverge
 from legcal.estimation.loss import Huber, PseudoHuber
@@ -88,15 +89,9 @@ def test_exact_measurements_are_explained_exactly(loss: PseudoHuber | Huber) -> 
 def test_elimination_gives_the_covariance_of_the_whole_system(n_open: int) -> None:
     problem = waves(np.random.default_rng(1), all_free(N_SHARED, 1), 0.1, n_open)
     linear = linearize(problem, AWAY)
-    rows, where = linear["values"], problem.sparsity["values"]
-    J = np.zeros((len(rows.r), problem.size))
-    J[:, :N_SHARED] = rows.J[:, 0]
-    for i, k in enumerate(np.repeat(np.arange(N_ELEMENTS), N_EACH).tolist()):
-        J[i, N_SHARED + 2 * k : N_SHARED + 2 * k + 2] = rows.J_element[i, 0]
-    H = J.T @ J
-    H[0, 0] += 0.5**-2
-    assert np.array_equal(where.index, np.tile(np.arange(N_SHARED), (len(J), 1)))
-    covariance = np.linalg.pinv(H, hermitian=True)[:N_SHARED, :N_SHARED]
+    J, index = jacobian(problem, linear), problem.sparsity["values"].index
+    assert np.array_equal(index, np.tile(np.arange(N_SHARED), (N_ELEMENTS * N_EACH, 1)))
+    covariance = np.linalg.pinv(J.T @ J, hermitian=True)[:N_SHARED, :N_SHARED]
     mine = named_covariance(linear, information(linear).kept_covariance())
     np.testing.assert_allclose(mine, covariance, rtol=1e-9)
 
@@ -107,15 +102,9 @@ def test_blocks_that_are_left_out_are_predicted_as_by_the_rest_alone(n_open: int
     state = minimise(problem, AWAY).state
     linear, block = linearize(problem, state), np.array([0, 1, 0, 2, 1])
     left_out = left_out_blocks(linear, block)
-    rows, element = linear["values"], np.repeat(np.arange(N_ELEMENTS), N_EACH)
-    J = np.zeros((len(element) + 1, problem.size))
-    J[:-1, :N_SHARED] = rows.J[:, 0]
-    for i, k in enumerate(element.tolist()):
-        J[i, N_SHARED + 2 * k : N_SHARED + 2 * k + 2] = rows.J_element[i, 0]
-    J[-1, 0] = 0.5**-1
-    r = np.append(rows.r[:, 0], linear.prior_r)
+    J, r = jacobian(problem, linear), residuals(problem, state)
     for b in range(3):
-        is_inside = np.append(block[element] == b, False)
+        is_inside = np.append(np.repeat(block == b, N_EACH), False)  # without the prior
         rest, own = J[~is_inside], np.repeat(block == b, 2)
         x = -np.linalg.pinv(rest) @ r[~is_inside]
         known, offsets = ~np.append(np.zeros(N_SHARED, dtype=bool), own), J[is_inside]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
+from edits import keyed
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -257,9 +257,7 @@ def test_a_calibrated_printer_prints_with_what_was_exported(tmp_path: Path) -> N
     made = SimulationSettings(Level.OUTLINES, perfect, poses=8, sampling="workspace", seed=4)
     folder = tmp_path / "session"
     simulate(true, folder, made)
-    dataset = folder / "dataset.yaml"
-    entries = yaml.safe_load(dataset.read_text()) | {"mechanism": str(nominal.yaml_path)}
-    dataset.write_text(yaml.safe_dump(entries))
+    keyed("dataset.yaml", mechanism=str(nominal.yaml_path))(folder)
     calibrate(folder, output=tmp_path / "out")
     exported = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg")
     before, after = off_by(KLIPPER, true), off_by(exported.paths[0].read_text(), true)

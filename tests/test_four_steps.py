@@ -32,7 +32,7 @@ def shipped(name: str, n_poses: int = 6, noise: float = 0.0, seed: int = 0) -> M
     The noise counts in that of 0.2 px at the ends of an outline.
     """
     session = machine_session(name, n_poses=n_poses)
-    return session.with_noise(noise, seed) if noise > 0.0 else session
+    return session.noisy(seed, noise) if noise > 0.0 else session
 
 
 def staged(session: MachineSession, criteria: Criteria = "default") -> StagedResult:

@@ -1,6 +1,6 @@
 """Platforms that readings do not place: moved by hand, or with fewer motors than freedoms."""
 
-from functools import cache
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +8,13 @@ import pytest
 from dataset_folder import Folder, folder
 from fit_sessions import machine_session, with_boards
 from layouts import Layout, MachineSpec, write_machine
-from leg_pictures import clutter, edges, segments
-from machines import SHIPPED_URDF, SHIPPED_YAML, of_types
+from leg_pictures import clutter, edges, motion, segments
+from machines import by_hand, of_types
 from outline_sessions import made
-from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, small_camera
 
 import legcal
-from legcal import LegcalError, Machine, load_mechanism, simulate
-from legcal.calibration.joint_fit.fit import refine
+from legcal import LegcalError, load_mechanism, simulate
 from legcal.data.landmarks import Landmarks, place_by_landmarks, platforms_by_landmarks
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason, Rejection
@@ -48,16 +46,6 @@ def drawn(kind: str) -> MachineSpec:
     return of_types(types, kinds)
 
 
-def without_motors(machine: Path, *left: str) -> Path:
-    """Write a model with some of its motors only."""
-    text = machine.read_text()
-    for line in text.split("name_mot:")[1].split("\njoint_name")[0].splitlines():
-        if line.strip(" -") and line.strip(" -") not in left:
-            text = text.replace(f"{line}\n", "", 1)
-    machine.write_text(text if left else text.replace("name_mot:\n", "name_mot: []\n"))
-    return machine
-
-
 # --- ranks --------------------------------------------------------------------------------------
 
 
@@ -81,33 +69,15 @@ def test_ranks_are_those_of_a_dense_jacobian(
 # --- recognition --------------------------------------------------------------------------------
 
 
-@cache
-def by_hand(n_motors: int, folder: Path) -> Machine:
-    """The shipped hexapod with some of its motors."""
-    path = folder / "hexapod.yaml"
-    path.write_text(SHIPPED_YAML.read_text().replace("../urdf/hexapod.urdf", str(SHIPPED_URDF)))
-    motors = [f"leg{j}_prismatic" for j in range(1, n_motors + 1)]
-    return load_mechanism(without_motors(path, *motors))
-
-
 def test_poses_are_found_by_clicks(tmp_path: Path) -> None:
-    machine, rng = by_hand(0, tmp_path), np.random.default_rng(0)
+    machine, rng = load_mechanism(by_hand(tmp_path)), np.random.default_rng(0)
     true = [
         look_at(1.1 * np.array([np.cos(a), np.sin(a), 0.4]), np.array([0.0, 0.0, 0.2]))
         for a in (0.4, 2)
     ]
-    rough = [
-        T
-        * RigidTransform.from_components(
-            rng.normal(0.0, 0.01, 3), Rotation.from_rotvec(rng.normal(0.0, 0.015, 3))
-        )
-        for T in true
-    ]
+    rough = [T * motion(rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.015, 3)) for T in true]
     T = [
-        machine.home
-        * RigidTransform.from_components(
-            rng.uniform(-0.06, 0.06, 3), Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3))
-        )
+        machine.home * motion(rng.uniform(-0.06, 0.06, 3), rng.uniform(-0.2, 0.2, 3))
         for _ in range(3)
     ]
     B = np.array([one.apply(machine.B_platform) for one in T])[[0, 1, 2, 2]]
@@ -181,9 +151,8 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     session = machine_session(str(path), n_views=2, n_poses=10)
     pose = session.measurements.pose[session.outlines.row]
     few = session.outlines.choose((pose > 3) | (session.outlines.leg == 0))
-    found = refine(session.legs, session.measurements, few, session.start)
-    for leg, true in zip(found.legs, session.truth.legs, strict=True):
-        assert np.abs(np.concatenate([leg.A - true.A, leg.B - true.B])).max() < 1e-7
+    found = replace(session, outlines=few).fit()
+    assert session.off(found.legs) < 1e-7
     open_ones = session.measurements.pose[few.row] < 4
     np.testing.assert_array_equal(found.outlines.used, ~open_ones)
     assert {why for why, out in zip(found.outlines.reason, open_ones, strict=True) if out} == {
@@ -227,7 +196,7 @@ def test_photographs_of_a_platform_that_motors_leave_a_freedom_are_calibrated(
 
 def free_set(folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Return a dataset of a hexapod of three motors, of whose views one has no rough camera."""
-    machine = by_hand(3, tmp_path)
+    machine = load_mechanism(by_hand(tmp_path, [f"leg{j}_prismatic" for j in (1, 2, 3)]))
     monkeypatch.setattr("legcal.data.dataset.load_mechanism", lambda path: machine)
     folder.columns = folder.columns[:5]
     folder.entry["views"]["c2"].pop("legs")
@@ -272,7 +241,7 @@ def test_a_fit_that_fails_without_any_length_says_what_to_measure(
     session = machine_session(str(path), n_views=1, n_poses=3)
     some = session.outlines.choose(session.outlines.leg < 4)
     with pytest.raises(LegcalError) as refusal:
-        refine(session.legs, session.measurements, some, session.start)
+        replace(session, outlines=some).fit()
     first = refusal.value.problems[0]
     assert ("no measured length" in first and "board on the platform" in first) == says
 
@@ -282,8 +251,5 @@ def test_legs_and_a_board_on_the_platform_calibrate_what_is_moved_by_hand(tmp_pa
     path = write_machine(tmp_path, drawn("6-UPS by hand"), Layout())
     session = machine_session(str(path), n_poses=8)
     seen, start = with_boards(session, base=False)
-    found = refine(session.legs, session.measurements, session.outlines, start, board=seen)
-    off = session.legs.vector(session.start.legs) - session.legs.vector(session.truth.legs)
-    left = session.legs.vector(found.legs) - session.legs.vector(session.truth.legs)
-    assert np.abs(off).max() > 2e-3
-    assert np.abs(left).max() < 1e-9
+    assert session.off(session.start.legs) > 2e-3
+    assert session.off(session.fit(start, board=seen).legs) < 1e-9

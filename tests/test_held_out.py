@@ -4,17 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from fit_sessions import PINHOLE, MachineSession, irregular_hexapod
+from fit_sessions import MachineSession, irregular_hexapod
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import Holdout
-from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.held_out import Posterior, compare_held_out
 from legcal.calibration.joint_fit.variables import start_from
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import IntArray
-from legcal.simulation.observe import moved_outlines
 
 N_SEEDS = 2
 SHARED = 0.15  # [px], the error that each edge of each leg has in all images of a view
@@ -46,17 +44,18 @@ def _of_rows(
 
 def _held_out(session: MachineSession, seed: int) -> HeldOut:
     rng = np.random.default_rng(seed)
-    measurements, outlines = session.noisy(rng)
+    noisy = session.noisy(rng)
+    measurements, outlines = noisy.measurements, noisy.outlines
     edge = np.stack([measurements.view[outlines.row], outlines.leg, outlines.edge - 1])
     errors = SHARED * rng.standard_normal((3, 6, 2))
-    outlines = moved_outlines(outlines, PINHOLE, np.repeat(errors[tuple(edge)][:, None], 2, axis=1))
+    outlines = noisy.moved(np.repeat(errors[tuple(edge)][:, None], 2, axis=1)).outlines
     is_held_out = np.arange(measurements.n_rows) % 4 == 2
     (fitted, shown, start), (held_out, kept, near) = (
         _of_rows(session, measurements, outlines, rows)
         for rows in (np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out))
     )
     begin = replace(session.start, T_Rb_Re=start)
-    solution = refine(session.legs, fitted, shown, begin)
+    solution = replace(session, measurements=fitted, outlines=shown).fit(begin)
     assert max(map(abs, solution.posterior.biases.values()), default=0.0) > 0.02  # [px]
     poses = start_from(solution.legs, held_out, session.legs, (), near, "").T_Rb_Re
     return HeldOut(solution.posterior, held_out, kept, poses)

@@ -10,18 +10,12 @@ from command_line import Outcome, run
 from csv_rows import read_rows
 from hexapod_example import HEXAPOD
 from photograph_files import exif, jpeg
+from simulated import small_camera
 
 from legcal import load_dataset
 from legcal.vision.image_file import camera_of_photographs, read_facts
 
 PICTURE = np.zeros((48, 64), np.uint8)
-CAMERA = """image_width: 64
-image_height: 48
-camera_name: c
-camera_matrix: {rows: 3, cols: 3, data: [80, 0, 32, 0, 80, 24, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
-"""
 LEGS = [f"leg{j}" for j in range(1, 7)]
 
 
@@ -34,7 +28,7 @@ def own_folder(
         path.parent.mkdir(parents=True, exist_ok=True)
         said = {"taken": taken[name]} if taken else {}
         path.write_bytes(jpeg(PICTURE + np.uint8(k), block=exif(**said)))
-    (tmp_path / "camera_info.yaml").write_text(CAMERA)
+    small_camera(tmp_path, 64, 48).rename(tmp_path / "camera_info.yaml")
     return tmp_path
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from edits import keyed
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
 from machines import MACHINES, displaced, of_types, ring, write_home
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -22,6 +22,7 @@ from legcal import (
     singularity,
 )
 from legcal.errors import DidNotConverge, ModelError, NotIdentifiable, UsageError
+from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.types import Array
 from legcal.machine.configurations import Configurations
 from legcal.machine.equations import pose_equations
@@ -192,10 +193,7 @@ def test_a_rounded_home_closes(description: str, carried: bool, tmp_path: Path) 
     rounded = RigidTransform.from_matrix(np.round(drawn.home.as_matrix(), 4))
     assert np.abs(rounded.as_matrix() - drawn.home.as_matrix()).max() > 1e-6
     path = write_machine(tmp_path, drawn, CARRIED if carried else Layout())
-    document = yaml.safe_load(path.read_text())
-    xyz, quat = rounded.translation.tolist(), rounded.rotation.as_quat().tolist()
-    document["legcal"]["home"] = {"xyz": xyz, "quat_xyzw": quat}
-    path.write_text(yaml.safe_dump(document))
+    keyed(path.name, legcal__home=motion_to_xyz_quat(rounded))(tmp_path)
     machine = load_mechanism(path)
     check_closed(machine)
     T = forward_kinematics(machine, inverse_kinematics(machine, machine.home))

@@ -1,26 +1,33 @@
-"""Intrinsics whose camera file states a covariance are unknowns of the joint fit, known by it."""
+"""Intrinsics whose camera file states a covariance are unknowns of the joint fit, known by it.
+
+Camera files that the measurements contradict are named, with what they do to the parameters.
+"""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from fit_sessions import LENS, MachineSession, machine_session, with_camera
+from edits import keyed
+from fit_sessions import LENS, PINHOLE, MachineSession, irregular_hexapod, machine_session
 from simulated import simulated
 from thinned import thinned
 
 from legcal import calibrate, check, load_dataset
 from legcal.calibration.documents import Result
-from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.calibration.joint_fit.sensitivity import EXACT_CAMERAS, INTRINSICS, SIGMA_EXACT
+from legcal.calibration.joint_fit.sensitivity import (
+    EXACT_CAMERAS,
+    FITTED_CAMERA,
+    INTRINSICS,
+    SIGMA_EXACT,
+)
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
+from legcal.vision.camera_file import read_camera
 
 pytestmark = pytest.mark.usefixtures("without_steps")
 
@@ -44,21 +51,12 @@ COVARIANCE = _covariance()
 @cache
 def session(seed: int | None = 0, n_poses: int = 5) -> MachineSession:
     exact = machine_session("hexapod", n_poses=n_poses)
-    if seed is None:
-        return exact
-    measurements, outlines = exact.noisy(seed)
-    return replace(exact, measurements=measurements, outlines=outlines)
+    return exact if seed is None else exact.noisy(seed)
 
 
-def fitted(
-    given: MachineSession, camera: Camera, choices: Choices | None = None, views: Sequence[int] = ()
-) -> Solution:
-    """Return the fit of the pixels of a session with another camera; some views state nothing."""
-    m, o = with_camera(given.measurements, given.outlines, camera)
-    bare = replace(camera, covariance=None)
-    kept = tuple(replace(v, camera=bare) if i in views else v for i, v in enumerate(m.views))
-    m = replace(m, views=kept)
-    return refine(given.legs, m, o, given.start, choices=choices or Choices())
+def fitted(given: MachineSession, camera: Camera) -> Solution:
+    """Return the fit of the pixels of a session with another camera."""
+    return given.with_camera(camera).fit()
 
 
 def moved(away: Array, covariance: Array | None = COVARIANCE) -> Camera:
@@ -88,19 +86,11 @@ def test_an_exact_focal_length_may_be_off_by_what_the_images_leave_of_it() -> No
         fitted(session(None), moved(part * by_focal, None)) for part in (0.0, SIGMA_EXACT)
     )
     left = right.sensitivities[EXACT_CAMERAS][:, 0]
-    change = session().legs.vector(wrong.legs) - session().legs.vector(right.legs)
+    change = session().errors(wrong.legs) - session().errors(right.legs)
     sizes = np.linalg.norm(left), np.linalg.norm(change)
     assert left @ change > 0.9 * np.prod(sizes)
     assert 1e-3 < sizes[0] / sizes[1] < 1.0  # images know a part of it
     assert EXACT_CAMERAS not in fitted(session(), moved(0.0 * SIGMA)).sensitivities
-
-
-def errors(given: MachineSession, found: Solution) -> float:
-    """Return e' C^-1 e of the kinematic parameters over their number."""
-    e = given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)
-    sigma = np.sqrt(np.diagonal(found.kinematic.value_covariance))
-    z, correlation = e / sigma, found.kinematic.value_covariance / np.outer(sigma, sigma)
-    return float(z @ np.linalg.solve(correlation, z)) / len(e)
 
 
 def said_of_cameras(found: Solution) -> list[str]:
@@ -115,10 +105,10 @@ def test_errors_of_a_drawn_camera_are_those_that_the_fit_states() -> None:
         given = session(seed)
         away = np.append(root @ rng.standard_normal(len(NAMES) - 1), 0.0)
         found = fitted(given, moved(away))
-        honest.append(errors(given, found))
+        honest.append(given.squares(found))
         assert said_of_cameras(found) == []
         if seed < 1:
-            exact.append(errors(given, fitted(given, moved(away, None))))
+            exact.append(given.squares(fitted(given, moved(away, None))))
     n = 3 * len(session().legs.parametrization)
     assert abs(np.mean(honest) - 1.0) < 4.0 * np.sqrt(2.0 / n)
     assert np.mean(exact) > 2.0
@@ -134,7 +124,7 @@ def test_intrinsics_of_exact_pictures_are_found() -> None:
     assert not any(name.startswith(others) for name in found.estimates.values)
     assert found.cameras[2].K is not LENS.K
     np.testing.assert_allclose(found.cameras[2].K, LENS.K, atol=1e-4)
-    assert np.abs(given.legs.vector(found.legs) - given.legs.vector(given.truth.legs)).max() < 1e-7
+    assert given.off(found.legs) < 1e-7
 
 
 def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
@@ -144,7 +134,8 @@ def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
         free=frozenset({"c1.cx"}),
         priors={"c1.cy": Prior(380.5, 1e-6)},
     )
-    stated, chosen = fitted(session(), camera), fitted(session(), camera, choices)
+    given = session().with_camera(camera)
+    stated, chosen = given.fit(), given.fit(choices=choices)
     assert "c1.fx" not in chosen.estimates.values
     assert "c1.cx" not in chosen.estimates.prior_sigma
     fy = [found.estimates.prior_sigma["c1.fy"] for found in (chosen, stated)]
@@ -161,11 +152,7 @@ def test_what_the_owner_chooses_leaves_the_covariance_of_the_file() -> None:
     thinned(
         [
             ("f", 0.01, ("focal length of c1", "given 1302.9 px", "same focus and zoom")),
-            (
-                "cx",
-                25.0,
-                ("principal point of c1", "given (543.0, 380.0) px", "same focus and zoom"),
-            ),
+            ("cx", 25.0, ("principal point of c1", "given (543.0, 380.0) px", "same focus and")),
         ],
         lambda name, *_: name == "cx",
     ),
@@ -184,24 +171,68 @@ def test_a_camera_that_contradicts_its_covariance_is_named(
     assert [wrong.view for wrong in found.camera_doubts] == ["c1"]
 
 
+def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:
+    """Digital zoom: all distances from the principal point of its camera are longer."""
+    noisy = irregular_hexapod(6).noisy(0)
+    o, centre = noisy.outlines, PINHOLE.K[:2, 2]
+    zoomed = (noisy.measurements.view[o.row] == 1)[:, None, None]
+    ends = np.where(zoomed, centre + 1.03 * (o.ends - centre), o.ends)
+    solution = fitted(replace(noisy, outlines=replace(o, ends=ends)), PINHOLE)
+    (note,) = [note for note in solution.notes if "focal length" in note]
+    assert note.startswith("The focal length of view c2 does not agree with the other views")
+    found = float(note.partition("it differs by ")[2].partition(" +-")[0])
+    assert found == pytest.approx(3.0, abs=1.2)
+    assert [wrong.view for wrong in solution.camera_doubts] == ["c2"]
+
+
+@pytest.fixture(scope="module")
+def right() -> Solution:
+    """The fit with the camera that the pictures are of."""
+    return irregular_hexapod(12).noisy(0).fit()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "start", "words"),
+    [
+        ({"k1": -0.1}, "The distortion of c1", "appears to have been removed"),
+        ({"cx": 539.0}, "The principal point of c1", "given (539.0, 380.0) px"),
+    ],
+)
+def test_a_wrong_camera_file_is_noticed_and_what_it_does_is_told(
+    right: Solution, wrong: dict[str, float], start: str, words: str
+) -> None:
+    """As where board and machine are corrected for the lens, or cropped, differently."""
+    solution = fitted(irregular_hexapod(12).noisy(0), with_intrinsics(PINHOLE, wrong))
+    (note,) = (note for note in solution.notes if "does not agree" in note)
+    assert note.startswith(start)
+    assert words in note
+    assert [wrong.view for wrong in solution.camera_doubts] == ["c1"]
+    assert not [note for note in right.notes if "does not agree" in note]
+    assert right.camera_doubts == ()
+    names = right.kinematic.parametrization.names
+    off = solution.estimates.vector(names) - right.estimates.vector(names)
+    moved = solution.sensitivities[FITTED_CAMERA][:, 0]
+    assert np.linalg.norm(off + moved) < 0.5 * np.linalg.norm(off)  # it says where the truth is
+
+
 def state_covariance(folder: Path, seen: float = 1.0) -> Path:
     """Write a covariance of fx, fy and k3 into the camera file of a dataset; return the folder.
 
     Boards were seen in the left part of the image, *seen* of its width.
     """
     (path,) = set(load_dataset(folder).camera_paths)
-    document, names = yaml.safe_load(path.read_text()), ["fy", "fx", "k3"]
+    camera = read_camera(path)
     rows = [[9.0, 8.5, 0.0], [8.5, 9.0, 0.0], [0.0, 0.0, 0.0]]
-    right, bottom = seen * document["image_width"], document["image_height"]
+    right, bottom = seen * camera.width, camera.height
     covered = [[-1.0, -1.0], [right, -1.0], [right, bottom], [-1.0, bottom]]
     block = {
         "version": 1,
         "sigma": {"fx": 3.0},
-        "names": names,
+        "names": ["fy", "fx", "k3"],
         "covariance": rows,
         "covered": covered,
     }
-    path.write_text(yaml.safe_dump(document | {"legcal_camera": block}))
+    keyed(path.name, legcal_camera=block)(path.parent)
     return folder
 
 

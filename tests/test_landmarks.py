@@ -8,8 +8,8 @@ import pytest
 from clicked_joints import camera_beside, seen_from, write_clicks
 from csv_rows import read_rows, write_rows
 from dataset_folder import dataset_of_readings
-from machines import ROOT
-from refusal_table import GONE, cell, keyed
+from edits import GONE, cell, keyed
+from machines import ROOT, by_hand
 from scipy.spatial.transform import RigidTransform
 from simulated import simulated
 
@@ -23,14 +23,6 @@ from legcal.machine.model import readings_at
 from legcal.machine.rods import ends_at_poses
 
 pytestmark = pytest.mark.usefixtures("without_steps")
-
-
-def without_motors(text: str) -> str:
-    """Return the text of the model of a hexapod that is moved by hand."""
-    motors = "".join(f"- leg{j}_prismatic\n" for j in range(1, 7))
-    assert f"name_mot:\n{motors}" in text
-    text = text.replace(f"name_mot:\n{motors}", "name_mot: []\n")
-    return text.replace("../urdf/", f"{ROOT}/urdf/")
 
 
 def dataset(folder: Path, model: str, n_rows: int = 2, **view: object) -> Path:
@@ -89,10 +81,9 @@ def test_base_joints_place_the_camera_where_readings_give_no_pose(
     seen = seen_from(folder, 0, true)
     table, joints = folder / "measurements.csv", [f"leg{j}_prismatic" for j in range(1, 7)]
     if unknown == "no motors":
-        model = folder / "by_hand.yaml"
-        model.write_text(without_motors((ROOT / "models/hexapod.yaml").read_text()))
+        model = str(by_hand(tmp_path / "own"))
         table.write_text("view,image\nc1,0.png\n")
-        keyed("dataset.yaml", mechanism="by_hand.yaml", encoder_sigma=GONE)(folder)
+        keyed("dataset.yaml", mechanism=model, encoder_sigma=GONE)(folder)
     else:
         cell("measurements.csv", None, **dict.fromkeys(joints[3:], ""))(folder)
         write_rows(table, [row | {"time": 1} for row in read_rows(table)])

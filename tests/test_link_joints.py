@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hexapod_example import Run
+from machines import written_with
 
 import legcal
 from legcal import Machine, load_mechanism
@@ -14,7 +15,6 @@ from legcal.calibration.result import joints_in_links
 from legcal.calibration.verification import possible_changes
 from legcal.geometry.types import Array
 from legcal.machine.leg import LINKS
-from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import (
     geometries,
     moved_legs,
@@ -111,9 +111,7 @@ def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Pa
             np.testing.assert_allclose(np.square(one.sigma or []), expected, rtol=1e-5, atol=1e-18)
 
     # and the URDF has them there
-    write_urdf(machine, moved_legs(legs, found.place, 1e-3 * np.eye(n)[1]), tmp_path / "m.urdf")
-    write_calibrated_yaml(machine, tmp_path / "m.yaml", "m.urdf")
-    written = load_mechanism(tmp_path / "m.yaml")
+    written = written_with(machine, moved_legs(legs, found.place, 1e-3 * np.eye(n)[1]), tmp_path)
     np.testing.assert_allclose(written.A_base, joints_with(1e-3 * np.eye(n)[1])[0], atol=1e-12)
 
 

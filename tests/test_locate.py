@@ -27,6 +27,7 @@ from located import (
     shipped,
     write_poses,
 )
+from machines import copied_model
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
@@ -287,11 +288,6 @@ def found() -> Location:
     return locate(shipped("hexapod"), made("hexapod", 5).poses)
 
 
-@pytest.fixture(scope="module")
-def in_part() -> Location:
-    return locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
-
-
 def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(tmp_path: Path) -> None:
     hexapod = made("hexapod", 5)
     position = hexapod.poses.position.copy()
@@ -342,27 +338,22 @@ def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(
 
 def _machine_with(folder: Path, extra: str) -> Path:
     """Write the hexapod with more in its URDF."""
-    machine = shipped("hexapod")
-    for name in ("models", "urdf"):
-        (folder / name).mkdir()
-    text = machine.urdf.content.decode().replace("</robot>", extra + "</robot>")
-    (folder / "urdf/hexapod.urdf").write_bytes(text.encode())
-    (folder / "models/hexapod.yaml").write_bytes(machine.yaml_path.read_bytes())
-    return folder / "models/hexapod.yaml"
+    return copied_model(
+        folder, "hexapod", lambda text: text.replace("</robot>", f"{extra}</robot>")
+    )
 
 
 JOINT = '<joint name="{0}_j" type="fixed"><parent link="{1}"/><child link="{0}"/>{2}</joint>\n'
 
 
-def test_links_of_another_meaning_are_refused(
-    found: Location, in_part: Location, tmp_path: Path
-) -> None:
+def test_links_of_another_meaning_are_refused(found: Location, tmp_path: Path) -> None:
+    in_part = locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
     for link in ("world", "tool"):
-        folder = tmp_path / link
-        folder.mkdir()
         links = f'<link name="{link}"/>' + JOINT.format(link, "base", "")
         with pytest.raises(UsageError, match=f"found a link '{link}' that is not"):
-            write_located_model(load_mechanism(_machine_with(folder, links)), found, tmp_path / "x")
+            write_located_model(
+                load_mechanism(_machine_with(tmp_path / link, links)), found, tmp_path / "x"
+            )
     with pytest.raises(ModelError, match="below the joint 'platform_free', which moves"):
         write_located_model(replace(shipped("hexapod"), base="platform"), found, tmp_path / "x")
     _, urdf = write_located_model(shipped("3-rpr"), in_part, tmp_path / "in part")

@@ -14,7 +14,7 @@ from legcal.calibration.location.tool_poses import read_tool_poses
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.descriptions.description import Description, assemble
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
-from legcal.errors import DatasetError, ModelError
+from legcal.errors import DatasetError
 from legcal.files.table import Column, read_table
 from legcal.machine.kinematics import forward_kinematics_many
 from legcal.machine.model import Machine, readings_at
@@ -269,14 +269,6 @@ def test_the_sheet_of_a_workbook_that_has_a_table_is_read(tmp_path: Path) -> Non
         sheet.append([f"Zylinder {j}", *A, 0, *B, 0.0, 28])
     book.save(tmp_path / "own.xlsx")
     check(described(tmp_path / "own.xlsx", "mm", (14, 14)), (14, 14))
-
-
-@pytest.mark.parametrize("content", [b"PK\x03\x04none", b"\xd0\xcf\x11\xe0none"])
-def test_other_workbooks_are_refused(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "own.xls"
-    path.write_bytes(content)
-    with pytest.raises(ModelError, match=r"workbook.*save the sheet as CSV"):
-        described(path, "mm", ())
 
 
 @pytest.mark.parametrize("mark", [";", " "])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from edits import GONE, keyed
 from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from layouts import PASSED, Layout, LegLayout, LegSpec, MachineSpec, borne, write_machine
@@ -267,17 +267,6 @@ UNNAMED = {
 }
 
 
-def _without(path: Path, *keys: str) -> Path:
-    """Take the block legcal out of a file, or some of its keys."""
-    document = yaml.safe_load(path.read_text())
-    for key in keys:
-        document["legcal"].pop(key)
-    if not keys:
-        document.pop("legcal")
-    path.write_text(yaml.safe_dump(document, sort_keys=False))
-    return path
-
-
 @pytest.mark.parametrize(
     ("machine", "layout"),
     [
@@ -290,7 +279,8 @@ def test_base_platform_and_legs_are_taken_from_the_bodies(
 ) -> None:
     path = write_machine(tmp_path, MACHINES[machine](), UNNAMED[layout])
     named = load_mechanism(path)
-    found = load_mechanism(_without(path))
+    keyed(path.name, legcal=GONE)(tmp_path)
+    found = load_mechanism(path)
     assert (found.base, found.platform_joint) == ("base", named.platform_joint)
     assert found.leg_names == named.leg_names
     assert any("no block legcal" in note for note in found.diagnostics)

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from csv_rows import read_rows, write_rows
+from edits import added, keyed
 from simulated import simulated
 
 from legcal import (
@@ -38,13 +37,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     errors = ParameterErrors(base_joints=small, platform_joints=small, lengths=small)
     drawn: dict[str, Any] = {"errors": errors, "poses": 1, "sampling": "workspace", "seed": 4}
     simulated(folder, "servo-hexapod", views=3, **drawn)
-    entry = yaml.safe_load((folder / "dataset.yaml").read_text())
-    (folder / "dataset.yaml").write_text(
-        yaml.safe_dump({**entry, "machine_kind": "machined", "spline_teeth": 25})
-    )
-    rows = read_rows(folder / "measurements.csv")
-    turned = [row | {"servo4": repr(float(row["servo4"]) - TOOTH)} for row in rows]
-    write_rows(folder / "measurements.csv", turned)
+    keyed("dataset.yaml", machine_kind="machined", spline_teeth=25)(folder)
+    added("measurements.csv", "servo4", -TOOTH)(folder)
     return folder
 
 

@@ -14,7 +14,6 @@ from fit_sessions import (
     disturbed_start,
     irregular_hexapod,
     machine_session,
-    shifted,
     with_board,
 )
 
@@ -27,7 +26,6 @@ from legcal.calibration.estimate import (
     next_trial,
 )
 from legcal.calibration.joint_fit.factors import observed_outlines
-from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import (
     PLACES,
     RECOVERED_SHARE,
@@ -39,7 +37,6 @@ from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.calibration.tuning import LIMB_GAMMA_SIGMA
-from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge
@@ -47,7 +44,6 @@ from legcal.estimation.problem import linearize
 from legcal.estimation.solver import information
 from legcal.estimation.uncertainty import score_test, scores_of_block
 from legcal.geometry.types import Array, BoolArray
-from legcal.simulation.observe import moved_outlines
 from legcal.vision.cylinder import EPSILON
 
 SHARE = 0.2  # of outlines that are wrong
@@ -66,8 +62,7 @@ def _session(name: str) -> MachineSession:
 
 @cache
 def _clean(name: str) -> Solution:
-    session = _session(name)
-    return refine(session.legs, *session.noisy(0), session.start)
+    return _session(name).noisy(0).fit()
 
 
 def pairs(session: MachineSession, rng: np.random.Generator) -> BoolArray:
@@ -86,13 +81,10 @@ def whole_legs(session: MachineSession, rng: np.random.Generator) -> BoolArray:
 def test_a_fifth_of_the_outlines_wrong_costs_less_than_half_the_accuracy(
     name: str, which: Callable[[MachineSession, np.random.Generator], BoolArray]
 ) -> None:
-    session = _session(name)
-    measurements, outlines = session.noisy(0)
-    rng = np.random.default_rng(100)
+    session, rng = _session(name), np.random.default_rng(100)
     wrong = which(session, rng)
     assert 0.1 < wrong.mean() < 0.3
-    dirty = shifted(session, outlines, _shifts(session, wrong, rng))
-    found = refine(session.legs, measurements, dirty, session.start)
+    found = session.noisy(0).moved(_shifts(session, wrong, rng)).fit()
     clean = _clean(name)
     sigma = np.sqrt(np.diag(clean.kinematic.covariance))
     free = sigma > 0.0  # all but twists
@@ -133,35 +125,27 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     }
     shift = np.zeros((len(o), 2))
     shift[99] = 5.4
-    outlines = moved_outlines(o, PINHOLE, shift)
+    outlines = session.moved(shift).outlines
     h, ends = outlines.h.copy(), outlines.ends.copy()
     for wrong, (right, _) in swaps.items():
         h[wrong], ends[wrong] = o.h[right], o.ends[right]
-    outlines = replace(outlines, h=h, ends=ends)
-    found = refine(session.legs, session.measurements, outlines, session.start)
+    found = replace(session, outlines=replace(outlines, h=h, ends=ends)).fit()
     assert set(np.flatnonzero(~found.outlines.used)) == {*swaps, 99}
     assert str(found.outlines.reason[99]) == "disagrees with the fit by 5.4 px"
     for wrong, (_, leg) in swaps.items():
         assert found.outlines.reason[wrong].reason is Reason.DISAGREES
         said = str(found.outlines.reason[wrong].detail)
         assert said.endswith(f" px, lies on edge 2 of {leg}.{leg}_tube")
-    assert np.abs(session.errors(found.legs)).max() < 1e-9
+    assert session.off(found.legs) < 1e-9
 
 
 def test_errors_of_corners_are_found_in_their_residuals() -> None:
     session = machine_session("hexapod")
-    measurements, outlines = session.noisy(3)
-    corners = corners_of(session, seed=4)
-    claimed = [
-        refine(
-            session.legs,
-            measurements,
-            outlines,
-            with_board(session, corners)[1],
-            board=with_board(session, replace(corners, sigma_px=factor * corners.sigma_px))[0],
-        ).estimates.sigma
-        for factor in (0.2, 5.0)
-    ]
+    corners, claimed = corners_of(session, seed=4), []
+    for factor in (0.2, 5.0):
+        said = replace(corners, sigma_px=factor * corners.sigma_px)
+        seen, start = with_board(session, said)
+        claimed.append(session.noisy(3).fit(start, board=seen).estimates.sigma)
     np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
 
 
@@ -173,15 +157,15 @@ def biases_of(session: MachineSession) -> EdgeBiases:
 
 def shared_errors(
     session: MachineSession, rng: np.random.Generator, level: float, slope: float
-) -> Outlines:
-    """Return outlines whose edges err alike in all images of a view, and change with place."""
+) -> MachineSession:
+    """Return a session whose edges err alike in all images of a view, and change with place."""
     possible = biases_of(session)
     sigma = np.array([0.0, 0.0, level, level, slope, slope])
     values = sigma[possible.kind] * rng.standard_normal(len(possible))
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
     shift = np.zeros((len(observed), 2))
     shift[observed.index] = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
-    return moved_outlines(session.noisy(rng)[1], PINHOLE, shift)
+    return session.noisy(rng).moved(shift)
 
 
 def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[Array, Array]:
@@ -190,7 +174,8 @@ def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[
 
 
 def test_scores_are_those_of_the_residuals_of_a_fit(session: MachineSession) -> None:
-    problem = build_fit(session.legs, *session.noisy(4))
+    noisy = session.noisy(4)
+    problem = build_fit(session.legs, noisy.measurements, noisy.outlines)
     state = problem.begin(disturbed_start(session, joints=1e-5, camera=1e-5, angle=1e-5))
     whitening = np.asarray(problem.factor("outlines").whitening)
     possible = biases_of(session)
@@ -217,11 +202,8 @@ def test_scores_are_those_of_the_residuals_of_a_fit(session: MachineSession) -> 
 def test_shared_errors_are_found_and_weighed(session: MachineSession) -> None:
     normalised, sizes = [], []
     for seed in range(3):
-        rng = np.random.default_rng(seed)
-        outlines = shared_errors(session, rng, 0.06, 0.03)
-        found = refine(session.legs, session.noisy(rng)[0], outlines, session.start)
-        error = session.errors(found.legs)
-        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
+        found = shared_errors(session, np.random.default_rng(seed), 0.06, 0.03).fit()
+        normalised.append(session.squares(found))
         sizes.append(found.quality.noise.scale)
         kinds = {name.rsplit(".", 1)[1] for name in found.posterior.biases}
         assert {"bias", "tilt", "bias_x"} <= kinds
@@ -240,10 +222,8 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
         rng = np.random.default_rng(seed)
         shift = np.zeros((len(observed), 2))
         shift[observed.index] = sigma * rng.standard_normal(int(place.max()) + 1)[place, None]
-        outlines = moved_outlines(session.noisy(rng)[1], PINHOLE, shift)
-        found = refine(session.legs, session.noisy(rng)[0], outlines, session.start)
-        error = session.errors(found.legs)
-        normalised.append(error @ np.linalg.solve(found.kinematic.covariance, error) / len(error))
+        found = session.noisy(rng).moved(shift).fit()
+        normalised.append(session.squares(found))
         found_px.append(found.quality.shared_px[PLACES[0]])
     assert 0.7 < np.mean(normalised) < 1.2
     assert np.mean(found_px) == pytest.approx(sigma, rel=0.3)
@@ -252,15 +232,10 @@ def test_errors_that_come_back_with_a_place_widen_the_covariance() -> None:
 @pytest.mark.system
 def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None:
     session = irregular_hexapod(20, legs_seen=5, sigma_px=0.03, repeats=4)
-    measurements, outlines = session.noisy(0)
+    noisy = session.noisy(0)
+    looks = (np.full(len(noisy.outlines), polish) for polish in (-3.0, 3.0))
     matte, polished = (
-        refine(
-            session.legs,
-            measurements,
-            replace(outlines, polish=np.full(len(outlines), polish)),
-            session.start,
-        )
-        for polish in (-3.0, 3.0)
+        replace(noisy, outlines=replace(noisy.outlines, polish=polish)).fit() for polish in looks
     )
     np.testing.assert_allclose(session.errors(polished.legs), session.errors(matte.legs))
     assert polished.quality.shared_px[PLACES[0]] == pytest.approx(0.2, rel=0.05)
@@ -271,7 +246,7 @@ def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None
 def test_independent_errors_are_hardly_taken_for_shared_ones(session: MachineSession) -> None:
     shared = list[float]()
     for seed in range(3):
-        found = refine(session.legs, *session.noisy(100 + seed), session.start)
+        found = session.noisy(100 + seed).fit()
         shared.append(max(map(abs, found.posterior.biases.values()), default=0.0))
         assert found.quality.noise.bias_px == found.quality.noise.tilt_px == 0.0
     assert shared.count(0.0) >= 2  # one set in twenty seems to have some
@@ -280,10 +255,8 @@ def test_independent_errors_are_hardly_taken_for_shared_ones(session: MachineSes
 
 def _fit_in_rounds(session: MachineSession, n_rounds: int) -> Solution:
     """Return a fit to outlines whose errors are shared by parts in views, in some rounds."""
-    rng = np.random.default_rng(3)
-    outlines = shared_errors(session, rng, 0.2, 0.1)
-    settings = RefinementSettings(noise_rounds=n_rounds)
-    return refine(session.legs, session.noisy(rng)[0], outlines, session.start, settings)
+    shared = shared_errors(session, np.random.default_rng(3), 0.2, 0.1)
+    return shared.fit(settings=RefinementSettings(noise_rounds=n_rounds))
 
 
 def test_a_fit_that_still_changes_a_lot_is_refused(session: MachineSession) -> None:
@@ -297,31 +270,29 @@ def test_a_fit_that_still_changes_a_little_says_so(session: MachineSession) -> N
     assert " px to 0." in note
 
 
-def without_gamma(measurements: Measurements) -> Measurements:
-    """Return measurements of views of one camera whose gamma is not given."""
-    camera = replace(PINHOLE, gamma_is_given=False)
-    views = tuple(replace(view, camera=camera) for view in measurements.views)
-    return replace(measurements, views=views)
+def without_gamma(session: MachineSession) -> MachineSession:
+    """Return a session of one camera whose gamma is not given."""
+    return session.with_camera(replace(PINHOLE, gamma_is_given=False))
 
 
-def encoded(session: MachineSession, log_gamma: float = LOG_GAMMA, seed: int = 3) -> Outlines:
+def encoded(session: MachineSession, log_gamma: float = LOG_GAMMA) -> MachineSession:
     """Return noisy outlines that were measured with a gamma of one, of a camera with another."""
-    rng = np.random.default_rng(seed)
-    outlines = session.noisy(rng)[1]
+    rng = np.random.default_rng(3)
+    outlines = session.noisy(rng).outlines
     by_gamma = rng.normal(0.0, 0.2, len(outlines))
     inward = -by_gamma * log_gamma * EPSILON[outlines.edge - 1]
     # Normals of moved_outlines point to one side of the leg: to the inside of one of both edges.
-    small = moved_outlines(outlines, PINHOLE, np.full((len(outlines), 2), 1e-3))
+    noisy = replace(session, outlines=outlines)
+    small = noisy.moved(np.full((len(outlines), 2), 1e-3)).outlines
     xy = PINHOLE.undistort(small.ends[:, 0])
     side = np.sign(np.sum(outlines.h * np.column_stack([xy, np.ones(len(xy))]), axis=1))
-    moved = moved_outlines(outlines, PINHOLE, np.repeat((side * inward)[:, None], 2, axis=1))
-    return replace(moved, gamma=np.ones(len(moved)), by_gamma=by_gamma)
+    moved = noisy.moved(np.repeat((side * inward)[:, None], 2, axis=1)).outlines
+    moved = replace(moved, gamma=np.ones(len(moved)), by_gamma=by_gamma)
+    return replace(session, outlines=moved)
 
 
 def test_gamma_of_a_camera_is_found_by_its_outlines(session: MachineSession) -> None:
-    measurements = without_gamma(session.measurements)
-    outlines = encoded(session)
-    found = refine(session.legs, measurements, outlines, session.start)
+    found = without_gamma(encoded(session)).fit()
     (gamma,) = found.gammas
     assert gamma.views == ("c1", "c2", "c3")
     assert gamma.measured_with == 1.0
@@ -330,7 +301,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: MachineSession) -> 
     assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_GAMMA_SIGMA**2))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not given" in n for n in found.notes)
-    as_linear = refine(session.legs, session.measurements, outlines, session.start)
+    as_linear = encoded(session).fit()
     right, wrong = (np.sqrt(np.mean(session.errors(s.legs) ** 2)) for s in (found, as_linear))
     assert right < wrong
     assert found.quality.rms_px is not None
@@ -342,8 +313,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: MachineSession) -> 
 def test_a_higher_gamma_is_tried_unless_the_first_fit_excludes_it(
     session: MachineSession, log_gamma: float, *, is_tried: bool
 ) -> None:
-    measurements, outlines = without_gamma(session.measurements), encoded(session, log_gamma)
-    first = refine(session.legs, measurements, outlines, session.start)
+    first = without_gamma(encoded(session, log_gamma)).fit()
     gammas = GammaTrials.begun(first, {}).next()
     tried = dict.fromkeys(("c1", "c2", "c3"), np.exp(GAMMA_STEP)) if is_tried else {}
     assert gammas == pytest.approx(tried)

@@ -1,50 +1,25 @@
-"""Sub-pixel lines: pixels beside an outline, the limb model, and blocks fitted to it."""
+"""Sub-pixel lines: noise beside an outline, the limb model, and blocks fitted to it."""
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array
-from legcal.perception.blocks import BlockLine, Blocks
+from legcal.perception.blocks import Blocks
 from legcal.perception.limb import MATTE_DIRECTIONS, powers, profile_functions
 from legcal.perception.pooled_fit import fit_pooled
 from legcal.perception.profiles import (
     Edge,
     PixelBins,
     PixelSums,
-    Profiles,
     Samples,
     even_weights,
     noise_ratios,
-    read_profiles,
     to_light,
 )
 from legcal.perception.subpixel_edges import limb_shifts
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import Band
-
-# Pixels and their distances.
-
-LENS = Camera(
-    np.array([[500.0, 0.0, 200.0], [0.0, 500.0, 150.0], [0.0, 0.0, 1.0]]),
-    400,
-    300,
-    np.array([-0.2, 0.05, 0.001, -0.001, 0.0]),
-)
-DEEP = 3.5
-
-
-def numbered(axis: int) -> Samples:
-    """Return an image that holds the column (0) or the row (1) of every pixel."""
-    return np.asarray(np.indices((300, 400))[1 - axis], dtype=np.float32)
-
-
-def read(
-    edges: list[Edge], axis: int = 0, inner: float = DEEP, most: int | None = None
-) -> Profiles:
-    depths = DEEP, np.full(len(edges), inner)
-    return read_profiles(numbered(axis), LENS, edges, [e.v for e in edges], depths, 8, most)
-
 
 # Sums over pixels, and their noise.
 
@@ -80,14 +55,6 @@ def test_both_sides_are_equally_noisy_when_weighted(behind: float) -> None:
     one, other = noise_ratios(sums, BOUNDS, kept, NOISY_BLUR)
     assert one == 1.0
     assert other == ratio[1]
-
-
-# Blocks one by one, and lines through them.
-
-
-def fitted(line: BlockLine | None) -> BlockLine:
-    assert line is not None
-    return line
 
 
 # All blocks of outlines together.

@@ -9,20 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from dataset_folder import Folder, folder
-from fit_sessions import T_RE_BOARD, MachineSession, machine_session, with_boards
+from dataset_folder import folder
+from edits import keyed
+from fit_sessions import T_RE_BOARD, machine_session, with_boards
 from simulated import settings
 
 from legcal import calibrate, evaluate, identifiability, load_dataset, load_mechanism, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
-from legcal.calibration.joint_fit.fit import refine
 from legcal.data.measurements import row_names
 from legcal.data.outlines import no_outlines
-from legcal.errors import DatasetError
-from legcal.simulation.dataset import SimulatedDataset
 from legcal.simulation.settings import Level
-from legcal.vision.board import parse_boards
 
 __all__ = ["folder"]
 
@@ -37,25 +33,20 @@ CHESSBOARD: dict[str, Any] = {
 ON_PLATFORM = {"on": "platform"}
 
 
-def _off(session: MachineSession, legs: Any) -> float:
-    fitted, true = session.legs, session.truth.legs
-    return float(np.abs(fitted.vector(legs) - fitted.vector(true)).max())
-
-
 def test_a_board_alone_gives_the_machine_exactly_without_noise() -> None:
     """From joints that are 3 mm and axes that are 1 degree off; no image shows a leg."""
     session = machine_session("hexapod", n_poses=8)
-    assert _off(session, session.start.legs) > 0.002
+    assert session.off(session.start.legs) > 0.002
     seen, start = with_boards(session, base=False)
-    found = refine(session.legs, session.measurements, no_outlines(), start, board=seen)
-    assert _off(session, found.legs) < 1e-7
+    found = replace(session, outlines=no_outlines()).fit(start, board=seen)
+    assert session.off(found.legs) < 1e-7
     assert found.radii == {}
     place = T_RE_BOARD.inv() * found.T_frame_board["platform"]
     assert np.linalg.norm(place.translation) < 1e-7
 
 
 def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_own() -> None:
-    session = machine_session("hexapod", n_poses=15)
+    session = replace(machine_session("hexapod", n_poses=15), outlines=no_outlines())
     m = session.measurements
     seen, start = with_boards(session, seed=3)
     fixed = seen.boards[1]
@@ -64,71 +55,41 @@ def test_corners_of_the_board_on_the_platform_have_noise_and_outliers_of_their_o
     px = seen.corners.px + np.where(wrong[:, None], [4.0, -3.0], 0.0)
     sigma = np.where(moved, 0.5, 1.0) * seen.corners.sigma_px  # said to be better than they are
     corners = replace(seen.corners, px=px, sigma_px=sigma)
-    found = refine(session.legs, m, no_outlines(), start, board=replace(seen, corners=corners))
+    found = session.fit(start, board=replace(seen, corners=corners))
     rows = np.unique(seen.corners.row[wrong])
     assert set(found.rejected_corners) == {
         (m.views[m.view[row]].name, int(m.pose[row]), fixed.first + 5) for row in rows
     }
     said = next(note for note in found.notes if "disagree with the fit" in note)
     assert f"{fixed.first + 5} in c1, {row_names(m)[0]}" in said
-    right = refine(session.legs, m, no_outlines(), start, board=seen)
+    right = session.fit(start, board=seen)
     np.testing.assert_allclose(found.estimates.sigma, right.estimates.sigma, rtol=0.1)
     assert found.quality.rms_corners_px["platform"] == pytest.approx(0.05, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("board", "words"),
-    [
-        (CHARUCO | {"on": "leg1_tube"}, ("board.on", "'leg1_tube'", "base or platform")),
-        (CHARUCO | {"on": None}, ("board.on", "base or platform")),
-        ([CHARUCO, CHESSBOARD], ("two boards on the base", "on the platform")),
-        ([CHARUCO, CHARUCO | ON_PLATFORM | {"square": 0.04}], ("DICT_4X4", "apart")),
-        ([CHARUCO, CHARUCO | ON_PLATFORM | {"dictionary": "DICT_4X4_100"}], ("DICT_4X4",)),
-        ([CHESSBOARD, CHESSBOARD | ON_PLATFORM | {"square": 0.02}], ("numbers of squares",)),
-        (CHARUCO | ON_PLATFORM | {"T_base_board": {"xyz": [0, 0, 0], "quat_xyzw": [0, 0, 0, 1]}},
-         ("T_base_board", "T_platform_board")),
-        ([], ("empty list",)),
-        ([CHARUCO, "chessboard"], ("'chessboard'", "mapping")),
-    ],
-)  # fmt: skip
-def test_boards_that_cannot_be_used_are_refused(board: Any, words: tuple[str, ...]) -> None:
-    with pytest.raises(DatasetError) as caught:
-        parse_boards(board, PATH)
-    (problem,) = caught.value.problems
-    assert [word for word in (str(PATH), "needed", *words) if word not in problem] == []
 
 
 # Datasets
 
 
-@pytest.fixture(scope="module")
-def of_boards(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
-    """A dataset with corners of both boards, whose views name no leg and have no rough pose."""
-    folder = tmp_path_factory.mktemp("boards") / "d"
+@pytest.mark.system
+def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
+    tmp_path: Path,
+) -> None:
+    """No view names a leg."""
+    folder = tmp_path / "d"
     chosen = settings(
         level=Level.OUTLINES, poses=15, views=1, board="charuco", platform_board="charuco",
         sigma_px=0.02, hints=False, seed=1,
     )  # fmt: skip
-    made = simulate("hexapod", folder, chosen)
+    of_boards = simulate("hexapod", folder, chosen)
     (folder / "observations.csv").unlink()
-    entry = yaml.safe_load((folder / "dataset.yaml").read_text())
-    for view in entry["views"].values():
-        view["legs"] = []
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(entry))
-    return made
-
-
-@pytest.mark.system
-def test_corners_of_two_boards_calibrate_a_machine_without_a_leg_or_a_rough_pose(
-    of_boards: SimulatedDataset, tmp_path: Path
-) -> None:
-    assert identifiability_of_dataset(load_dataset(of_boards.folder)).platform_board
-    calibration = calibrate(of_boards.folder, output=tmp_path / "r")
+    keyed("dataset.yaml", views__c1__legs=[])(folder)
+    assert identifiability_of_dataset(load_dataset(folder)).platform_board
+    calibration = calibrate(folder, output=tmp_path / "r")
     assert "steps need legs in sight: there is no staged.yaml" in calibration.summary()
     result = json.loads((tmp_path / "r/result.json").read_text())
-    truth = json.loads((of_boards.folder / "truth/truth.json").read_text())
+    truth = json.loads((folder / "truth/truth.json").read_text())
     error, nominal = (
-        evaluate(model, of_boards.truth_path, dataset=of_boards.folder).displacement.mean()
+        evaluate(model, of_boards.truth_path, dataset=folder).displacement.mean()
         for model in (tmp_path / "r/calibrated.yaml", of_boards.nominal)
     )
     assert error < 3.0 * result["platform"]["sigma_dX_m"]
@@ -152,10 +113,3 @@ def test_identify_says_what_a_board_on_the_platform_determines() -> None:
     found = identifiability(machine, [["leg1"]], 8, platform_board=True)
     assert found.identifiable
     assert found.platform_board
-
-
-def test_views_without_legs_need_a_board_on_the_platform(folder: Folder) -> None:
-    folder.entry["views"]["c1"]["legs"] = []
-    folder.entry["board"] = CHARUCO
-    with pytest.raises(DatasetError, match=r"views.c1.legs .* no board on the platform, needed"):
-        load_dataset(folder.write())

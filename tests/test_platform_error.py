@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from machines import written_with
 
 from legcal import Machine, evaluate, load_mechanism, random_configurations
 from legcal.calibration.joint_fit.platform import (
@@ -13,7 +14,6 @@ from legcal.calibration.joint_fit.platform import (
 )
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
-from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import (
     Parametrization,
     geometries,
@@ -30,16 +30,11 @@ def random_covariance(
     return np.asarray(sigma * rng.normal(size=(len(parametrization), rank)) / np.sqrt(rank))
 
 
-def written_with(
-    nominal: Machine, parametrization: Parametrization, step: Array, folder: Path
-) -> Machine:
+def changed(nominal: Machine, parametrization: Parametrization, step: Array, to: Path) -> Machine:
     """Return a mechanism with changed parameters, as loaded from the files written of it."""
-    folder.mkdir(exist_ok=True)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
     moved = moved_legs(geometries(nominal), parametrization.place, step)
-    write_urdf(nominal, reframed(moved, nominal.frame_legs, origin), folder / "other.urdf")
-    write_calibrated_yaml(nominal, folder / "other.yaml", "other.urdf")
-    return load_mechanism(folder / "other.yaml")
+    return written_with(nominal, reframed(moved, nominal.frame_legs, origin), to)
 
 
 def _motions(nominal: Machine, other: Machine, q: Array) -> Array:
@@ -67,7 +62,7 @@ def test_predicted_errors_are_those_of_written_models_in_pinocchio(
     predicted = expected_error(J, root @ root.T)
     squares = np.zeros((3, 6))
     for k, column in enumerate(root.T):
-        other = written_with(nominal, parametrization, column, tmp_path / str(k))
+        other = changed(nominal, parametrization, column, tmp_path / str(k))
         squares += _motions(nominal, other, drawn.readings) ** 2
     np.testing.assert_allclose(predicted.displacement, np.sqrt(squares[:, 3:].sum(1)), rtol=3e-3)
     np.testing.assert_allclose(predicted.rotation, np.sqrt(squares[:, :3].sum(1)), rtol=3e-3)
@@ -82,7 +77,7 @@ def test_the_change_and_the_workspace_are_those_of_written_models(tmp_path: Path
     parameters = parametrization_of(nominal, twists=True)
     rng = np.random.default_rng(3)
     step = 5e-4 * rng.normal(size=len(parameters))
-    calibrated = written_with(nominal, parameters, step, tmp_path / "a")
+    calibrated = changed(nominal, parameters, step, tmp_path / "a")
     q = random_configurations(nominal, 3, rng).readings
     root = random_covariance(parameters, rng, 1, 1e-6)
     before, after = (
@@ -96,7 +91,7 @@ def test_the_change_and_the_workspace_are_those_of_written_models(tmp_path: Path
     displacement, rotation = pose_differences(after, before)
     np.testing.assert_allclose(accuracy.change.displacement, displacement, rtol=1e-6)
     np.testing.assert_allclose(accuracy.change.rotation, rotation, rtol=1e-6)
-    apart = evaluate(calibrated, written_with(calibrated, parameters, root[:, 0], tmp_path / "b"))
+    apart = evaluate(calibrated, changed(calibrated, parameters, root[:, 0], tmp_path / "b"))
     assert accuracy.workspace is not None
     assert len(accuracy.workspace.displacement) == len(apart.displacement) == 100
     for found, expected, rel in (

@@ -62,7 +62,7 @@ def _is_right(placed: PoseCandidates, T: RigidTransform) -> bool:
     return angle < np.deg2rad(5.0) and away < 0.1
 
 
-MOTION = RigidTransform.from_components([0.3, -0.2, 0.5], Rotation.from_rotvec([0.4, 1.0, -0.3]))
+MOTION = lp.motion([0.3, -0.2, 0.5], [0.4, 1.0, -0.3])
 
 
 def _pose(T_base_camera: RigidTransform, n_legs: int = 6) -> CameraPoses:
@@ -161,9 +161,7 @@ def test_where_joints_are_known_well_a_symmetric_machine_is_not_taken_for_its_tu
     for seed in range(6):
         rng = np.random.default_rng(seed)
         made, T = lp.machine(6), lp.camera(rng)
-        tilted = RigidTransform.from_components(
-            [0.03, -0.02, 0.38], Rotation.from_rotvec([0.08, 0.04, 0.0])
-        )
+        tilted = lp.motion([0.03, -0.02, 0.38], [0.08, 0.04, 0.0])
         ends = made.A, made.posed(tilted)
         seen = lp.picture(ends, ends, T, rng, noise=0.3)
         for joint_error in right:
@@ -259,9 +257,7 @@ def test_a_symmetric_machine_at_a_symmetric_reading_is_ambiguous_and_others_reso
 
 def test_a_rough_pose_is_improved_and_that_of_another_place_is_not_clear() -> None:
     pictures, T = _scene(4, 6, 4, joint_error=2e-3, **HARD)
-    off = RigidTransform.from_components(
-        [0.02, -0.02, 0.03], Rotation.from_rotvec([0.03, -0.02, 0])
-    )
+    off = lp.motion([0.02, -0.02, 0.03], [0.03, -0.02, 0])
     placed = place_near(pictures, T * off, 6)
     assert placed.hinted
     assert placed.is_convincing
@@ -335,10 +331,7 @@ def test_a_wrong_rough_pose_gives_way_to_a_better_one(monkeypatch: pytest.Monkey
     rng = np.random.default_rng(1)
     T, made = lp.camera(rng), lp.machine(6)
     spread = [
-        RigidTransform.from_components(
-            [*rng.uniform(-0.03, 0.03, 2), 0.38], Rotation.from_rotvec(rng.uniform(-0.1, 0.1, 3))
-        )
-        for _ in range(4)
+        lp.motion([*rng.uniform(-0.03, 0.03, 2), 0.38], rng.uniform(-0.1, 0.1, 3)) for _ in range(4)
     ]
     _Made.made[:] = lp.pictures(made, T, spread, rng, n_clutter=6)
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
@@ -417,9 +410,7 @@ def _fitted(
     search = _search(Search, made, B)
     (group,) = group_views(search.measurements, np.arange(N_IMAGES), [None], None)
     noise = np.zeros((N_IMAGES, N_LEGS, 2, 2))
-    off = RigidTransform.from_components(
-        [0.02, -0.01, 0.02], Rotation.from_rotvec([0.0, 0.05, 0.0])
-    )
+    off = lp.motion([0.02, -0.01, 0.02], [0.0, 0.05, 0.0])
     shift = joints * rng.normal(size=(2, N_LEGS, 3))
     outlines = _outlines(search, T, search.A_base + shift[0], search.B_base + shift[1], noise)
     used = (outlines.leg != without) & (without < N_LEGS)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import Outcome, run
+from simulated import small_camera
 
 from legcal import load_dataset, load_mechanism
 from legcal.geometry.types import Array
@@ -64,16 +65,6 @@ def motion() -> Motion:
             times.append(times[-1] + rng.uniform(0.4, 0.9))
             s.append(k + 1)
     return Motion(np.array(times), np.array(s, dtype=float), q)
-
-
-def _camera_file(folder: Path) -> Path:
-    path = folder / "camera_info.yaml"
-    K = [100.0, 0.0, 48.0, 0.0, 100.0, 32.0, 0.0, 0.0, 1.0]
-    lines = [f"image_width: {SIZE[0]}", f"image_height: {SIZE[1]}", "camera_name: small",
-             f"camera_matrix: {{rows: 3, cols: 3, data: {K}}}", "distortion_model: plumb_bob",
-             "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}"]  # fmt: skip
-    path.write_text("\n".join(lines))
-    return path
 
 
 def _table(motion: Motion, path: Path, times: Array) -> Path:
@@ -156,7 +147,14 @@ def _bag(motion: Motion, folder: Path, **extra: str) -> Path:
 @pytest.fixture
 def import_(tmp_path: Path) -> Iterator[Callable[..., Outcome]]:
     """Import into a folder ``dataset``."""
-    given = ("--model", MODEL, "--camera", _camera_file(tmp_path), "-o", tmp_path / "dataset")
+    given = (
+        "--model",
+        MODEL,
+        "--camera",
+        small_camera(tmp_path, *SIZE),
+        "-o",
+        tmp_path / "dataset",
+    )
     yield lambda *words: run("import", *words, *given)
     left = [p.name for p in tmp_path.iterdir() if p.name.endswith(".legcal-part")]
     assert left == []

@@ -15,6 +15,7 @@ from browser import chromium, until
 from browser import errors as _errors
 from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
+from scipy.spatial.transform import RigidTransform
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
@@ -332,6 +333,17 @@ class Placer(Dialog):
         return float(self.browser.execute_script(script))
 
 
+def placing(
+    browser: Any, page: str, folder: Path, found: Detection
+) -> tuple[Placer, RigidTransform, dict[str, Any]]:
+    """Open the first image of a page; return its editor, camera, and where joints are seen."""
+    browser.get(page)
+    placer, camera = Placer(browser), found.T_base_camera[0]
+    placer.open(0)
+    assert camera is not None
+    return placer, camera, seen_from(folder, int(found.rows[0]), camera)
+
+
 def test_a_photograph_fills_the_editor_on_a_telephone(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:
@@ -353,12 +365,8 @@ def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
 ) -> None:
     folder, found = detection
     _download_to(browser, tmp_path)
-    browser.get((folder.parent / "found" / "index.html").as_uri())
-    placer, row = Placer(browser), int(found.rows[0])
-    placer.open(0)
-    camera = found.T_base_camera[0]
-    assert camera is not None
-    seen = seen_from(folder, row, camera)
+    page = (folder.parent / "found" / "index.html").as_uri()
+    placer, camera, seen = placing(browser, page, folder, found)
     for joint in ("leg1.base", "leg2.base"):  # the next one is chosen by itself
         placer.click(seen[joint])
     placer.choose("leg4.base")
@@ -396,12 +404,7 @@ def test_a_served_page_draws_the_legs_and_saves_clicks(
     server = ClickServer(examination, replace(found, dataset=dataset), folder.parent / "found")
     threading.Thread(target=server.run, daemon=True).start()
     try:
-        browser.get(str(server.address))
-        placer, row = Placer(browser), int(found.rows[0])
-        placer.open(0)
-        camera = found.T_base_camera[0]
-        assert camera is not None
-        seen = seen_from(folder, row, camera)
+        placer, camera, seen = placing(browser, str(server.address), folder, found)
         for joint in (*(f"leg{k}.base" for k in range(1, 7)), "leg1.platform", "leg3.platform"):
             placer.choose(joint)
             placer.click(seen[joint])

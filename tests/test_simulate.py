@@ -294,30 +294,20 @@ def machine() -> Machine:
     return load_mechanism("3-rps")
 
 
-def _with_board(factory: pytest.TempPathFactory, **settings: Any) -> Path:
-    folder = factory.mktemp("board") / "session"
+def _with_board(folder: Path, **settings: Any) -> Path:
     simulate(machine(), folder, SimulationSettings(level=Level.OUTLINES, views=1, **settings))
     return folder
 
 
-@pytest.fixture(scope="module")
-def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _with_board(tmp_path_factory, poses=2, board="charuco", board_pose=True, seed=3)
-
-
-@pytest.fixture(scope="module")
-def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _with_board(tmp_path_factory, poses=3, board="aprilgrid", hand_held=True, sigma_px=0.0)
-
-
-def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
-    dataset = load_dataset(standing)
+def test_corners_are_off_by_as_much_as_they_claim(tmp_path: Path) -> None:
+    folder = _with_board(tmp_path / "set", poses=2, board="charuco", board_pose=True, seed=3)
+    dataset = load_dataset(folder)
     corners, (fixed,) = dataset.corners, dataset.boards
     board, T_base_board = fixed.board, fixed.T_link_board
     assert corners is not None
     assert T_base_board is not None
     view = dataset.measurements.views[0]
-    truth = truth_of(standing)["views"]["c1"]["T_base_camera"]
+    truth = truth_of(folder)["views"]["c1"]["T_base_camera"]
     T = motion_from_xyz_quat(**truth).inv() * T_base_board
     exact = view.camera.project(T.apply(board.points))[corners.corner]
     assert len(corners) >= 2 * 0.5 * board.n_corners
@@ -325,16 +315,18 @@ def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
     assert np.all(corners.sigma_px == 0.1)
 
 
-def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Path) -> None:
-    dataset = load_dataset(held)
+def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    _with_board(folder, poses=3, board="aprilgrid", hand_held=True, sigma_px=0.0)
+    dataset = load_dataset(folder)
     m = dataset.measurements
     assert dataset.corners is not None
     assert [view.name for view in m.views] == [f"c1-{k + 1}" for k in range(m.n_rows)]
     poses, _ = camera_poses_by_board(
         dataset.corners, dataset.boards[0].board, m, [view.name for view in m.views]
     )
-    truth = truth_of(held)
-    T_base_board = parse_board(truth["board"], held).T_link_board
+    truth = truth_of(folder)
+    T_base_board = parse_board(truth["board"], folder).T_link_board
     assert T_base_board is not None
     places = []
     for view, T_board_camera in zip(m.views, poses, strict=True):

@@ -1,14 +1,14 @@
 """Poses of simulated machines, drawn, given or commanded: reached and inside all limits."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import ROOT
+from machines import copied_model
 from scipy.spatial.transform import RigidTransform
 
 from legcal import Machine, forward_kinematics, inverse_kinematics, load_mechanism, singularity
@@ -70,15 +70,6 @@ def test_without_enough_motors_the_machine_wanders() -> None:
         assert np.abs(machine.chain.residual(configuration)).max() < 1e-11
 
 
-def _copy(name: str, folder: Path, change: Callable[[str], str]) -> Machine:
-    """Load a copy of a shipped model with another URDF."""
-    for kind, suffix in (("models", "yaml"), ("urdf", "urdf")):
-        (folder / kind).mkdir()
-        text = (ROOT / kind / f"{name}.{suffix}").read_text()
-        (folder / kind / f"{name}.{suffix}").write_text(change(text) if kind == "urdf" else text)
-    return load_mechanism(folder / "models" / f"{name}.yaml")
-
-
 def _limited(name: str, joint: str, limits: tuple[float, float], folder: Path) -> Machine:
     """Load a copy of a shipped model with other limits of some revolutes."""
     lower, upper = limits
@@ -89,7 +80,7 @@ def _limited(name: str, joint: str, limits: tuple[float, float], folder: Path) -
         assert n > 0
         return changed
 
-    return _copy(name, folder, narrow)
+    return load_mechanism(copied_model(folder, name, narrow))
 
 
 def test_joint_limits_of_revolutes_are_kept(tmp_path: Path) -> None:
@@ -149,11 +140,6 @@ def _penetration(machine: Machine, T: RigidTransform) -> float:
     return max(_overlap(machine, T, i, j) for i, j in combinations(range(machine.n_legs), 2))
 
 
-def _thick(folder: Path) -> Machine:
-    """Load a copy of the shipped hexapod with legs of 37 mm radius."""
-    return _copy("hexapod", folder, lambda text: re.sub(r'radius="[^"]*"', 'radius="0.037"', text))
-
-
 def _csv(folder: Path, machine: Machine, rows: Array) -> Path:
     """Write readings of all motors as a CSV."""
     header = [str(machine.legs[j].prismatic) for j in machine.motors]
@@ -178,7 +164,8 @@ def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) ->
 
 
 def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) -> None:
-    thick = _thick(tmp_path)
+    radius = partial(re.sub, r'radius="[^"]*"', 'radius="0.037"')
+    thick = load_mechanism(copied_model(tmp_path, "hexapod", radius))
     poses = _drawn(load_mechanism("hexapod"), 12)
     overlaps = [_penetration(thick, T) for T in poses.poses]
     with pytest.raises(DatasetError, match="collide there, needed") as caught:

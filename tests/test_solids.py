@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from machines import ROOT
+from machines import ROOT, copied_model
 from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
@@ -40,13 +40,8 @@ endsolid one
 
 def hexapod_showing(folder: Path, visuals: str) -> Machine:
     """Return the hexapod with visuals on its platform."""
-    (folder / "models").mkdir()
-    (folder / "urdf").mkdir()
-    (folder / "models" / "hexapod.yaml").write_text((ROOT / "models/hexapod.yaml").read_text())
-    text = (ROOT / "urdf/hexapod.urdf").read_text()
-    text = text.replace('<link name="platform"/>', f'<link name="platform">{visuals}</link>')
-    (folder / "urdf" / "hexapod.urdf").write_text(text)
-    return load_mechanism(folder / "models" / "hexapod.yaml")
+    old, new = '<link name="platform"/>', f'<link name="platform">{visuals}</link>'
+    return load_mechanism(copied_model(folder, "hexapod", lambda text: text.replace(old, new)))
 
 
 @pytest.mark.parametrize(

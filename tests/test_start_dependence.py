@@ -1,13 +1,8 @@
 """The result of a calibration does not depend on where its search began."""
 
-import sys
 from pathlib import Path
 
 import pytest
-from thinned import thinned
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
 from start_dependence import (
     OFF,
     RECORDED,
@@ -20,19 +15,14 @@ from start_dependence import (
     session_folder,
     with_other_model,
 )
+from thinned import thinned
 
 from legcal.simulation.settings import Level
 
-OUTLINES = {
-    "hexapod": Session("hexapod", Level.OUTLINES, 8, 3, 6),
-    "linear-delta": Session("linear-delta", Level.OUTLINES, 10, 3, 6),
-}
-
 
 @pytest.mark.system
-@pytest.mark.parametrize("name", ["hexapod"])
-def test_outlines_with_outliers_give_one_result(name: str, tmp_path: Path) -> None:
-    folder = session_folder(name, OUTLINES[name], tmp_path)
+def test_outlines_with_outliers_give_one_result(tmp_path: Path) -> None:
+    folder = session_folder("hexapod", Session("hexapod", Level.OUTLINES, 8, 3, 6), tmp_path)
     first = calibrated(folder, "nominal", steps=False)
     assert not first.solution.outlines.used.all()  # a tenth of them are wrong
     other = calibrated(folder, "staged")

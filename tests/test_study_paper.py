@@ -61,9 +61,8 @@ def test_eq20_of_the_truth_is_zero_and_of_equal_offsets_the_travel_of_a_lift() -
 # Sessions
 
 
-@pytest.mark.parametrize("name", ["coplanar"])
-def test_a_session_is_that_of_the_paper(name: str) -> None:
-    machine, seed = paper_machine(name), np.random.SeedSequence(1)
+def test_a_session_is_that_of_the_paper() -> None:
+    machine, seed = paper_machine("coplanar"), np.random.SeedSequence(1)
     views = paper_cameras(machine, np.random.default_rng(1))
     rngs = streams(seed)
     session = PaperStudy().session(machine, views, rngs)
@@ -80,7 +79,7 @@ def test_a_session_is_that_of_the_paper(name: str) -> None:
     assert 2.5e-6 < np.abs(error).max() <= 3e-6
     assert m.sigma_q == pytest.approx(3e-6 / np.sqrt(3.0))
     height = max(abs(joint[2]) for leg in geometries(machine) for joint in (leg.A, leg.B))
-    assert height == pytest.approx(0.0 if name == "coplanar" else 0.030, abs=1e-12)
+    assert height < 1e-12
 
 
 # Runs

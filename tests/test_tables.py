@@ -21,7 +21,6 @@ from legcal.data.outlines import (
     MEASURED,
     LegAxes,
     Outlines,
-    axes_from_outlines,
     axes_of_table,
     join_axes,
     no_outlines,
@@ -29,7 +28,6 @@ from legcal.data.outlines import (
     write_observations,
 )
 from legcal.data.reasons import Reason, Rejection, read_rejection
-from legcal.geometry.types import Array
 
 FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -149,21 +147,6 @@ def test_joined_axes_do_not_depend_on_the_points_that_state_them() -> None:
     for name in ("u", "M", "covariance"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-7, atol=1e-12)
     assert np.abs(one.M - two.M[0]).max() > 1e-5
-
-
-def test_the_covariance_of_an_axis_is_that_of_both_of_its_outlines() -> None:
-    outlines = outlines_of(5, rejected=0.0)
-    radii = {cylinder.link: cylinder.radius for leg in LEGS for cylinder in leg.cylinders}
-
-    def covariance(*edges: int) -> Array:
-        known = np.isin(outlines.edge, edges)[:, None, None]
-        some = replace(outlines, covariance=np.where(known, outlines.covariance, 0.0))
-        return axes_from_outlines(some, MEASUREMENTS, radii).covariance
-
-    floor, one, two, both = covariance(), covariance(1), covariance(2), covariance(1, 2)
-    np.testing.assert_allclose(both, one + two - floor, rtol=1e-6, atol=1e-12 * both.max())
-    for alone in (one, two):
-        assert np.all(np.trace(alone, axis1=1, axis2=2) > 10.0 * np.trace(floor, axis1=1, axis2=2))
 
 
 # --- corrected by hand

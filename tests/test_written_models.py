@@ -9,7 +9,7 @@ import pytest
 import yaml
 from layouts import Layout, LegLayout, write_machine
 from lxml import etree
-from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types
+from machines import MACHINES, SHIPPED_URDF, SHIPPED_YAML, of_types, written_with
 from scipy.spatial.transform import RigidTransform
 
 from legcal import (
@@ -29,7 +29,6 @@ from legcal.machine.home import home_of_legs
 from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.model_writer import (
     check_closes,
-    reload_and_check,
     write_calibrated_yaml,
     write_urdf,
 )
@@ -64,9 +63,7 @@ def write(nominal: Machine, legs: tuple[Leg, ...], folder: Path) -> Machine:
     """Write a calibrated model and load it again."""
     home = home_of_legs(nominal, legs, 0.2)
     assert home is not None
-    write_urdf(nominal, legs, folder / "calibrated.urdf")
-    write_calibrated_yaml(nominal, folder / "calibrated.yaml", "calibrated.urdf", home, legs)
-    return reload_and_check(folder / "calibrated.yaml")
+    return written_with(nominal, legs, folder, home)
 
 
 def apart(one: Leg, two: Leg) -> float:
@@ -125,7 +122,6 @@ def test_the_yaml_keeps_the_gains_of_motors(tmp_path: Path) -> None:
     moved = q * np.where([leg.prismatic == motor for leg in nominal.legs], 1.001, 1.0)
     before = forward_kinematics(nominal, moved)
     np.testing.assert_allclose(T.as_matrix(), before.as_matrix(), atol=1e-9)
-    (tmp_path / "more").mkdir()
     half = write(
         at_1001, moved_legs(geometries(at_1001), parametrization.place, step), tmp_path / "more"
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
-from legcal import Calibration, calibrate, detect, load_dataset
+from legcal import calibrate, detect, load_dataset
 from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
 from legcal.calibration.estimate import outlier_images
@@ -312,13 +312,6 @@ def test_what_is_flat_has_no_edges() -> None:
     assert measure_exposure(stripes).blur < 0.6  # all slopes are the greatest
 
 
-@pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
-    """A calibration of a hexapod from outlines."""
-    made = simulated(tmp_path_factory.mktemp("outlines") / "set", "hexapod", poses=6)
-    return calibrate(made.folder)
-
-
 def _with_rejected(outlines: Outlines, rejected: BoolArray) -> Outlines:
     out = rejected & outlines.used
     reasons = zip(out.tolist(), outlines.reason, strict=True)
@@ -328,8 +321,8 @@ def _with_rejected(outlines: Outlines, rejected: BoolArray) -> Outlines:
     return replace(outlines, used=outlines.used & ~out, reason=reason)
 
 
-def test_images_most_of_whose_outlines_disagree_are_named(fitted: Calibration) -> None:
-    o = fitted.solution.outlines
+def test_images_most_of_whose_outlines_disagree_are_named(tmp_path: Path) -> None:
+    o = calibrate(simulated(tmp_path / "set", "hexapod", poses=6).folder).solution.outlines
     (notes,) = outlier_images(_with_rejected(o, o.row == 1)).items()
     assert notes[0] == 1
     assert re.match(r"\d+ of its \d+ outlines disagree with the fit and were left", str(notes[1]))

@@ -248,13 +248,21 @@ def plan_new_dataset(
     texts = map(table.text, ("image", "view", "time"))
     rows = tuple(itertools.starmap(Row, zip(table.where, *texts, strict=True)))
     matching = match(rows, photographs, str(path))
-    view_of = tuple(_view(rows[k], photograph) for k, photograph in matching.pairs)
+    view_of = tuple(
+        rows[k].view or (photograph.folder if photograph.folder != "." else ONE_VIEW)
+        for k, photograph in matching.pairs
+    )
     cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
     stated = options.encoder_sigma
     if isinstance(stated, Mapping):
         stated = {joint: x for joint, x in stated.items() if joint not in sheet.unknown}
     least = MIN_SIGMA * machine.size
     sigma, sigma_notes = _sigmas(stated, sheet.motors, sheet_readings, least)
+    unknown = [
+        f"The readings of {few(sheet.unknown)} are not known (empty cells): these legs count as "
+        "passive. Where the others do not determine the pose, click joints with legcal detect "
+        "DATASET -o OUT --edit: at the base in a picture of each view, at the platform in all."
+    ]
     views_stated = any(row.view for row in rows)
     return NewDataset(
         machine=machine,
@@ -272,7 +280,7 @@ def plan_new_dataset(
         encoder_sigma=sigma,
         notes=(
             *sheet.notes,
-            *_unknown_notes(sheet.unknown),
+            *(unknown if sheet.unknown else []),
             *sheet_readings.notes,
             *matching.notes,
             *sigma_notes,
@@ -281,16 +289,6 @@ def plan_new_dataset(
         ),
         made_cameras={path: text for path, (_, text) in made.items()},
     )
-
-
-def _unknown_notes(joints: Sequence[str]) -> Iterator[str]:
-    """Yield a note on readings that are not known."""
-    if joints:
-        yield (
-            f"The readings of {few(joints)} are not known (empty cells): these legs count as "
-            "passive. Where the others do not determine the pose, click joints with legcal detect "
-            "DATASET -o OUT --edit: at the base in a picture of each view, at the platform in all."
-        )
 
 
 def _made_notes(
@@ -370,16 +368,11 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
             (folder / name).write_bytes(content)
         for name, path in linked.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            _link(path, folder / name)
+            try:
+                os.link(path, folder / name)
+            except OSError:  # no links there
+                shutil.copy2(path, folder / name)
     return [new.destination / name for name in dataset_files]
-
-
-def _link(path: Path, place: Path) -> None:
-    """Link a file, or copy it where it cannot be linked."""
-    try:
-        os.link(path, place)
-    except OSError:
-        shutil.copy2(path, place)
 
 
 def _sigmas(
@@ -413,11 +406,6 @@ def _sigmas(
             "or worse."
         )
     return smallest if slides and not isinstance(stated, Mapping) else sigmas, notes
-
-
-def _view(row: Row, photograph: Photograph) -> str:
-    """Return the view of a pair: the entry of the table, else the folder."""
-    return row.view or (photograph.folder if photograph.folder != "." else ONE_VIEW)
 
 
 def _cameras(

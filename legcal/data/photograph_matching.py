@@ -251,12 +251,6 @@ def _alike(photograph: Photograph, text: str) -> tuple[int, bool]:
     return [*are_equal, False].index(False), photograph.name.endswith(_path(text))
 
 
-def _candidates(row: Row, photographs: Sequence[Photograph]) -> list[Photograph]:
-    """Return the photographs in the folder of a row's view, or all if there is no such folder."""
-    of_view = [p for p in photographs if row.view and _in_folder(p, row.view)]
-    return of_view or list(photographs)
-
-
 def _in_folder(photograph: Photograph, view: str) -> bool:
     folder = photograph.folder.casefold()
     return folder == view.casefold() or folder.endswith("/" + view.casefold())
@@ -277,7 +271,8 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
         for k in named:
             same_key = by_key.get(key(rows[k].image), [])
             if same_key and rows[k].view:
-                same_key = _candidates(rows[k], same_key)
+                inside = [p for p in same_key if _in_folder(p, rows[k].view)]
+                same_key = inside or same_key
             if same_key and key(rows[k].image):
                 most = max(_alike(photograph, rows[k].image) for photograph in same_key)
                 matches[k] = [p for p in same_key if _alike(p, rows[k].image) == most]

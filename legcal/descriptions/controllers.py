@@ -343,6 +343,7 @@ _WORDS = {
     "stop": "the height of the centred nozzle over the bed at the endstops",
     "angle": "the angle of the tower",
 }
+_STOPS_OF_ARMS = "the lowest and highest angle of the arms"
 
 
 def _shown(key: str) -> str:
@@ -371,10 +372,11 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
             missing.append(p)
         values[p.key] = 0.0 if value is None else value
     if missing:
+        words = _WORDS | ({"stop": _STOPS_OF_ARMS} if read.firmware.stops_are_motors else {})
         raise ModelError(
             [
                 f"{path}: the {read.firmware.title} configuration could not be read: found no "
-                f"{_shown(p.key)}, needed {_needed(read.firmware, p)}; write it, or give the file "
+                f"{_shown(p.key)}, needed {words[p.field]}; write it, or give the file "
                 "that has it."
                 + "".join(f" {note}" for note in read.notes if "not followed" in note)
                 for p in missing
@@ -383,19 +385,11 @@ def _completed(path: Path, read: Configuration) -> dict[str, float]:
     return values
 
 
-def _needed(firmware: Firmware, p: Parameter) -> str:
-    """Return the meaning of a parameter."""
-    if p.field != "stop" or not firmware.stops_are_motors:
-        return _WORDS[p.field]
-    return "the lowest and highest angle of the arms"
-
-
 def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float | None) -> Table:
     """Return the table of a Delta, and what was assumed."""
     firmware = read.firmware
     ideal = firmware.ideal(_completed(path, read))
-    _check(path, firmware, ideal, unit)
-    _check_trims(path, read, unit)
+    _check(path, read, ideal, unit)
     at_stops = ideal.at_stops
     size = float(np.mean(ideal.arm if ideal.turns else ideal.radius))
     if effector is not None and not 0.0 < effector < LARGEST_EFFECTOR * size:
@@ -469,11 +463,11 @@ def _lowest(read: Configuration, ideal: IdealDelta, size: float) -> Array:
     return np.asarray(np.min(np.where(np.isfinite(on_bed), on_bed, np.inf), axis=0)) - 1e-3 * size
 
 
-def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None:
+def _check(path: Path, read: Configuration, ideal: IdealDelta, unit: str) -> None:
     """Refuse a Delta that cannot be one, the most likely cause first."""
-    start = f"{path}: the {firmware.title} configuration could not be used: found"
+    start = f"{path}: the {read.firmware.title} configuration could not be used: found"
     apart = np.abs((ideal.angle - np.roll(ideal.angle, 1) + 180.0) % 360.0 - 180.0)
-    rod, radius, problems = ideal.rod, ideal.radius, []
+    rod, radius, stop, problems = ideal.rod, ideal.radius, ideal.stop, []
     if apart.min() < MIN_APART:
         i = int(np.argmin(apart))
         problems.append(
@@ -483,55 +477,49 @@ def _check(path: Path, firmware: Firmware, ideal: IdealDelta, unit: str) -> None
         )
     sizes = 1e3 * LENGTH[unit] * rod
     least = min(radius.min(), ideal.arm.min() if ideal.turns else np.inf)
-    if not least > 0.0:
-        problems.append(
-            f"{start} a radius or arm of {least:g} {unit}, needed a positive length; correct it."
-        )
-    elif np.ptp(sizes) > 0.5 * sizes.max():
-        problems.append(
-            f"{start} rods of {', '.join(f'{x:g}' for x in rod)} {unit} on a radius of "
-            f"{radius.min():g} {unit}, needed rods that are nearly alike; "
-            "write all lengths in one unit."
-        )
-    elif not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]):
-        problems.append(
-            f"{start} rods of {rod.min():g} {unit}, needed {SIZES[0]:g} to {SIZES[1]:g} mm; state "
-            "their unit with --unit in or --unit m if they are in another one, or correct them."
-        )
-    elif not ideal.turns and (rod <= radius).any():
-        problems.append(
-            f"{start} rods of {rod.min():g} {unit} on a radius of {radius.max():g} {unit}, needed "
+    over_bed = f"{unit} over the bed with rods of"
+    height = "the height of the nozzle at the endstops; write"
+    faults = (
+        (not least > 0.0, f"a radius or arm of {least:g} {unit}", "a positive length; correct it"),
+        (
+            np.ptp(sizes) > 0.5 * sizes.max(),
+            f"rods of {', '.join(f'{x:g}' for x in rod)} {unit} on a radius of {radius.min():g} "
+            f"{unit}",
+            "rods that are nearly alike; write all lengths in one unit",
+        ),
+        (
+            not (SIZES[0] <= sizes.min() and sizes.max() <= SIZES[1]),
+            f"rods of {rod.min():g} {unit}",
+            f"{SIZES[0]:g} to {SIZES[1]:g} mm; state their unit with --unit in or --unit m if they "
+            "are in another one, or correct them",
+        ),
+        (
+            not ideal.turns and (rod <= radius).any(),
+            f"rods of {rod.min():g} {unit} on a radius of {radius.max():g} {unit}",
             "rods that are longer than the radius, as a rule twice as long; write both in one "
-            "unit, or correct them."
-        )
-    elif not ideal.stops_are_motors and not (0.05 * rod < ideal.stop).all():
-        problems.append(
-            f"{start} endstops {ideal.stop.min():g} {unit} over the bed with rods of "
-            f"{rod.max():g} {unit}, needed the height of the nozzle at the endstops; write it in "
-            "the unit of the rods."
-        )
-    elif not ideal.turns and (ideal.stop > 15.0 * rod).any():
-        problems.append(
-            f"{start} endstops {ideal.stop.max():g} {unit} over the bed with rods of "
-            f"{rod.min():g} {unit}, needed the height of the nozzle at the endstops; write both "
-            "in one unit."
-        )
-    if problems:
-        raise ModelError(problems)
-
-
-def _check_trims(path: Path, read: Configuration, unit: str) -> None:
-    """Refuse corrections of Marlin's rods that are none."""
-    if read.firmware.name != "marlin":
-        return
-    largest = LARGEST_TRIM * read.values["M665 L"]
-    if problems := [
-        f"{path}: the Marlin configuration could not be used: found {letter} of M665, the "
-        f"correction of a rod, of {trim:g} {unit}, needed at most {largest:.4g} {unit} (5 % of the "
-        "rod); correct it."
-        for letter in "ABC"
+            "unit, or correct them",
+        ),
+        (
+            not ideal.stops_are_motors and not (0.05 * rod < stop).all(),
+            f"endstops {stop.min():g} {over_bed} {rod.max():g} {unit}",
+            f"{height} it in the unit of the rods",
+        ),
+        (
+            not ideal.turns and (stop > 15.0 * rod).any(),
+            f"endstops {stop.max():g} {over_bed} {rod.min():g} {unit}",
+            f"{height} both in one unit",
+        ),
+    )
+    likeliest = [f"{start} {found}, needed {needed}." for is_so, found, needed in faults if is_so]
+    problems += likeliest[:1]
+    largest = LARGEST_TRIM * read.values.get("M665 L", np.inf)
+    problems += [
+        f"{start} {letter} of M665, the correction of a rod, of {trim:g} {unit}, needed at most "
+        f"{largest:.4g} {unit} (5 % of the rod); correct it."
+        for letter in "ABC" * (read.firmware.name == "marlin")
         if not abs(trim := read.values.get(f"M665 {letter}", 0.0)) <= largest
-    ]:
+    ]
+    if problems:
         raise ModelError(problems)
 
 

@@ -345,7 +345,14 @@ def assemble(described: Description) -> Assembled:
     _refuse(wrong_sizes(described))
     T, notes = home_of_description(described)
     readings = _readings_at_home(described, T)
-    A = np.array([_at(leg, readings) for leg in described.legs])
+    A = np.array(
+        [
+            leg.A_base
+            if (motor := leg.actuator) is None
+            else motor.at(leg.A_base, np.array([readings[motor.joint]]))[0]
+            for leg in described.legs
+        ]
+    )
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
     _refuse(wrong_lengths(described, lengths))
@@ -628,14 +635,6 @@ def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> lis
     if stated is not None:
         return sorted(readings, key=lambda q: abs(q - stated))
     return sorted(readings, key=lambda q: max(low - q, q - high, 0.0))
-
-
-def _at(entry: LegEntry, readings: Mapping[str, float]) -> Array:
-    """Return the joint at A (3,) at readings of motors that carry joints."""
-    if entry.actuator is None:
-        return entry.A_base
-    q = np.array([readings[entry.actuator.joint]])
-    return np.asarray(entry.actuator.at(entry.A_base, q)[0])
 
 
 def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, float]:

@@ -82,22 +82,19 @@ class OutputFile:
 
     def check_place(self, path: Path, *, force: bool = False) -> None:
         """Refuse a path where no file can be written, or, without *force*, with another file."""
-        start = f"{path}: {self.noun} could not be written: found"
-        if not path.name or os.path.isdir(path):
-            raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
-        if not os.path.isdir(path.parent):
-            raise UsageError(
-                f"{start} no folder {path.parent}, needed one that exists; create it or give "
-                "another file."
-            )
-        refusal = _takes_no_files(path.parent)
-        if refusal:
-            raise UsageError(f"{start} {refusal}; give another file.")
+        found, remedy = "", "give another file"
         may_go = os.path.isfile(path) if force else self.is_at(path)
-        if os.path.lexists(path) and not may_go:
-            raise UsageError(
-                f"{start} another file of that name, needed {self.needed}; give another file."
-            )
+        if not path.name or os.path.isdir(path):
+            found, remedy = "a folder, needed the name of a file", "give one in it"
+        elif not os.path.isdir(path.parent):
+            found = f"no folder {path.parent}, needed one that exists"
+            remedy = f"create it or {remedy}"
+        elif refusal := _takes_no_files(path.parent):
+            found = refusal
+        elif os.path.lexists(path) and not may_go:
+            found = f"another file of that name, needed {self.needed}"
+        if found:
+            raise UsageError(f"{path}: {self.noun} could not be written: found {found}; {remedy}.")
 
     def is_at(self, path: Path) -> bool:
         """Return whether a file is of this kind."""
@@ -177,28 +174,27 @@ def check_empty(destination: Path, kind: OutputKind) -> None:
 
 def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
     """Refuse a path where no folder exists or can be made, or that cannot be written to."""
-    start = f"{destination}: the {kind.noun} could not be written: found"
-    remedy = "needed a path that can be created; give another output folder."
+    needed = "needed a path that can be created"
     try:
         os.lstat(destination)
         if destination.is_dir():
             os.listdir(destination)
+            found = _takes_no_files(destination)
+        elif destination.exists():
+            found = "a file of that name, needed a folder"
+        else:
+            found = "a broken link, needed a folder"
     except FileNotFoundError:
-        pass
-    except NotADirectoryError as error:
-        above = existing_parent(destination)
-        raise UsageError(f"{start} that {above} is a file, {remedy}") from error
+        found = _takes_no_files(existing_parent(destination))
+    except NotADirectoryError:
+        found = f"that {existing_parent(destination)} is a file, {needed}"
     except OSError as error:
-        raise UsageError(f"{start} '{error.strerror}', {remedy}") from error
-    if destination.is_symlink() and not destination.exists():
-        raise UsageError(f"{start} a broken link, needed a folder; give another output folder.")
-    if destination.exists() and not destination.is_dir():
+        found = f"'{error.strerror}', {needed}"
+    if found:
         raise UsageError(
-            f"{start} a file of that name, needed a folder; give another output folder."
+            f"{destination}: the {kind.noun} could not be written: found {found}; give another "
+            "output folder."
         )
-    refusal = _takes_no_files(destination if destination.is_dir() else existing_parent(destination))
-    if refusal:
-        raise UsageError(f"{start} {refusal}; give another output folder.")
 
 
 def in_the_way(destination: Path, kind: OutputKind, actual: str) -> str:

@@ -51,6 +51,13 @@ _NEEDED = {
     "dict_type": "a mapping of names to values",
     "model_type": "a mapping of names to values",
     "model_attributes_type": "a mapping of names to values",
+    "greater_than": "a number greater than {gt:g}",
+    "less_than": "a number less than {lt:g}",
+    "greater_than_equal": "{ge:g} or more",
+    "less_than_equal": "{le:g} or less",
+    "literal_error": "{expected}",
+    "too_short": "at least {min_length} entries",
+    "too_long": "at most {max_length} entries",
 }
 
 
@@ -371,22 +378,8 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
                 return refused(bad.found, bad.needed, bad.remedy, "used")
             sentence = f"{place} could not be used: {bad}"
             return Problem(sentence, file=str(path), name=place, code=Code.BAD_VALUE)
-        case "greater_than":
-            needed = f"a number greater than {context['gt']:g}"
-        case "less_than":
-            needed = f"a number less than {context['lt']:g}"
-        case "greater_than_equal":
-            needed = f"{context['ge']:g} or more"
-        case "less_than_equal":
-            needed = f"{context['le']:g} or less"
-        case "literal_error":
-            needed = context["expected"]
-        case "too_short":
-            needed = f"at least {context['min_length']} entries"
-        case "too_long":
-            needed = f"at most {context['max_length']} entries"
-        case other:
-            needed = _NEEDED.get(other, error["msg"])
+    template = _NEEDED.get(error["type"])
+    needed = error["msg"] if template is None else template.format(**context)
     return refused(describe(error["input"]), needed, "correct the value")
 
 
