@@ -268,7 +268,7 @@ def _share_of_scale(platform: PlatformAccuracy) -> str:
 
 
 def _error_of_travel(platform: PlatformAccuracy, solution: Solution, tolerance: Tolerance) -> str:
-    """Return a clause on what an error of all travel does, "" where that is negligible."""
+    """Return a clause on what errors of the travel do, "" where that is negligible."""
     predicted = (platform.workspace or platform.sigma).mean_displacement
     moved = platform.effects.get(ALL_READINGS)
     if moved is None or moved.mean_displacement <= NEGLIGIBLE * predicted:

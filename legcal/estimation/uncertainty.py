@@ -332,15 +332,6 @@ class Estimated(NamedTuple):
     square: float  # of the score over its variance: chi-squared of that rank if all are zero
 
 
-def size_left(score: float, information: float, sigma: float) -> float:
-    """Return how large a number that a fit takes as zero may be, by its score and a prior.
-
-    The root mean square of its distribution with the standard deviation *sigma* as prior.
-    """
-    variance = 1.0 / (sigma**-2 + max(information, 0.0))
-    return float(np.hypot(score * variance, np.sqrt(variance)))
-
-
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Rao's scores of numbers that a fit lacks, and their information (:func:`score_test`)."""
@@ -372,6 +363,17 @@ class Scores:
             score=self.score - toward @ numbers.amount,
             information=self.information - toward @ numbers.covariance @ toward.T,
         )
+
+
+def size_left(scores: Scores, covariance: Array) -> Array:
+    """Return how large numbers may be that a fit takes as zero, by their scores and a prior.
+
+    (c, c + 1): their means with the *covariance* (c, c) as prior, and a root of what is left of it.
+    """
+    root = np.linalg.cholesky(covariance)
+    value, vector = np.linalg.eigh(root.T @ scores.information @ root)
+    left = (root @ vector) / np.sqrt(1.0 + np.maximum(value, 0.0))
+    return np.column_stack([left @ left.T @ scores.score, left])
 
 
 class LeftOut(NamedTuple):

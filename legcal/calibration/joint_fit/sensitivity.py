@@ -71,13 +71,13 @@ def sensitivity_to_exact_cameras(cameras: CameraResiduals) -> dict[str, Array]:
     chosen = {ParameterId.parse(name).owner for name in problem.choices.fixed}
     free = np.array([owner in chosen for owner in owners])
     free |= (_camera_columns(problem)[:, :2] < problem.n_kept).any(axis=1)
-    unit, moved = _camera_error(state, _FOCAL, {}), list[Array]()
-    for owner in dict.fromkeys(owners[~free].tolist()):
-        error = unit * (owners == owner)[:, None]
-        scores = cameras.scores([error])
-        off = size_left(scores.score[0], scores.information[0, 0], SIGMA_EXACT)
-        moved.append(off * kinematic_steps(problem, cameras.response(error)))
-    return {EXACT_CAMERAS: np.hstack(moved)} if moved else {}
+    unit = _camera_error(state, _FOCAL, {})
+    errors = [unit * (owners == owner)[:, None] for owner in dict.fromkeys(owners[~free].tolist())]
+    if not errors:
+        return {}
+    off = size_left(cameras.scores(errors), SIGMA_EXACT**2 * np.eye(len(errors)))
+    moved = np.hstack([kinematic_steps(problem, cameras.response(error)) for error in errors])
+    return {EXACT_CAMERAS: moved @ off}
 
 
 def sensitivity_to_intrinsics(problem: FitProblem, covariance: Array) -> dict[str, Array]:
