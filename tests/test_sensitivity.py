@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from fit_sessions import PINHOLE, MachineSession, irregular_hexapod, with_camera
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices
@@ -55,6 +56,25 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
     found = float(note.partition("it differs by ")[2].partition(" +-")[0])
     assert found == pytest.approx(3.0, abs=1.2)
     assert [wrong.view for wrong in solution.camera_doubts] == ["c2"]
+
+
+def test_a_view_of_photographs_that_were_turned_upside_down_is_named() -> None:
+    """Its camera rolled by half a turn, and its principal point is on the other side."""
+    session = irregular_hexapod(6)
+    measurements, outlines = session.noisy(0)
+    camera = with_intrinsics(measurements.views[0].camera, {"cx": 521.5, "cy": 373.5})
+    rolled = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, np.pi]))
+    of_view, size = measurements.view[outlines.row] == 1, np.array([camera.width, camera.height])
+    moved = outlines.ends + [10.0, -10.0] - (measurements.views[0].camera.K[:2, 2] - [511.5, 383.5])
+    ends = np.where(of_view[:, None, None], size - 1.0 - moved, moved)
+    h = np.where(of_view[:, None], outlines.h * [-1.0, -1.0, 1.0], outlines.h)
+    data = with_camera(measurements, replace(outlines, ends=ends, h=h), camera)
+    cameras = list(session.start.T_camera_Rb)
+    cameras[1] = rolled * cameras[1]
+    start = replace(session.start, T_camera_Rb=tuple(cameras))
+    (wrong,) = refine(session.legs, *data, start).camera_doubts
+    assert (wrong.kind, wrong.view) == ("centre", "c2")
+    assert "turned upside down" in str(wrong)
 
 
 @pytest.mark.parametrize(
