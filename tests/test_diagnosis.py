@@ -131,7 +131,7 @@ def _diagnosed(
     data = order_dataset(d, in_turn, no_progress)
     few = [one for one in mistakes(data) if is_tried(one)]
     assert len(few) > 1
-    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    monkeypatch.setattr(diagnosis, "mistakes", lambda *_: few)
     (found,) = diagnose(data)
     return found
 
@@ -196,7 +196,7 @@ def test_outlines_under_the_names_of_other_legs_in_a_view_are_named(
     outlines: Callable[[str], Dataset], model: str, names: dict[int, int], what: str
 ) -> None:
     d = outlines(model)
-    assert diagnose(order_dataset(d, in_turn, no_progress)) == ()
+    assert not diagnose(order_dataset(d, in_turn, no_progress))
     renamed = _misnamed(d, names)
     (mistake,) = diagnose(order_dataset(renamed, in_turn, no_progress))
     assert mistake.what == f"the outlines of {what} in view c2"
@@ -318,14 +318,14 @@ def test_joints_exchanged_in_the_model_are_named_before_readings_that_it_cannot_
     d = _base_joints_exchanged(outlines("hexapod"))
     kinds = {"joints exchanged", "columns exchanged"}
     few = [m for m in mistakes(order_dataset(d, in_turn, no_progress)) if m.kind in kinds]
-    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    monkeypatch.setattr(diagnosis, "mistakes", lambda *_: few)
     with pytest.raises(DatasetError) as refused:
         calibrate(d)
     first = refused.value.problems[0]
     assert first.startswith("The base joints of leg5 and leg6 appear to be swapped in the model")
     (reach,) = map(str, refused.value.consequences)
     assert "cannot reach" in reach
-    monkeypatch.setattr(diagnosis, "mistakes", lambda _: [])
+    monkeypatch.setattr(diagnosis, "mistakes", lambda *_: [])
     said = reach.partition("--leave-out ")[2].partition(")")[0]
     calibration = calibrate(d, leave_out=said)  # the other images are fitted
     assert f"Left out, as asked: {said}." in calibration.notes

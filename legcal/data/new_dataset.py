@@ -273,6 +273,7 @@ def plan_new_dataset(
         notes=(
             *sheet.notes,
             *_unknown_notes(sheet.unknown),
+            *_unused_notes(options, sheet.motors),
             *sheet_readings.notes,
             *matching.notes,
             *sigma_notes,
@@ -380,6 +381,15 @@ def _link(path: Path, place: Path) -> None:
         os.link(path, place)
     except OSError:
         shutil.copy2(path, place)
+
+
+def _unused_notes(options: SheetOptions, motors: Sequence[Leg]) -> list[str]:
+    """Return a note on options that are of readings, where none is known."""
+    given = {"--encoder-sigma": options.encoder_sigma, "--unit": options.unit}
+    unused = [name for name, value in given.items() if value]
+    if motors or not unused:
+        return []
+    return [f"{' and '.join(unused)} had no effect: the table has no reading."]
 
 
 def _sigmas(

@@ -90,7 +90,7 @@ class OutputFile:
                 f"{start} no folder {path.parent}, needed one that exists; create it or give "
                 "another file."
             )
-        refusal = _takes_no_files(path.parent)
+        refusal = takes_no_files(path.parent)
         if refusal:
             raise UsageError(f"{start} {refusal}; give another file.")
         may_go = os.path.isfile(path) if force else self.is_at(path)
@@ -196,7 +196,7 @@ def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
         raise UsageError(
             f"{start} a file of that name, needed a folder; give another output folder."
         )
-    refusal = _takes_no_files(destination if destination.is_dir() else existing_parent(destination))
+    refusal = takes_no_files(destination if destination.is_dir() else existing_parent(destination))
     if refusal:
         raise UsageError(f"{start} {refusal}; give another output folder.")
 
@@ -209,7 +209,7 @@ def in_the_way(destination: Path, kind: OutputKind, actual: str) -> str:
     )
 
 
-def _takes_no_files(folder: Path) -> str:
+def takes_no_files(folder: Path) -> str:
     """Return in words why files cannot be created in a folder and the remedy, or "" if they can.
 
     A file is created as a test: permissions do not tell of full or read-only disks, or ``/proc``.
@@ -344,7 +344,7 @@ def _workshop(destination: Path) -> Path:
     if not destination.is_dir():
         return parent
     is_near = parent.stat().st_dev == destination.stat().st_dev
-    return parent if is_near and not _takes_no_files(parent) else destination
+    return parent if is_near and not takes_no_files(parent) else destination
 
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:

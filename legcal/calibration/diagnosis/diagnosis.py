@@ -49,6 +49,13 @@ from legcal.perception.placement import Group, Placement, Search, group_views
 _Judged = tuple[Mistake, Agreement]  # with what all images say of it
 
 STAGE = "Trying common mistakes"
+NONE_EXPLAINS = (
+    "Tried without success, each alone and the likeliest with another one: wrong columns, rows, "
+    "units, directions and zeros of readings, joints of the model in another order or mirrored, "
+    "diameters as radii, other focal lengths, mirrored and turned photographs. Several may be wrong "
+    "at once: click some joints in one photograph of each view (legcal view), run legcal detect "
+    "and see in its overlays which legs stand elsewhere; mend that, and calibrate again."
+)
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 MIN_IMAGES = 3  # of a group of views
@@ -61,7 +68,7 @@ _FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these sui
 _POOL = 3  # cameras of other mistakes that are tried
 _NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras first
 _FINALISTS = 6  # mistakes that all images judge
-_AHEAD = 24  # mistakes ahead in one group of views for which cameras of the next are searched for
+_AHEAD = 12  # mistakes ahead in one group of views for which cameras of the next are searched for
 _FIRSTS = 3  # mistakes beside which others are tried
 _SAME_AMOUNT = 2  # of these that differ by how much
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
