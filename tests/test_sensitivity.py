@@ -65,7 +65,7 @@ def test_a_view_of_photographs_that_were_turned_upside_down_is_named() -> None:
     camera = with_intrinsics(measurements.views[0].camera, {"cx": 521.5, "cy": 373.5})
     rolled = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, np.pi]))
     of_view, size = measurements.view[outlines.row] == 1, np.array([camera.width, camera.height])
-    moved = outlines.ends + [10.0, -10.0] - (measurements.views[0].camera.K[:2, 2] - [511.5, 383.5])
+    moved = outlines.ends + camera.K[:2, 2] - measurements.views[0].camera.K[:2, 2]
     ends = np.where(of_view[:, None, None], size - 1.0 - moved, moved)
     h = np.where(of_view[:, None], outlines.h * [-1.0, -1.0, 1.0], outlines.h)
     data = with_camera(measurements, replace(outlines, ends=ends, h=h), camera)

@@ -111,8 +111,8 @@ class GuidedSession:
         self.folder, self.target = self.dataset.folder, target
         if refusal := takes_no_files(self.folder):
             raise UsageError(
-                f"{self.folder}: no photograph can be taken into the session: found {refusal}; free "
-                "some space there, or go on in a copy of the session that can be written."
+                f"{self.folder}: the session takes no photograph: found {refusal}; free some space "
+                "there, or go on in a copy of the session that can be written."
             )
         self.machine = self.dataset.machine
         self.cameras: dict[str, RigidTransform] = {}  # T_base_camera of placed views
