@@ -13,9 +13,10 @@ each image, light from another side shifts edges, a joint moves, all motors have
 against the true machine is compared with what is stated, for mistakes of the scale or of a gain
 with the error that pitches may have. Printed are sessions that harm by more than three stated
 sigmas, how many of these are trusted, and how often the first doubt names their mistake; ``pitch``
-is a kind apart. FILE keeps sessions as JSON lines; those in it are not done again. About 5 s a session.
-With --photographs 18 small photographs are rendered in place of outlines, and mistakes are those of
-readings, of a stated length, and of a focal length, to which images are enlarged; about a minute.
+is a kind apart. FILE keeps sessions as JSON lines; those in it are not done again. About 5 s a
+session. With --photographs 18 small photographs are rendered in place of outlines, and mistakes are
+those of readings, of a stated length, and of a focal length, to which images are enlarged; about a
+minute.
 """
 
 import argparse

@@ -50,9 +50,9 @@ _Judged = tuple[Mistake, Agreement]  # with what all images say of it
 
 STAGE = "Trying common mistakes"
 NONE_EXPLAINS = (
-    "Tried without success, each alone and the likeliest beside others: wrong columns, rows, units, "
-    "directions and zeros of readings, joints of the model in another order or mirrored, diameters "
-    "as radii, other focal lengths, mirrored and turned photographs. More may be wrong at once, or "
+    "Tried without success, each alone and the likeliest beside others: wrong columns, rows, "
+    "units, directions and zeros of readings, joints of the model in another order or mirrored, "
+    "diameters as radii, focal lengths, mirrored or turned photographs. More may be wrong, or "
     "photographs show too little: click some joints in a photograph of each view (legcal detect "
     "DATASET -o OUT --edit), see in its overlays which legs stand elsewhere, mend that, and "
     "calibrate again."
