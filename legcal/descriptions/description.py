@@ -112,6 +112,8 @@ class Description:
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
     notes: tuple[str, ...] = ()  # assumptions
     home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
+    reach: float | None = None  # of the platform from the z axis of the base [m]
+    floor: float | None = None  # its lowest z [m]
 
 
 def legs_in_words(names: Sequence[str]) -> str:
