@@ -209,6 +209,12 @@ ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if
 
 def wrong_sizes(described: Description) -> list[str]:
     """Return the problems of radii, offsets and travels in themselves."""
+    if all_revolute(described) and any(leg.actuator for leg in described.legs):
+        return [
+            f"{described.source}: this mechanism is not supported: found a planar machine whose "
+            "joints at A move on carriages or arms, needed a machine in space, or sliders along "
+            "the legs; this machine cannot be calibrated with legcal."
+        ]
     for leg in described.legs:
         for end in leg.travel or (0.0,):
             length = None if leg.offset is None else leg.offset + end

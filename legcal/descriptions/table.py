@@ -939,7 +939,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     of_lengths = [
         unit
         for unit, text in zip(units, header, strict=True)
-        if text not in names and unit not in ("", *_NOT_LENGTHS)
+        if text not in names and unit not in ("", *_NOT_LENGTHS) and "home" not in concepts(unit)
     ]
     if unknown := sorted({unit for unit in of_lengths if unit not in LENGTH}):
         raise DatasetError(
