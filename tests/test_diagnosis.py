@@ -1,7 +1,7 @@
 """Common mistakes of owners are named: in readings, models and images that disagree."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,11 +17,11 @@ from legcal import Dataset, calibrate, load_dataset, simulate
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.leg_names import _permuted
-from legcal.calibration.diagnosis.mistakes import Diagnosis, Mistake, mistakes
-from legcal.calibration.ordered_dataset import order_dataset
+from legcal.calibration.diagnosis.mistakes import Assumed, Diagnosis, Mistake, mistakes
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
@@ -177,6 +177,45 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert found.after >= 11 > found.before
     assert any(one.startswith(other) for one in found.same_as) or not other
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
+
+
+def _reversed(d: Dataset) -> Dataset:
+    ends = np.array([sum(leg.travel) for leg in d.machine.legs])
+    return _with_readings(d, ends - d.measurements.q)
+
+
+def _few(kinds: Sequence[str]) -> Callable[..., list[Mistake]]:
+    """Return the mistakes of some kinds, also beside others that are undone."""
+
+    def few(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
+        return [one for one in mistakes(data, given) if one.kind in kinds]
+
+    return few
+
+
+def test_two_mistakes_at_once_are_named_together_with_both_remedies(
+    outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = ("diameter for radius", "direction of encoders", "columns exchanged")
+
+    monkeypatch.setattr(diagnosis, "mistakes", _few(kinds))
+    changed = _thick(_reversed(outlines("hexapod")))
+    (found,) = diagnose(order_dataset(changed, in_turn, no_progress)) or ()
+    assert set(found.kind.split(" and ")) == set(kinds[:2])
+    assert found.after >= 11 > found.before
+    for told in ("appear to be diameters", "reverse them in the table", "<visual> cylinders"):
+        assert told in found.sentence
+
+
+def test_what_was_tried_in_vain_stands_beside_a_refusal(
+    outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "mistakes", _few(("diameter for radius",)))
+    d = outlines("hexapod")
+    rng = np.random.default_rng(0)
+    with pytest.raises((NotVisible, DidNotConverge)) as refused:
+        calibrate(_with_readings(d, rng.permuted(d.measurements.q, axis=0)))
+    assert diagnosis.NONE_EXPLAINS in refused.value.notes
 
 
 @pytest.mark.parametrize(

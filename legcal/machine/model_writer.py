@@ -6,7 +6,6 @@ Written files are loaded again and checked.
 from __future__ import annotations
 
 import math
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -71,6 +71,7 @@ _NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras fi
 _FINALISTS = 6  # mistakes that all images judge
 _AHEAD = 12  # mistakes ahead in one group of views for which cameras of the next are searched for
 _FIRSTS = 3  # mistakes beside which others are tried
+_CLEARLY = 2.0  # gain of the first of them over the second, where it leads
 _SAME_AMOUNT = 2  # of these that differ by how much
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 # kinds that may begin during a session, and how many of these are tried
@@ -340,25 +341,32 @@ class _Judge:
         return [tried[k] for k in sorted(found)], gain  # the commoner first
 
     def of_two(self, tried: Sequence[Mistake], gain: Array) -> list[_Judged]:
-        """Return two mistakes at once that explain most images, if two do.
+        """Return pairs of mistakes at once that explain half of the images or more, if any do.
 
-        The first of them are those that gain most alone, the second one of all images beside each;
-        a few images of the group that disagrees most judge, near the cameras known by then.
+        The first of a pair are those that gain most alone, the second one of all images beside
+        each. A few images of the group that disagrees most judge near the cameras known by then;
+        beside a first one that leads clearly, cameras are searched for where these suit none.
         """
         missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
-        g, found = int(np.argmax(missing)), list[tuple[float, Mistake]]()
-        for k in np.argsort(-gain, kind="stable")[:_FIRSTS].tolist():
+        g = int(np.argmax(missing))
+        rows, before = self.groups[g].some, self.of_groups[g].at(self.groups[g].some)
+        order = np.argsort(-gain, kind="stable")[: _FIRSTS + 1].tolist()
+        found = dict[frozenset[str], tuple[float, Mistake]]()
+        for k in order[:_FIRSTS]:
             beside = [one for one in mistakes(self.data, tried[k].true) if one.kind not in _RARE]
             true = [one.true for one in beside]
-            shown = [_total(one) for one in self.compare(true, g, self.groups[g].some, ())]
-            best = int(np.argmax(shown))
-            found.append((shown[best], both(tried[k], beside[best])))
-        if not found:
-            return []
-        _, pair = max(found, key=lambda one: one[0])
-        one = self.all(pair.true)
-        explains = one.images >= _MOST * len(one.row) and self.is_explained(pair, one)
-        return [(pair, one)] if explains else []
+            support = [_total(one) for one in self.compare(true, g, rows, ())]
+            leads = k == order[0] and gain[k] > _CLEARLY * max(gain[order[1:]], default=0.0)
+            if leads and not _suits(max(support), before):
+                support = [_total(one) for one in self.compare(true, g, rows, _FEW_STARTS[0])]
+            for one, shown in zip(beside, support, strict=True):  # in either order once
+                key = frozenset((tried[k].what, one.what))
+                found.setdefault(key, (shown, both(tried[k], one)))
+        best = sorted(found.values(), key=lambda one: -one[0])[:_FINALISTS]
+        alike = [pair for shown, pair in best if shown >= _ALIKE * best[0][0]]
+        judged = [(pair, self.all(pair.true)) for pair in alike]
+        return self.likeliest([(pair, one) for pair, one in judged
+                               if one.images >= MIN_SHARE * len(one.row)])  # fmt: skip
 
     def nearly_agrees(self, g: int) -> bool:
         """Return whether the images of a group show half of the legs or more as given."""
