@@ -113,10 +113,13 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
         *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
     ]
     finalists, gain = judge.finalists(tried)
-    likeliest = judge.likeliest(judge.judged(finalists)) or judge.of_two(tried, gain)
+    likeliest = judge.likeliest(judge.judged(finalists))
+    renamed = () if likeliest else judge.exchanged_legs()
+    if not (likeliest or renamed):
+        likeliest = judge.of_two(tried, gain)
     data.progress(STAGE, 1, 1)
     if not likeliest:
-        return ()
+        return renamed
     suited = [judge.hints_suited(one) for _, one in likeliest]
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
     first = [what for what, _ in likeliest]
