@@ -368,12 +368,14 @@ class Scores:
 def size_left(scores: Scores, covariance: Array) -> Array:
     """Return how large numbers may be that a fit takes as zero, by their scores and a prior.
 
-    (c, c + 1): their means with the *covariance* (c, c) as prior, and a root of what is left of it.
+    The root (c, c) of their mean products, with the *covariance* (c, c) as prior.
     """
     root = np.linalg.cholesky(covariance)
     value, vector = np.linalg.eigh(root.T @ scores.information @ root)
     left = (root @ vector) / np.sqrt(1.0 + np.maximum(value, 0.0))
-    return np.column_stack([left @ left.T @ scores.score, left])
+    mean = left @ left.T @ scores.score
+    value, vector = np.linalg.eigh(left @ left.T + np.outer(mean, mean))
+    return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
 
 
 class LeftOut(NamedTuple):
