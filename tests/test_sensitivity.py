@@ -10,6 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.vision.camera import Camera, with_intrinsics
@@ -35,6 +36,23 @@ def fitted(
 @cache
 def fitted_rightly(camera: Camera) -> Solution:
     return fitted(irregular_hexapod(12, camera=camera), 0, 1.0)
+
+
+def test_an_error_of_pitch_may_be_of_all_motors_or_of_each() -> None:
+    """A wrong scale of one motor moves the parameters as the sensitivities of a fit say."""
+    session = irregular_hexapod(5)
+    measurements, outlines = session.noisy(0)
+    right = refine(session.legs, measurements, outlines, session.start)
+    stated = right.sensitivities[ALL_READINGS]
+    assert stated.shape[1] == len(session.legs.names)
+    for motors in (slice(None), [2]):
+        q = measurements.q.copy()
+        q[:, motors] *= 1.0 + 1e-4
+        wrong = refine(session.legs, replace(measurements, q=q), outlines, session.start)
+        change = session.legs.vector(wrong.legs) - session.legs.vector(right.legs)
+        weights, *_ = np.linalg.lstsq(stated, change, rcond=None)
+        missed = change - stated @ weights
+        assert np.linalg.norm(missed) < 0.2 * np.linalg.norm(change)
 
 
 def notes_on_focal_lengths(solution: Solution) -> list[str]:
