@@ -10,12 +10,13 @@ come before the platform stands still, a motor has backlash, another scale or an
 commands stand for readings, a camera is bumped or refocused, its autofocus or its tripod moves in
 each image, light from another side shifts edges, a joint moves, all motors have another scale
 (``pitch``, which nothing in outlines shows). Each is calibrated; the platform error by eq (20)
-against the true machine is compared with what is stated, for mistakes of the scale with the error
-that all readings may share. Printed are sessions that harm by more than three stated sigmas, how
-many of these are trusted, and how often the first doubt names their mistake; ``pitch`` is a kind
-apart. FILE keeps sessions as JSON lines; those in it are not done again. About 5 s a session.
-With --photographs 18 small photographs are rendered in place of outlines, and mistakes are those of
-readings, of a stated length, and of a focal length, to which images are enlarged; about a minute.
+against the true machine is compared with what is stated, for mistakes of the scale or of a gain
+with the error that pitches may have. Printed are sessions that harm by more than three stated
+sigmas, how many of these are trusted, and how often the first doubt names their mistake; ``pitch``
+is a kind apart. FILE keeps sessions as JSON lines; those in it are not done again. About 5 s a
+session. With --photographs 18 small photographs are rendered in place of outlines, and mistakes are
+those of readings, of a stated length, and of a focal length, to which images are enlarged; about a
+minute.
 """
 
 import argparse
@@ -254,7 +255,8 @@ def report(lines: list[dict[str, object]]) -> None:
     for kind in (HEALTHY, *KINDS):
         of_kind = [line for line in lines if line["kind"] == kind]
         judged = [line for line in of_kind if "refused" not in line]
-        of_scale = kind == PITCH or kind in OF_SCALE  # for others the sigma of the fit has to do
+        # For others the sigma of the fit has to do.
+        of_scale = kind in (PITCH, "gain") or kind in OF_SCALE
         harmful = [
             x for x in judged
             if x["off_mm"] > N_SIGMAS * np.hypot.reduce([x["stated_mm"], *x["scale_mm"][:of_scale]])  # type: ignore[index]

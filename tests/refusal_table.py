@@ -959,6 +959,11 @@ def _described() -> Iterable[Refusal]:
          ("version could not", "unknown key", "add 'legcal_table: 1'")),
         ("type-digit", {"type": "²-RPS"}, ("type", "'²-RPS'")),
         ("one-leg", {"base_joints": [[1, 2, 3]]}, ("base_joints", "at least 2")),
+        ("plane-of-arms",
+         {"type": "3-RRR", "lengths": 150, "travel": None, "offsets": None, "home": turned,
+          "actuators": {f"m{j}": {"point": [x, y, 0], "axis": [0, 0, 1], "travel_deg": [-60, 60]}
+                        for j, (x, y) in enumerate([(-200, -115), (200, -115), (0, 231)])}},
+         ("planar machine", "sliders along the legs")),
         ("frame-twice", {"base_frame": ["leg1", "leg1", "leg2"]},
          ("base_frame", "'leg1' more than once")),
         ("frame-two", {"base_frame": ["leg1", "leg2"]}, ("base_frame", "leg1, leg2", "needed 3")),

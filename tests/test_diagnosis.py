@@ -1,7 +1,7 @@
 """Common mistakes of owners are named: in readings, models and images that disagree."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,11 +17,11 @@ from legcal import Dataset, calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration.diagnosis import diagnosis
 from legcal.calibration.diagnosis.diagnosis import diagnose
 from legcal.calibration.diagnosis.leg_names import _permuted
-from legcal.calibration.diagnosis.mistakes import Diagnosis, Mistake, mistakes
-from legcal.calibration.ordered_dataset import order_dataset
+from legcal.calibration.diagnosis.mistakes import Assumed, Diagnosis, Mistake, mistakes
+from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
@@ -131,8 +131,8 @@ def _diagnosed(
     data = order_dataset(d, in_turn, no_progress)
     few = [one for one in mistakes(data) if is_tried(one)]
     assert len(few) > 1
-    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
-    (found,) = diagnose(data)
+    monkeypatch.setattr(diagnosis, "mistakes", lambda *_: few)
+    (found,) = diagnose(data) or ()
     return found
 
 
@@ -179,6 +179,45 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
 
 
+def _reversed(d: Dataset) -> Dataset:
+    ends = np.array([sum(leg.travel) for leg in d.machine.legs])
+    return _with_readings(d, ends - d.measurements.q)
+
+
+def _few(kinds: Sequence[str]) -> Callable[..., list[Mistake]]:
+    """Return the mistakes of some kinds, also beside others that are undone."""
+
+    def few(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
+        return [one for one in mistakes(data, given) if one.kind in kinds]
+
+    return few
+
+
+def test_two_mistakes_at_once_are_named_together_with_both_remedies(
+    outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = ("diameter for radius", "direction of encoders", "columns exchanged")
+
+    monkeypatch.setattr(diagnosis, "mistakes", _few(kinds))
+    changed = _thick(_reversed(outlines("hexapod")))
+    (found,) = diagnose(order_dataset(changed, in_turn, no_progress)) or ()
+    assert set(found.kind.split(" and ")) == set(kinds[:2])
+    assert found.after >= 11 > found.before
+    for told in ("appear to be diameters", "reverse them in the table", "<visual> cylinders"):
+        assert told in found.sentence
+
+
+def test_what_was_tried_in_vain_stands_beside_a_refusal(
+    outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "mistakes", _few(("diameter for radius",)))
+    d = outlines("hexapod")
+    rng = np.random.default_rng(0)
+    with pytest.raises((NotVisible, DidNotConverge)) as refused:
+        calibrate(_with_readings(d, rng.permuted(d.measurements.q, axis=0)))
+    assert diagnosis.NONE_EXPLAINS in refused.value.notes
+
+
 @pytest.mark.parametrize(
     ("model", "names", "what"),
     [
@@ -196,9 +235,9 @@ def test_outlines_under_the_names_of_other_legs_in_a_view_are_named(
     outlines: Callable[[str], Dataset], model: str, names: dict[int, int], what: str
 ) -> None:
     d = outlines(model)
-    assert diagnose(order_dataset(d, in_turn, no_progress)) == ()
+    assert not diagnose(order_dataset(d, in_turn, no_progress))
     renamed = _misnamed(d, names)
-    (mistake,) = diagnose(order_dataset(renamed, in_turn, no_progress))
+    (mistake,) = diagnose(order_dataset(renamed, in_turn, no_progress)) or ()
     assert mistake.what == f"the outlines of {what} in view c2"
     assert (mistake.images, mistake.images_before, mistake.images_after) == (6, 0, 6)
     with pytest.raises(DidNotConverge, match=re.escape(mistake.sentence)):
@@ -318,14 +357,14 @@ def test_joints_exchanged_in_the_model_are_named_before_readings_that_it_cannot_
     d = _base_joints_exchanged(outlines("hexapod"))
     kinds = {"joints exchanged", "columns exchanged"}
     few = [m for m in mistakes(order_dataset(d, in_turn, no_progress)) if m.kind in kinds]
-    monkeypatch.setattr(diagnosis, "mistakes", lambda _: few)
+    monkeypatch.setattr(diagnosis, "mistakes", lambda *_: few)
     with pytest.raises(DatasetError) as refused:
         calibrate(d)
     first = refused.value.problems[0]
     assert first.startswith("The base joints of leg5 and leg6 appear to be swapped in the model")
     (reach,) = map(str, refused.value.consequences)
     assert "cannot reach" in reach
-    monkeypatch.setattr(diagnosis, "mistakes", lambda _: [])
+    monkeypatch.setattr(diagnosis, "mistakes", lambda *_: [])
     said = reach.partition("--leave-out ")[2].partition(")")[0]
     calibration = calibrate(d, leave_out=said)  # the other images are fitted
     assert f"Left out, as asked: {said}." in calibration.notes

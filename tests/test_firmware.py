@@ -18,13 +18,15 @@ from legcal import (
     calibrate,
     export,
     inverse_kinematics,
+    load_mechanism,
     simulate,
 )
 from legcal.descriptions.controllers import firmware_table, read_delta
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
-from legcal.machine.configurations import random_poses
+from legcal.machine.configurations import feasible_poses, random_poses
+from legcal.machine.model_writer import write_model
 from legcal.simulation.settings import Level
 
 KLIPPER = """
@@ -248,6 +250,34 @@ def off_by(text: str, true: Machine) -> float:
     there, nozzle = (points - points.mean(axis=0) for points in both)
     _, distance = Rotation.align_vectors(nozzle, there)
     return float(distance / np.sqrt(len(nozzle)))
+
+
+def test_poses_of_a_printer_stay_over_its_bed(tmp_path: Path) -> None:
+    """Plans, the workspace and copies of the model end where the firmware does."""
+    machine = machine_of(KLIPPER, tmp_path)
+    copied = load_mechanism(write_model(machine, tmp_path / "copy")[0])
+    assert (copied.reach, copied.floor) == (machine.reach, machine.floor) == (0.12, 0.0)
+    extreme = feasible_poses(copied, 12, np.random.default_rng(1), extreme=True)
+    for poses in (extreme.poses, random_poses(copied, 50, 2)[1]):
+        at = np.array([pose.translation for pose in poses])
+        assert np.hypot(at[:, 0], at[:, 1]).max() <= 0.12
+        assert at[:, 2].min() >= 0.0
+
+
+def test_the_frame_of_an_export_is_said_in_degrees(tmp_path: Path) -> None:
+    table, _ = firmware_table(Path("printer"), KLIPPER) or ({}, ())
+    turn = Rotation.from_euler("x", 0.4, degrees=True)
+    rails = {
+        name: motor | {"direction": turn.apply(motor["direction"]).tolist()}
+        for name, motor in table["actuators"].items()
+    }
+    home = {"xyz": turn.apply(table["home"]["xyz"]).tolist(), "rpy_deg": [0.4, 0.0, 0.0]}
+    A = turn.apply(table["base_joints"]).tolist()
+    tilted = table | {"base_joints": A, "actuators": rails, "home": home}
+    machine = create_model(described_machine(tilted, Path("tilted")), tmp_path).machine
+    exported = export(machine, "klipper", tmp_path / "printer.cfg")
+    assert "0.4 deg away" in exported.paths[0].read_text()
+    assert exported.figures["remaining_mm"]["max"] < 1e-3
 
 
 @pytest.mark.system

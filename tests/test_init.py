@@ -298,9 +298,10 @@ def test_readings_that_nobody_knows_stay_empty(tmp_path: Path) -> None:
         ]
         text = "\n".join(",".join(row) for row in [["image", *LEGS], *rows])
         (folder / "own.csv").write_text(text)
-        made = init(folder, "--force")
+        made = init(folder, "--force", "--encoder-sigma", "2um", "--unit", "mm")
         assert made.code == 0
         assert "are not known (empty cells)" in made.said
+        assert ("--encoder-sigma and --unit had no effect" in made.said) == (len(unknown) == 6)
         machine = load_dataset(folder / "dataset").machine
         assert len(machine.motors) == 6 - len(unknown)
     rows[0][1] = "10"

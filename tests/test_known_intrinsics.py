@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from edits import keyed
 from fit_sessions import LENS, PINHOLE, MachineSession, irregular_hexapod, machine_session
+from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 from thinned import thinned
 
 from legcal import calibrate, check, load_dataset
 from legcal.calibration.documents import Result
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.calibration.joint_fit.sensitivity import (
     EXACT_CAMERAS,
     FITTED_CAMERA,
@@ -169,6 +171,40 @@ def test_a_camera_that_contradicts_its_covariance_is_named(
     (note,) = said_of_cameras(found)
     assert [word for word in said if word not in note] == []
     assert [wrong.view for wrong in found.camera_doubts] == ["c1"]
+
+
+def test_an_error_of_pitch_may_be_of_all_motors_or_of_each() -> None:
+    """A wrong scale of one motor moves the parameters as the sensitivities of a fit say."""
+    noisy = irregular_hexapod(5).noisy(0)
+    right = noisy.fit()
+    stated = right.sensitivities[ALL_READINGS]
+    assert stated.shape[1] == len(noisy.legs.names)
+    for motors in (slice(None), [2]):
+        q = noisy.measurements.q.copy()
+        q[:, motors] *= 1.0 + 1e-4
+        wrong = noisy.with_readings(q).fit()
+        change = noisy.legs.vector(wrong.legs) - noisy.legs.vector(right.legs)
+        weights, *_ = np.linalg.lstsq(stated, change, rcond=None)
+        missed = change - stated @ weights
+        assert np.linalg.norm(missed) < 0.2 * np.linalg.norm(change)
+
+
+def test_a_view_of_photographs_that_were_turned_upside_down_is_named() -> None:
+    """Its camera rolled by half a turn, and its principal point is on the other side."""
+    noisy = irregular_hexapod(6).noisy(0)
+    o, camera = noisy.outlines, with_intrinsics(PINHOLE, {"cx": 521.5, "cy": 373.5})
+    rolled = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, np.pi]))
+    of_view, size = noisy.measurements.view[o.row] == 1, np.array([camera.width, camera.height])
+    moved = o.ends + camera.K[:2, 2] - PINHOLE.K[:2, 2]
+    ends = np.where(of_view[:, None, None], size - 1.0 - moved, moved)
+    h = np.where(of_view[:, None], o.h * [-1.0, -1.0, 1.0], o.h)
+    given = replace(noisy, outlines=replace(o, ends=ends, h=h)).with_camera(camera)
+    cameras = list(given.start.T_camera_Rb)
+    cameras[1] = rolled * cameras[1]
+    turned = replace(given, start=replace(given.start, T_camera_Rb=tuple(cameras)))
+    (wrong,) = turned.fit().camera_doubts
+    assert (wrong.kind, wrong.view) == ("centre", "c2")
+    assert "turned upside down" in str(wrong)
 
 
 def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None:

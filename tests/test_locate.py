@@ -217,6 +217,12 @@ def _along_a_line() -> Located:
     return located("3-upu", platform=[shift * home for shift in shifts])
 
 
+def _exchanged() -> Located:
+    hexapod = located("hexapod", 8)
+    q = hexapod.poses.q[:, [0, 4, 2, 3, 1, 5]]
+    return replace(hexapod, poses=replace(hexapod.poses, q=q))
+
+
 def _unreachable() -> Located:
     hexapod = located("hexapod", 4)
     q = hexapod.poses.q.copy()
@@ -238,6 +244,8 @@ def _unreachable() -> Located:
         (lambda: _position(lambda p: 1e3 * p), {}, DatasetError, ("millimetres", "1000")),
         (_w_first, {}, DatasetError, ("order w, x, y, z",)),
         (_mirrored, {}, DatasetError, ("left-handed axes", "mirror")),
+        (_exchanged, {}, DatasetError,
+         ("columns leg2_prismatic and leg5_prismatic exchanged", "swap the headers")),
         (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
         (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
         (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),

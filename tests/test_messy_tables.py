@@ -1,6 +1,7 @@
 """Tables that a person reads at once: languages, titles, remarks, units, diameters, workbooks."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -227,6 +228,11 @@ def test_a_planar_table_states_home_by_joints_as_they_are_at_home(tmp_path: Path
     assert made.planar
     at_home = [made.home.apply(leg.B_platform)[:2] for leg in made.legs]
     np.testing.assert_allclose(at_home, 1e-3 * np.array(joints["B"]), atol=1e-9)
+    legs = [f"{j};{ax};{ay};{bx};{by}" for j, ((ax, ay), (bx, by))
+            in enumerate(zip(*joints.values(), strict=True), 1)]  # fmt: skip
+    path.write_text("\n".join(["Bein;A x;A y;B x (home);B y (home)", *legs]))
+    by_leg = assemble(description_of(path, replace(given, unit="mm")))
+    np.testing.assert_allclose(by_leg.home.as_matrix(), made.home.as_matrix(), atol=1e-12)
     rows[3:] = ["B1;0;-140", "B2;121.2;70", "B3;-121.2;70"]  # in the platform link
     path.write_text("\n".join(["Gelenk;X (mm);Y (mm)", *rows]))
     (note,) = [note for note in assemble(description_of(path, given)).notes if "Two poses" in note]

@@ -20,7 +20,8 @@ from csv_rows import read_rows, write_rows
 from hexapod_example import HEXAPOD, copy_of_the_example
 
 from legcal.data.dataset import load_dataset
-from legcal.errors import OutOfResources
+from legcal.errors import OutOfResources, UsageError
+from legcal.files import folder
 from legcal.files.folder import write_atomically
 from legcal.geometry.types import Array
 from legcal.planning import shooting
@@ -144,7 +145,26 @@ def test_a_photograph_that_finds_no_room_is_kept_by_word_once_there_is_some(
         monkeypatch.setattr(shooting, "write_atomically", write_atomically)
         dialogue.words.put("keep")
         heard(dialogue, "1.jpg is c1 c1_k01")
+        monkeypatch.setattr(shooting, "write_atomically", full)
+        dialogue.words.put("undo")
+        assert "undo it then" in heard(dialogue, "c1_k01.jpg could not be taken out")
+        monkeypatch.setattr(shooting, "write_atomically", write_atomically)
+        dialogue.words.put("undo")
+        heard(dialogue, "c1_k01.jpg was taken out")
+        (tmp_path / "phone/2.jpg").write_bytes(photograph("c1_k01"))
+        heard(dialogue, "2.jpg is c1 c1_k01")
     assert len(read_rows(session / "measurements.csv")) == 1
+
+
+def test_a_session_that_takes_no_files_is_refused_before_the_first_photograph(
+    session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read_only(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(folder, "temporary_folder", read_only)
+    with pytest.raises(UsageError, match="Read-only file system"):
+        GuidedSession(session)
 
 
 def test_a_session_that_is_killed_between_its_files_goes_on(

@@ -36,7 +36,12 @@ from legcal.calibration.detection import (
     views_to_click,
     write_detection,
 )
-from legcal.calibration.diagnosis.diagnosis import MIN_IMAGES, diagnose, notes_beside
+from legcal.calibration.diagnosis.diagnosis import (
+    MIN_IMAGES,
+    NONE_EXPLAINS,
+    diagnose,
+    notes_beside,
+)
 from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
@@ -455,7 +460,10 @@ def _look_at_views(checklist: _Checklist, exposures: Mapping[int, Exposure]) -> 
 
 
 def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
-    checklist.diagnosis = diagnose(data)
+    tried = diagnose(data)
+    checklist.diagnosis = tried or ()
+    if tried == ():
+        checklist.add("mistakes", "note", NONE_EXPLAINS)
     checklist.checks["mistakes"] = (
         "one explains the images better"
         if checklist.diagnosis

@@ -419,13 +419,14 @@ class _Evidence:
         views = sorted(names[v] for v in np.flatnonzero(wrong_in).tolist())
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
         wrong = max(doubts, key=lambda one: one.apart)
+        kind = {"centre": "principal point"}.get(wrong.kind, wrong.kind.replace("_", " "))
         what = (
-            f"the measurements contradict the camera of {few_views(views)}, above all its "
-            f"{wrong.kind.replace('_', ' ')}: {wrong.found}"
+            f"the measurements contradict the camera of {few_views(views)}, above all its {kind}: "
+            f"{wrong.found}"
         )
         remedy = (
             "calibrate it again at the same focus and zoom, and look for photographs that were "
-            "zoomed, scaled or cropped"
+            "zoomed, scaled, cropped or turned"
         )
         return [Doubt(CAMERA, what, remedy, *_mean(error))]
 

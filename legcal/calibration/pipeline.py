@@ -27,7 +27,12 @@ from typing import get_args
 import numpy as np
 
 from legcal.calibration.board import board_notes, rough_placement
-from legcal.calibration.diagnosis.diagnosis import agreement_with_zeros, diagnose, notes_beside
+from legcal.calibration.diagnosis.diagnosis import (
+    NONE_EXPLAINS,
+    agreement_with_zeros,
+    diagnose,
+    notes_beside,
+)
 from legcal.calibration.diagnosis.leg_names import exchanged_legs
 from legcal.calibration.diagnosis.mistakes import Diagnosis
 from legcal.calibration.documents import Holdout
@@ -357,7 +362,10 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         return _estimate(data, rows, options, diagnosed)
     except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
         is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
-        diagnosis, notes = () if is_told else diagnosed(data), data.dataset.notes
+        tried, notes = None if is_told else diagnosed(data), data.dataset.notes
+        diagnosis = tried or ()
+        if tried == () and isinstance(error, NotVisible | DidNotConverge):
+            notes = (NONE_EXPLAINS, *notes)
         if not (diagnosis or notes):
             raise
         refused: Sequence[str | Problem] = error.facts
@@ -390,7 +398,7 @@ def _estimate(
     data: OrderedDataset,
     rows: IntArray,
     options: Options,
-    diagnosed: Callable[[OrderedDataset], tuple[Diagnosis, ...]],
+    diagnosed: Callable[[OrderedDataset], tuple[Diagnosis, ...] | None],
 ) -> Estimate:
     """Go through the phases; images whose outlines are given are not searched.
 
@@ -410,7 +418,8 @@ def _estimate(
             image_notes=data.plan.notes,
             fit_notes=_notes_on_images(estimate),
             diagnosis=_wrong_names(estimate)
-            or (diagnosed(data) if _leaves_out_many(estimate) else ()),
+            or (_leaves_out_many(estimate) and diagnosed(data))
+            or (),
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
@@ -426,7 +435,7 @@ def _estimate(
     if options.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(data, rows, seen, options.choices)
     left_out = 1.0 - len(seen.kept(rows)) / len(rows)
-    diagnosis = diagnosed(data) if left_out > MAX_LEFT_OUT else ()
+    diagnosis = (diagnosed(data) or ()) if left_out > MAX_LEFT_OUT else ()
     # 3 and 4. Four steps and joint fit.
     settings = TRIAL if diagnosis else DEFAULT_SETTINGS
     first = fit_outlines(fitted, seen.outlines, seen.placement, board, options, settings)
@@ -457,7 +466,7 @@ def _estimate(
         ),
         fit_notes=_notes_on_images(estimate),
         other_radii=other_radii,
-        diagnosis=diagnosis or (diagnosed(data) if _leaves_out_many(estimate) else ()),
+        diagnosis=diagnosis or (_leaves_out_many(estimate) and diagnosed(data)) or (),
     )
 
 

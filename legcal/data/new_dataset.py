@@ -281,6 +281,7 @@ def plan_new_dataset(
         notes=(
             *sheet.notes,
             *(unknown if sheet.unknown else []),
+            *_unused_notes(options, sheet.motors),
             *sheet_readings.notes,
             *matching.notes,
             *sigma_notes,
@@ -373,6 +374,15 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
             except OSError:  # no links there
                 shutil.copy2(path, folder / name)
     return [new.destination / name for name in dataset_files]
+
+
+def _unused_notes(options: SheetOptions, motors: Sequence[Leg]) -> list[str]:
+    """Return a note on options that are of readings, where none is known."""
+    given = {"--encoder-sigma": options.encoder_sigma, "--unit": options.unit}
+    unused = [name for name, value in given.items() if value]
+    if motors or not unused:
+        return []
+    return [f"{' and '.join(unused)} had no effect: the table has no reading."]
 
 
 def _sigmas(

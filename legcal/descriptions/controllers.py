@@ -436,6 +436,8 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
         "platform_joints": (r * out[:, None] + both).reshape(6, 3).tolist(),
         "lengths": np.repeat(ideal.rod, 2).tolist(),
         "radius": thick,
+        "reach": float(np.round(_printable(read, size), 3)),
+        "floor": 0.0,
         "home": {"xyz": [0, 0, float(np.round(ends.mean(), 3))], "rpy_deg": [0, 0, 0]},
     }
     assumed = [] if stated is not None else [f"joints {r:g} {unit} from its middle"]
@@ -451,12 +453,17 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
     )
 
 
+def _printable(read: Configuration, size: float) -> float:
+    """Return the radius of the bed, beyond which the firmware does not move."""
+    return read.printable or PRINTABLE * size
+
+
 def _lowest(read: Configuration, ideal: IdealDelta, size: float) -> Array:
     """Return the lowest positions of the motors: those on the bed, or as stated."""
     if read.lowest is not None:
         return np.full(TOWERS, read.lowest)
     turn = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
-    ring = (read.printable or PRINTABLE * size) * np.stack(
+    ring = _printable(read, size) * np.stack(
         [np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1
     )
     on_bed = ideal.motors(np.concatenate([np.zeros((1, 3)), ring]))

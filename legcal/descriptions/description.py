@@ -112,6 +112,8 @@ class Description:
     base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
     notes: tuple[str, ...] = ()  # assumptions
     home_readings: Mapping[str, float] = field(default_factory=dict)  # of motors [m or rad]
+    reach: float | None = None  # of the platform from the z axis of the base [m]
+    floor: float | None = None  # its lowest z [m]
 
 
 def legs_in_words(names: Sequence[str]) -> str:
@@ -207,6 +209,12 @@ ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if
 
 def wrong_sizes(described: Description) -> list[str]:
     """Return the problems of radii, offsets and travels in themselves."""
+    if all_revolute(described) and any(leg.actuator for leg in described.legs):
+        return [
+            f"{described.source}: this mechanism is not supported: found a planar machine whose "
+            "joints at A move on carriages or arms, needed a machine in space, or sliders along "
+            "the legs; this machine cannot be calibrated with legcal."
+        ]
     for leg in described.legs:
         for end in leg.travel or (0.0,):
             length = None if leg.offset is None else leg.offset + end

@@ -423,6 +423,8 @@ def yaml_text(machine: Assembled) -> str:
             },
             **({"home_readings": dict(machine.home_readings)} if machine.home_readings else {}),
             **({"motors": stated} if stated else {}),
+            **({} if machine.reach is None else {"reach": machine.reach}),
+            **({} if machine.floor is None else {"floor": machine.floor}),
             "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
         },
     )

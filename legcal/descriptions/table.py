@@ -280,6 +280,8 @@ class TableFile(FileSchema):
     home: HomeEntry | None = None
     home_readings: dict[PlainName, Number] | None = None  # of carriages, in the unit
     home_readings_deg: dict[PlainName, Number] | None = None  # of arms
+    reach: Annotated[Number, Field(gt=0.0)] | None = None
+    floor: Number | None = None
     platform_in: Literal["base", "platform"] | None = None
     base_frame: FrameLegs | None = None
 
@@ -688,6 +690,7 @@ def _description(file: TableFile, source: str) -> Description:
         file.name, source, file.unit, tuple(legs), home, frame, tuple(notes),
         {name: file.metres(q) for name, q in (file.home_readings or {}).items()}
         | {name: float(np.radians(q)) for name, q in (file.home_readings_deg or {}).items()},
+        *(None if x is None else file.metres(x) for x in (file.reach, file.floor)),
     )  # fmt: skip
     if file.home is not None and file.home.height is not None:
         return home_at_height(described, in_metres(file.home.height, file.unit), turn)
@@ -936,7 +939,7 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     of_lengths = [
         unit
         for unit, text in zip(units, header, strict=True)
-        if text not in names and unit not in ("", *_NOT_LENGTHS)
+        if text not in names and unit not in ("", *_NOT_LENGTHS) and "home" not in concepts(unit)
     ]
     if unknown := sorted({unit for unit in of_lengths if unit not in LENGTH}):
         raise DatasetError(

@@ -309,15 +309,6 @@ class Estimated(NamedTuple):
     square: float  # of the score over its variance: chi-squared of that rank if all are zero
 
 
-def size_left(score: float, information: float, sigma: float) -> float:
-    """Return how large a number that a fit takes as zero may be, by its score and a prior.
-
-    The root mean square of its distribution with the standard deviation *sigma* as prior.
-    """
-    variance = 1.0 / (sigma**-2 + max(information, 0.0))
-    return float(np.hypot(score * variance, np.sqrt(variance)))
-
-
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Rao's scores of numbers that a fit lacks, and their information (:func:`score_test`)."""
@@ -349,6 +340,19 @@ class Scores:
             score=self.score - toward @ numbers.amount,
             information=self.information - toward @ numbers.covariance @ toward.T,
         )
+
+
+def size_left(scores: Scores, covariance: Array) -> Array:
+    """Return how large numbers may be that a fit takes as zero, by their scores and a prior.
+
+    The root (c, c) of their mean products, with the *covariance* (c, c) as prior.
+    """
+    root = np.linalg.cholesky(covariance)
+    value, vector = np.linalg.eigh(root.T @ scores.information @ root)
+    left = (root @ vector) / np.sqrt(1.0 + np.maximum(value, 0.0))
+    mean = left @ left.T @ scores.score
+    value, vector = np.linalg.eigh(left @ left.T + np.outer(mean, mean))
+    return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
 
 
 class LeftOut(NamedTuple):

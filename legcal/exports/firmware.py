@@ -93,7 +93,8 @@ def firmware_files(name: str, subject: Subject, path: Path) -> Rendered:
         before, _ = _in_best_frame(errors, _nearest_delta(firmware, then, of_nominal))
     remaining = _Remaining(firmware.title, mount.nozzle(poses), after, before)
     sentences = remaining.sentences("over the workspace")
-    moved, turned = np.linalg.norm(frame[:3]), np.degrees(np.linalg.norm(frame[3:]))
+    moved, across = np.linalg.norm(frame.reshape(2, 3), axis=1)
+    turned = np.degrees(across / np.mean(mount.start.rod))
     ways = [f"{moved:.3g} mm and {turned:.3g} deg away"] * bool(moved > 1e-3 or turned > 1e-3)
     ways += ["turned so that its towers stand as in the firmware"] * mount.is_turned
     ways += [f"with z = 0 {mount.lift:g} mm below, where the bed may be"] * bool(mount.lift)

@@ -89,7 +89,7 @@ class OutputFile:
         elif not os.path.isdir(path.parent):
             found = f"no folder {path.parent}, needed one that exists"
             remedy = f"create it or {remedy}"
-        elif refusal := _takes_no_files(path.parent):
+        elif refusal := takes_no_files(path.parent):
             found = refusal
         elif os.path.lexists(path) and not may_go:
             found = f"another file of that name, needed {self.needed}"
@@ -179,13 +179,13 @@ def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
         os.lstat(destination)
         if destination.is_dir():
             os.listdir(destination)
-            found = _takes_no_files(destination)
+            found = takes_no_files(destination)
         elif destination.exists():
             found = "a file of that name, needed a folder"
         else:
             found = "a broken link, needed a folder"
     except FileNotFoundError:
-        found = _takes_no_files(existing_parent(destination))
+        found = takes_no_files(existing_parent(destination))
     except NotADirectoryError:
         found = f"that {existing_parent(destination)} is a file, {needed}"
     except OSError as error:
@@ -205,7 +205,7 @@ def in_the_way(destination: Path, kind: OutputKind, actual: str) -> str:
     )
 
 
-def _takes_no_files(folder: Path) -> str:
+def takes_no_files(folder: Path) -> str:
     """Return in words why files cannot be created in a folder and the remedy, or "" if they can.
 
     A file is created as a test: permissions do not tell of full or read-only disks, or ``/proc``.
@@ -340,7 +340,7 @@ def _workshop(destination: Path) -> Path:
     if not destination.is_dir():
         return parent
     is_near = parent.stat().st_dev == destination.stat().st_dev
-    return parent if is_near and not _takes_no_files(parent) else destination
+    return parent if is_near and not takes_no_files(parent) else destination
 
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:

@@ -221,6 +221,7 @@ def _usable(
     least = MIN_SINGULARITY * singularity(machine, machine.home)
     usable = (part == 1.0) & ~_outside(machine, readings).any(axis=1)
     usable &= singularities(machine, poses) >= least
+    usable &= machine.may_move_to(poses[:, :, 3])
     for k in np.flatnonzero(usable):
         yield q[k], readings[k], poses[k]
 
@@ -415,6 +416,8 @@ class Feasibility:
         if problem is not None:
             return Cause.LIMITS, problem
         T = platform_pose(machine, configuration)
+        if not machine.may_move_to(T.translation):
+            return Cause.LIMITS, "the platform beyond the reach or floor of the model"
         if singularity(machine, T) < self._min_singularity:
             return Cause.SINGULARITY, Cause.SINGULARITY.value
         collision = self.collision(T)

@@ -188,6 +188,8 @@ class LegcalBlock(BuiltEntry):
     home: MotionEntry | None = None
     home_readings: dict[str, float] | None = None  # readings of actuators at home [m or rad]
     motors: dict[str, MotorEntry] | None = None  # motors that carry rods, by joint
+    reach: Annotated[float, Field(gt=0.0)] | None = None  # of the platform from the z axis [m]
+    floor: float | None = None  # its lowest z [m]
     legs: Annotated[dict[PlainName, str], Field(min_length=1)]
 
 

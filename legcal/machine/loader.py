@@ -5,6 +5,7 @@ converted). The links are grouped into rigid bodies, chains of joints between ba
 classified as legs, and a closed pose is found; every check below names the mistake in the file.
 """
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -274,6 +275,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         occluders=occluders,
         tolerance=block.built or NOT_STATED,
         spline_teeth=block.spline_teeth,
+        reach=block.reach or math.inf,
+        floor=-math.inf if block.floor is None else block.floor,
     )
     _check_frames(machine)
     return machine

@@ -1,5 +1,6 @@
 """A parallel mechanism as loaded: its legs, its frames, and its closed chain (section 2)."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.brief import brief
 from legcal.errors import UsageError
 from legcal.geometry.motions import frame_on_points, motion_of
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.chain import ClosedChain
 from legcal.machine.leg import (
@@ -63,6 +64,13 @@ class Machine:
     occluders: tuple[Occluder, ...] = ()  # what hides besides legs and arms
     tolerance: Tolerance = NOT_STATED  # how well it is built
     spline_teeth: int | None = None  # of the shafts that horns of servos sit on
+    reach: float = math.inf  # farthest that the platform moves from the z axis of the base [m]
+    floor: float = -math.inf  # lowest z of the platform there [m]
+
+    def may_move_to(self, positions: Array) -> BoolArray:
+        """Return which positions (..., 3) of the platform its control allows."""
+        inside = np.hypot(positions[..., 0], positions[..., 1]) <= self.reach
+        return np.asarray(inside & (positions[..., 2] >= self.floor))
 
     @property
     def upward(self) -> Array:

@@ -5,6 +5,7 @@ Written files are loaded again and checked.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,7 @@ def mechanism_text(machine: Machine, urdf: str) -> str:
             **({"motors": stated} if stated else {}),
             **machine.tolerance.entries,
             **({} if machine.spline_teeth is None else {"spline_teeth": machine.spline_teeth}),
+            **{key: x for key in ("reach", "floor") if math.isfinite(x := getattr(machine, key))},
             "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
         },
     )

@@ -186,7 +186,7 @@ def place_camera(
     best_first = sorted(pictures, key=lambda picture: -picture.pairs.best_merit)
     every = Pictures.of(pictures)
     near = CameraPoses.of(known, n_legs)
-    best = _candidates(every, _approached(every, near) if known else near)
+    best = _candidates(every, _approached(every, near, SUPPORT) if known else near)
     done = 0
     for n in starts if best.share < HINTED_SUPPORT else ():
         if done >= len(pictures) or (done and best.is_clear):
@@ -212,9 +212,17 @@ def place_camera(
     return best
 
 
-def _approached(pictures: Pictures, poses: CameraPoses) -> CameraPoses:
-    """Return rough poses after all steps that lead to the pairs."""
+def _approached(pictures: Pictures, poses: CameraPoses, least: float = 0.0) -> CameraPoses:
+    """Return rough poses after all steps that lead to the pairs.
+
+    Poses that a smaller share of the legs than *least* supports even roughly stay where they are.
+    """
     poses = refined(pictures, poses, SEARCHING[:3])
+    if least > 0.0:
+        matches = match_pairs(pictures, poses, SEARCHING[2])
+        shown, seen = (_by_legs(pictures, x).sum(axis=0) for x in (matches.score, matches.visible))
+        if not np.any(shown >= least * seen):
+            return poses
     return refined(pictures, poses, (*SEARCHING[2:], *FITTING), pictures.joint_error)
 
 

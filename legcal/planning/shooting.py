@@ -12,7 +12,8 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -38,7 +39,7 @@ from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, OutOfResources, UsageError
-from legcal.files.folder import write_atomically
+from legcal.files.folder import takes_no_files, write_atomically
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations, poses_at
@@ -108,6 +109,11 @@ class GuidedSession:
     def __init__(self, folder: str | Path, *, target: float | None = None) -> None:
         self.dataset = load_dataset(folder, check_images=False)
         self.folder, self.target = self.dataset.folder, target
+        if refusal := takes_no_files(self.folder):
+            raise UsageError(
+                f"{self.folder}: the session takes no photograph: found {refusal}; free some space "
+                "there, or go on in a copy of the session that can be written."
+            )
         self.machine = self.dataset.machine
         self.cameras: dict[str, RigidTransform] = {}  # T_base_camera of placed views
         self.found: dict[str, BoolArray] = {}  # legs found in images, by their names
@@ -332,19 +338,11 @@ class GuidedSession:
         if photograph is not None:
             image = asked.image + photograph.suffix.lower()
         cells["image"] = image
-        try:
+        with self._room("the photograph could not be taken into the dataset", "keep it"):
             if photograph is not None:
                 (self.folder / image).parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(self.folder / image, photograph.read_bytes())
             self._write_tables([*self._cells, cells])
-        except OSError as error:
-            raise OutOfResources(
-                "the photograph could not be taken into the dataset",
-                f"'{error.strerror or error}'",
-                "a folder that takes it",
-                "free some space there, and keep it then",
-                self.folder,
-            ) from error
         if checked is not None and checked.exposure is not None:
             self.exposures[image], self.facts[image] = checked.exposure, checked.facts
             if checked.legs is not None:
@@ -358,12 +356,28 @@ class GuidedSession:
         """Take the last photograph of this run out of the dataset; return its name, or ""."""
         if not self._accepted:
             return ""
-        image = self._accepted.pop()
-        self._write_tables(self._cells[:-1])
-        if self._digests.pop(image, None):
-            (self.folder / image).unlink(missing_ok=True)
-            self._read_tables()
+        image = self._accepted[-1]
+        with self._room(f"{image or 'the last row'} could not be taken out", "undo it"):
+            self._write_tables(self._cells[:-1])
+            self._accepted.pop()
+            if self._digests.pop(image, None):
+                (self.folder / image).unlink(missing_ok=True)
+                self._read_tables()
         return image or "The last row"
+
+    @contextmanager
+    def _room(self, what: str, then: str) -> Iterator[None]:
+        """Say in words that the dataset takes no files."""
+        try:
+            yield
+        except OSError as error:
+            raise OutOfResources(
+                what,
+                f"'{error.strerror or error}'",
+                "a folder that takes its files",
+                f"free some space there, and {then} then",
+                self.folder,
+            ) from error
 
     def _readings(self, q: Array) -> dict[str, str]:
         """Return the cells of readings, in the units of the table."""

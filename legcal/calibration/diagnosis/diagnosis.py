@@ -3,7 +3,8 @@
 Every mistake is undone in turn, and the images say how well they agree then (how many of the legs
 that they should show are there, with cameras placed anywhere). A few images of the views that
 disagree most say which mistakes are worth a closer look, all images judge these. One is named where
-far more images agree; those that images cannot tell from it are named with it.
+far more images agree; those that images cannot tell from it are named with it. Where none is, the
+likeliest are undone and others tried beside them, near the cameras that are known by then.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from legcal.calibration.diagnosis.mistakes import (
     Diagnosis,
     Mistake,
     as_given,
+    both,
     joints_of,
     limited_to,
     mistakes,
@@ -47,6 +49,14 @@ from legcal.perception.placement import Group, Placement, Search, group_views
 _Judged = tuple[Mistake, Agreement]  # with what all images say of it
 
 STAGE = "Trying common mistakes"
+NONE_EXPLAINS = (
+    "Tried without success, each alone and the likeliest beside others: wrong columns, rows, "
+    "units, directions and zeros of readings, joints of the model in another order or mirrored, "
+    "diameters as radii, focal lengths, mirrored or turned photographs. More may be wrong, or "
+    "photographs show too little: click some joints in a photograph of each view (legcal detect "
+    "DATASET -o OUT --edit), see in its overlays which legs stand elsewhere, mend that, and "
+    "calibrate again."
+)
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 MIN_IMAGES = 3  # of a group of views
@@ -59,6 +69,9 @@ _FEW_STARTS = (1,), (1, 1)  # of the first few, and of the next few if these sui
 _POOL = 3  # cameras of other mistakes that are tried
 _NEAR_GROUPS = 3  # of views, by which mistakes are judged near known cameras first
 _FINALISTS = 6  # mistakes that all images judge
+_AHEAD = 12  # mistakes ahead in one group of views for which cameras of the next are searched for
+_FIRSTS = 3  # mistakes beside which others are tried
+_CLEARLY = 2.0  # gain of the first of them over the second, where it leads
 _SAME_AMOUNT = 2  # of these that differ by how much
 _NEAR_BEST = 0.5  # of the gain of the best, which few images gave, that all images judge as well
 # kinds that may begin during a session, and how many of these are tried
@@ -77,33 +90,36 @@ _LEAST_GAIN = 0.03  # where an opposite is worse: errors of the model make up fo
 _SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
 
 
-def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...]:
+def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     """Return the likely mistakes of a session, the likeliest first; empty if none is likely.
 
-    Views of one or two images that no board relates to others do not count: some camera pose fits
-    them under any hypothesis.
+    None where there is nothing to explain, or too little to judge by. Views of one or two images
+    that no board relates to others do not count: some camera pose fits them under any hypothesis.
     """
     machine = data.machine
     rows = _rows_seen(data)
     if not (machine.is_determined and len(machine.motors) and len(rows)):
-        return ()
+        return None
     groups = _groups(data, rows)
     if not groups:
-        return ()
+        return None
     judge = _Judge(data, groups)
     if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
-        return judge.exchanged_legs()
+        return judge.exchanged_legs() or None
     common = mistakes(data)
     tried = [
         *common,
         *judge.in_some_images(common),
         *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
     ]
-    judged = judge.judged(judge.finalists(tried))
-    likeliest = judge.likeliest(judged)
+    finalists, gain = judge.finalists(tried)
+    likeliest = judge.likeliest(judge.judged(finalists))
+    renamed = () if likeliest else judge.exchanged_legs()
+    if not (likeliest or renamed):
+        likeliest = judge.of_two(tried, gain)
     data.progress(STAGE, 1, 1)
     if not likeliest:
-        return ()
+        return renamed
     suited = [judge.hints_suited(one) for _, one in likeliest]
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
     first = [what for what, _ in likeliest]
@@ -276,8 +292,10 @@ class _Judge:
         hint = self.groups[g].hint
         return [] if hint is None else [hint, _mirrored_camera(hint)]
 
-    def finalists(self, tried: Sequence[Mistake]) -> list[Mistake]:
+    def finalists(self, tried: Sequence[Mistake]) -> tuple[list[Mistake], Array]:
         """Return the mistakes favoured by some images of the views that disagree most.
+
+        And what each of those that are tried gains.
 
         These are all images of views that nearly agree, whose cameras are known about, and a few of
         others; more of them in a second round. Cameras are searched for only if no mistake
@@ -290,6 +308,7 @@ class _Judge:
         gain = np.sum([look.near_known() for look in looks], axis=0)
         searches = not _suits(gain.max(initial=0.0) + _total(near), near)
         gain, seen = np.zeros(len(tried)), list[Agreement]()
+        judged = np.zeros(len(tried), dtype=np.bool_)
         done, total = 0, len(_FEW_STARTS) * len(tried)
         for starts in _FEW_STARTS:
             n_images = 0
@@ -298,7 +317,10 @@ class _Judge:
                 look = looks.pop(0) if looks else _Look(self, tried, g)
                 seen.append(look.before)
                 n_images += 0 if self.nearly_agrees(g) else len(look.asked)
+                ahead = np.sort(gain[judged])[-_AHEAD:]
+                look.is_open = ~judged | (gain >= ahead[:1].max(initial=-np.inf))
                 gain += look.gains(starts, searches=searches)
+                judged[look.some] = True
                 done += len(tried)
                 self.data.progress(STAGE, min(done, total - 1), total)
             own = Agreement.joined(seen)
@@ -319,7 +341,35 @@ class _Judge:
                 found.append(k)
                 left_for[of_all] -= 1
                 amounts[amount] += 1
-        return [tried[k] for k in sorted(found)]  # the commoner first
+        return [tried[k] for k in sorted(found)], gain  # the commoner first
+
+    def of_two(self, tried: Sequence[Mistake], gain: Array) -> list[_Judged]:
+        """Return pairs of mistakes at once that explain half of the images or more, if any do.
+
+        The first of a pair are those that gain most alone, the second one of all images beside
+        each. A few images of the group that disagrees most judge near the cameras known by then;
+        beside a first one that leads clearly, cameras are searched for where these suit none.
+        """
+        missing = [float((one.expected - one.support).sum()) for one in self.of_groups]
+        g = int(np.argmax(missing))
+        rows, before = self.groups[g].some, self.of_groups[g].at(self.groups[g].some)
+        order = np.argsort(-gain, kind="stable")[: _FIRSTS + 1].tolist()
+        found = dict[frozenset[str], tuple[float, Mistake]]()
+        for k in order[:_FIRSTS]:
+            beside = [one for one in mistakes(self.data, tried[k].true) if one.kind not in _RARE]
+            true = [one.true for one in beside]
+            support = [_total(one) for one in self.compare(true, g, rows, ())]
+            leads = k == order[0] and gain[k] > _CLEARLY * max(gain[order[1:]], default=0.0)
+            if leads and not _suits(max(support), before):
+                support = [_total(one) for one in self.compare(true, g, rows, _FEW_STARTS[0])]
+            for one, shown in zip(beside, support, strict=True):  # in either order once
+                key = frozenset((tried[k].what, one.what))
+                found.setdefault(key, (shown, both(tried[k], one)))
+        best = sorted(found.values(), key=lambda one: -one[0])[:_FINALISTS]
+        alike = [pair for shown, pair in best if shown >= _ALIKE * best[0][0]]
+        judged = [(pair, self.all(pair.true)) for pair in alike]
+        return self.likeliest([(pair, one) for pair, one in judged
+                               if one.images >= MIN_SHARE * len(one.row)])  # fmt: skip
 
     def nearly_agrees(self, g: int) -> bool:
         """Return whether the images of a group show half of the legs or more as given."""
@@ -496,6 +546,7 @@ class _Look:
         self.before = own.at(self.asked)
         is_as = [one.true.is_as(judge.given, group.rows) for one in tried]
         self.some = np.flatnonzero(~np.array(is_as, dtype=np.bool_)).tolist()
+        self.is_open = np.ones(len(tried), dtype=np.bool_)  # cameras are searched for of these
         self.support = np.zeros(len(tried))
         self.cameras: dict[int, RigidTransform | None] = {}
         self.T_near = own.cameras[0] if judge.nearly_agrees(g) else None
@@ -521,8 +572,9 @@ class _Look:
             nearly = [k for k in self.some if self.support[k] >= _NEARLY * before]
             self._at([k for k in nearly if not tried[k].is_small], starts)
         elif searches and not _suits(self.support.max(), self.before):
-            self._at([k for k in self.some if not tried[k].is_small], starts)
-            self._at([k for k in self.some if tried[k].is_small], ())
+            far = [k for k in self.some if self.is_open[k] and not tried[k].is_small]
+            self._at(far, starts)
+            self._at([k for k in self.some if k not in far], ())
         best = int(np.argmax(self.support))
         is_better = self.support[best] >= before + _MIN_GAIN * self.before.expected.sum()
         if is_better and (T_best := self.cameras.get(best)) is not None:

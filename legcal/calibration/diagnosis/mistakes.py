@@ -173,9 +173,9 @@ def as_given(data: OrderedDataset) -> Assumed:
     return Assumed(data.machine, data.measurements.q, np.ones((n, 2)), np.zeros(n, dtype=np.intp))
 
 
-def mistakes(data: OrderedDataset) -> list[Mistake]:
-    """Return the possible mistakes of a session, the most common first."""
-    given = as_given(data)
+def mistakes(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
+    """Return the possible mistakes of a session, the most common first; beside those undone."""
+    given = as_given(data) if given is None else given
     encoders = _Encoders(given)
     candidates = [
         *_column_mistakes(data, given),
@@ -192,6 +192,17 @@ def mistakes(data: OrderedDataset) -> list[Mistake]:
     return [
         mistake for mistake in candidates if mistake.true.is_in_travel or not given.is_in_travel
     ]
+
+
+def both(first: Mistake, second: Mistake) -> Mistake:
+    """Return two mistakes as one; *second* is one of a session in which the first is undone."""
+    return Mistake(
+        f"{first.kind} and {second.kind}",
+        f"{first.what}, and {second.what}",
+        f"{first.mended} and {second.mended}",
+        f"{first.remedy}, and {second.remedy}",
+        second.true,
+    )
 
 
 def _column_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:

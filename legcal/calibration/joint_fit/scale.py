@@ -25,13 +25,19 @@ from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import linearize
 from legcal.estimation.solver import inverse_on_range, normal_equations
-from legcal.estimation.uncertainty import residual_changes, response, score_test, size_left
+from legcal.estimation.uncertainty import (
+    Projected,
+    residual_changes,
+    response,
+    score_test,
+    size_left,
+)
 from legcal.files.schema import few
 from legcal.geometry.types import Array
 from legcal.machine.leg import LINKS, LegColumns, ParameterId
 
 SCALE = "an error of the scale, known from radii alone, by one standard deviation"
-ALL_READINGS = "an error that all readings share, by one standard deviation of pitches"
+ALL_READINGS = "an error of pitch, of all motors alike and of each one, by one sigma"
 TRAVEL, BOARD = "the travel of the motors", "the calibration board"
 RADII, MODEL = "the radii", "the nominal model"
 _CLEARLY = 4.0  # squared sigmas, by which the others agree better without one witness
@@ -84,16 +90,20 @@ def sensitivity_to_scale(linear: FitLinear, covariance: Array) -> dict[str, Arra
     *covariance* is of the kept unknowns. Where radii alone say the scale, it is the relative change
     of the mean length of rods; its share of the covariance would vanish with one measured length.
     Where motors slide, their readings are exact in the fit, but screws and belts are not: they
-    share an error of which boards and stated lengths say as much as they know, by its score.
+    share an error, each one differs from that by as much again, and boards, stated lengths and
+    images say as much as they know of both, by their scores.
     """
     problem, state = linear.problem, linear.state
     if (travel := _travel(problem)).any():
-        columns = {"readings": _whitened_travel(problem, travel)[..., None]}
-        normal = normal_equations(linear)
-        (score,), ((information,),) = score_test(normal, columns)
-        off = size_left(score, information, problem.legs.sigma_travel)
+        leg, normal = problem.readings.leg, normal_equations(linear)
+        of_motors = np.equal(leg[:, None], np.unique(leg[travel != 0.0]))
+        columns = {"readings": (_whitened_travel(problem, travel) * of_motors)[:, None]}
+        n = of_motors.shape[1]
+        scores = Projected.of(normal, columns).at(np.arange(n))
+        alike = np.ones((n, n))  # and the differences of each one from the mean
+        covariance = problem.legs.sigma_travel**2 * (alike + np.eye(n) - alike / n)
         moved = kinematic_steps(problem, response(normal, columns))
-        return {ALL_READINGS: off * moved}
+        return {ALL_READINGS: moved @ size_left(scores, covariance)}
     parametrization = problem.legs.parametrization
     column = parametrization.place[:, LegColumns.LENGTH]
     rods = np.flatnonzero(column >= 0)

@@ -71,13 +71,13 @@ def sensitivity_to_exact_cameras(cameras: CameraResiduals) -> dict[str, Array]:
     chosen = {ParameterId.parse(name).owner for name in problem.choices.fixed}
     free = np.array([owner in chosen for owner in owners])
     free |= (_camera_columns(problem)[:, :2] < problem.n_kept).any(axis=1)
-    unit, moved = _camera_error(state, _FOCAL, {}), list[Array]()
-    for owner in dict.fromkeys(owners[~free].tolist()):
-        error = unit * (owners == owner)[:, None]
-        scores = cameras.scores([error])
-        off = size_left(scores.score[0], scores.information[0, 0], SIGMA_EXACT)
-        moved.append(off * kinematic_steps(problem, cameras.response(error)))
-    return {EXACT_CAMERAS: np.hstack(moved)} if moved else {}
+    unit = _camera_error(state, _FOCAL, {})
+    errors = [unit * (owners == owner)[:, None] for owner in dict.fromkeys(owners[~free].tolist())]
+    if not errors:
+        return {}
+    off = size_left(cameras.scores(errors), SIGMA_EXACT**2 * np.eye(len(errors)))
+    moved = np.hstack([kinematic_steps(problem, cameras.response(error)) for error in errors])
+    return {EXACT_CAMERAS: moved @ off}
 
 
 def sensitivity_to_intrinsics(problem: FitProblem, covariance: Array) -> dict[str, Array]:
@@ -121,7 +121,7 @@ def kinematic_steps(problem: FitProblem, steps: Array) -> Array:
     return kinematic
 
 
-Intrinsic = Literal["focal_length", "zoom", "principal_point", "distortion"]
+Intrinsic = Literal["focal_length", "zoom", "principal_point", "centre", "distortion"]
 _OF_CAMERAS: tuple[Intrinsic, ...] = ("focal_length", "principal_point", "distortion")
 _Unit = tuple[Mapping[str, float], Mapping[str, float]]  # a relative and an added error
 _TESTED: Mapping[Intrinsic, tuple[tuple[str, ...], list[_Unit], str]] = {  # keys, units, name
@@ -131,7 +131,11 @@ _TESTED: Mapping[Intrinsic, tuple[tuple[str, ...], list[_Unit], str]] = {  # key
     "distortion": (("k1",), [({}, {"k1": 1.0})], "distortion of"),
     # A view against the others with its camera file
     "zoom": (("fx",), [(_FOCAL, {})], "focal length of view"),
-}
+    "centre": (
+        ("cx", "cy"), [({}, {"cx": 1.0}), ({}, {"cy": 1.0})], "principal point of view"
+    ),
+}  # fmt: skip
+_OF_VIEWS: tuple[Intrinsic, ...] = ("zoom", "centre")
 _REMEDIES: Mapping[Intrinsic, str] = {
     "focal_length": (
         "calibrate the camera again at the same focus and zoom, look for photographs that were "
@@ -149,7 +153,12 @@ _REMEDIES: Mapping[Intrinsic, str] = {
         "look for photographs of that view that were zoomed, scaled, cropped or refocused, and "
         "calibrate its camera with the settings used there"
     ),
+    "centre": (
+        "look for photographs of that view that were turned upside down, cropped or stabilised, "
+        "and take them as the camera wrote them"
+    ),
 }
+_HALF_TURN = 0.3  # of the difference of a principal point and that of the image upside down
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +172,7 @@ class WrongIntrinsic:
     sigma: Array  # (u,) standard deviations of the correction
     apart: float  # correction in standard deviations
     error: Array  # (n_views, 5) the correction, in all views
+    is_turned: bool = False  # whether it is that of images upside down
 
     @property
     def found(self) -> str:
@@ -170,6 +180,12 @@ class WrongIntrinsic:
         (given, *_), (change, *_), (sigma, *_) = self.given, self.change, self.sigma
         if self.kind == "zoom":
             return f"it differs by {1e2 * change:+.2f} +- {1e2 * sigma:.2f} %"
+        if self.kind == "centre":
+            (dx, dy), (sigma_x, sigma_y) = self.change, self.sigma
+            looks = ", as if its photographs had been turned upside down" if self.is_turned else ""
+            return (
+                f"it differs by ({dx:+.1f} +- {sigma_x:.1f}, {dy:+.1f} +- {sigma_y:.1f}) px{looks}"
+            )
         if self.kind == "focal_length":
             return (
                 f"found fx = {given * (1.0 + change):.1f} +- {given * sigma:.1f} px, given "
@@ -189,7 +205,8 @@ class WrongIntrinsic:
         return f"found k1 = {found:.3f} +- {sigma:.3f}, given {given:.3f}{looks}"
 
     def __str__(self) -> str:
-        against = "the other views of its camera" if self.kind == "zoom" else "the measurements"
+        of_view = self.kind in _OF_VIEWS
+        against = "the other views of its camera" if of_view else "the measurements"
         return (
             f"The {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
             f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
@@ -274,9 +291,9 @@ class CameraResiduals:
         contradicted = list[WrongIntrinsic]()
         for owner in dict.fromkeys(owners.tolist()):
             wrong = self._wrong_intrinsics(owner, owners == owner)
-            zoomed = self._zoomed_view(owners == owner)
+            apart = self._view_apart(owners == owner)
             clearest = max((test.apart for test in wrong), default=_SIGNIFICANT)
-            contradicted += wrong if zoomed is None or zoomed.apart <= clearest else [zoomed]
+            contradicted += wrong if apart is None or apart.apart <= clearest else [apart]
         squares = float(self.linear["outlines"].squared_norms.sum())
         left = 1.0 - sum(test.apart**2 for test in contradicted) / max(squares, 1e-300)
         scatter = Scatter.of(self.problem, self.state).ratio()
@@ -318,28 +335,41 @@ class CameraResiduals:
             )
         return wrong_intrinsics
 
-    def _zoomed_view(self, of_camera: BoolArray) -> WrongIntrinsic | None:
-        """Return the view of a camera whose focal length differs most from its other views.
+    def _view_apart(self, of_camera: BoolArray) -> WrongIntrinsic | None:
+        """Return the view of a camera whose intrinsics differ most from its other views.
 
-        Causes are digital zoom and refocusing. Cameras with choices for intrinsics, or with only
-        one informative view, are not tested.
+        Causes are digital zoom and refocusing, or turned and cropped images. Cameras with choices
+        for intrinsics, or with only one informative view, are not tested.
         """
-        error = _camera_error(self.state, _FOCAL, {})
-        views = np.flatnonzero(self._known_views(error) & of_camera).tolist()
-        if len(views) < 2:
-            return None
-        in_view = [error * (np.arange(len(error)) == v)[:, None] for v in views]
-        scores, columns = self.scores(in_view), np.arange(len(views))
-        given, zoomed = scores.given(scores.estimate(columns, np.ones((len(views), 1)))), []
-        for i, v in enumerate(views):
-            number = given.estimate(columns[[i]])
-            change, sigma = -number.amount, np.sqrt(np.diagonal(number.covariance))
-            if number.rank:
+        differ = list[WrongIntrinsic]()
+        for kind in _OF_VIEWS:
+            keys, units, _ = _TESTED[kind]
+            errors = [_camera_error(self.state, *unit) for unit in units]
+            views = np.flatnonzero(self._known_views(np.sum(errors, axis=0)) & of_camera).tolist()
+            if len(views) < 2:
+                continue
+            n = len(errors)
+            in_view = [error * (np.arange(len(error)) == v)[:, None]
+                       for v in views for error in errors]  # fmt: skip
+            scores, alike = self.scores(in_view), np.tile(np.eye(n), (len(views), 1))
+            given = scores.given(scores.estimate(np.arange(len(in_view)), alike))
+            for i, v in enumerate(views):
+                number = given.estimate(n * i + np.arange(n))
+                if number.rank < n:
+                    continue
+                change, sigma = -number.amount, np.sqrt(np.diagonal(number.covariance))
                 name, camera = self.problem.outlines.views[v], self.problem.first_cameras[v]
-                focal, apart = np.array([intrinsic_of(camera, "fx")]), float(np.sqrt(number.square))
-                wrong = change[0] * in_view[i]
-                zoomed.append(WrongIntrinsic("zoom", name, focal, change, sigma, apart, wrong))
-        return max(zoomed, key=lambda test: test.apart, default=None)
+                values = np.array([intrinsic_of(camera, key) for key in keys])
+                by_turn = np.array([camera.width, camera.height]) - 1.0 - 2.0 * values
+                is_turned = kind == "centre" and bool(
+                    np.linalg.norm(change - by_turn) < _HALF_TURN * np.linalg.norm(by_turn)
+                )
+                wrong = np.tensordot(change, in_view[n * i : n * (i + 1)], axes=1)
+                apart = float(np.sqrt(number.square))
+                differ.append(
+                    WrongIntrinsic(kind, name, values, change, sigma, apart, wrong, is_turned)
+                )
+        return max(differ, key=lambda test: test.apart, default=None)
 
     def _known_views(self, error: Array) -> BoolArray:
         """Return which views have the intrinsics in *error* from camera files, (n_views,)."""

@@ -11,8 +11,9 @@ name the likeliest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -295,13 +296,12 @@ def likely_mistake(
     pairs: PosePairs,
     cost: float,  # cost of the best candidate
     fewest: int,  # rows that determine the frames
+    of_readings: Callable[[IntArray], Iterable[tuple[PosePairs, str, str]]],  # in some rows
 ) -> tuple[str, str] | None:
     """Return a description of the likeliest mistake and its remedy, or None."""
     best, mistake = cost / _spread(pairs) / _BETTER**2, None
-    selected = pairs.of(
-        np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp)
-    )
-    for changed, looks_like, remedy in _alternatives(selected):
+    rows = np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp)
+    for changed, looks_like, remedy in chain(_alternatives(pairs.of(rows)), of_readings(rows)):
         other = float(search(changed, fewest, subsets=_MISTAKE_SUBSETS).cost[0]) / _spread(changed)
         if other < best:
             best, mistake = other / _BETTER**2, (looks_like, remedy)
@@ -316,7 +316,7 @@ def _spread(pairs: PosePairs) -> float:
 
 
 def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
-    """Yield the poses with each mistake undone, a description of the mistake, and its remedy."""
+    """Yield the poses with each mistake in them undone, what it is, and its remedy."""
     has_orientations = bool(pairs.oriented.any())
     for size, unit, remedy in _LENGTHS:
         yield replace(pairs, p=size * pairs.p), f"positions in {unit}", remedy

@@ -162,7 +162,12 @@ def _check_plausible(
     relative = rms / min(1.0, spread / pairs.length + 1e-12)
     if relative <= _LARGE_RESIDUAL:
         return
-    mistake = likely_mistake(pairs, float(candidates.cost[0]), measurements.fewest)
+    mistake = likely_mistake(
+        pairs,
+        float(candidates.cost[0]),
+        measurements.fewest,
+        measurements.with_columns_exchanged,
+    )
     if mistake is not None:
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses that look like {mistake[0]}, "

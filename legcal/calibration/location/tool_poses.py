@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -255,6 +256,26 @@ class ToolMeasurements:
     def is_oriented(self) -> bool:
         """Whether any orientation was measured."""
         return bool(self.pairs.oriented.any())
+
+    def with_columns_exchanged(self, rows: IntArray) -> Iterator[tuple[PosePairs, str, str]]:
+        """Yield some rows with two columns of readings exchanged, what that is, and its remedy."""
+        machine, chosen = self.machine, self.pairs.of(rows)
+        for one, other in combinations(machine.motors, 2):
+            q = self.poses.q[rows]
+            q[:, [one, other]] = q[:, [other, one]]
+            is_inside = [bool(machine.legs[j].in_travel(q[:, j]).all()) for j in (one, other)]
+            if not all(is_inside):
+                continue
+            try:
+                T = np.array([x.as_matrix() for x in forward_kinematics_many(machine, q)])
+            except (DidNotConverge, UsageError):
+                continue
+            names = " and ".join(str(machine.legs[j].prismatic) for j in (one, other))
+            yield (
+                replace(chosen, R=T[:, :3, :3], t=T[:, :3, 3]),
+                f"those of readings with columns {names} exchanged",
+                "swap the headers of these columns",
+            )
 
 
 def tool_measurements(
