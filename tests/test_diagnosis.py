@@ -202,7 +202,7 @@ def test_two_mistakes_at_once_are_named_together_with_both_remedies(
     changed = _thick(_reversed(outlines("hexapod")))
     (found,) = diagnose(order_dataset(changed, in_turn, no_progress)) or ()
     assert set(found.kind.split(" and ")) == set(kinds[:2])
-    assert found.after >= 11 > found.before
+    assert found.images_after >= 11 > found.images_before
     for told in ("appear to be diameters", "reverse them in the table", "<visual> cylinders"):
         assert told in found.sentence
 
