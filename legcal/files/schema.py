@@ -119,7 +119,11 @@ class FileSchema(BaseModel):
     """A block of a file: no unknown keys, no NaN, and it does not change once read."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        coerce_numbers_to_str=True,
+        defer_build=True,
     )
 
 
@@ -127,7 +131,9 @@ class FileSchema(BaseModel):
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
+    model_config = ConfigDict(
+        frozen=True, allow_inf_nan=False, from_attributes=True, defer_build=True
+    )
 
     @classmethod
     def describing(cls, source: object, **others: Any) -> Self:
