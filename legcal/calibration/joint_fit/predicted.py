@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,13 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
-from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
+from legcal.calibration.joint_fit.variables import (
+    FittedLegs,
+    Start,
+    State,
+    coordinates_by_steps,
+    fitted_legs,
+)
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
@@ -267,6 +273,7 @@ def information_of_images(
     return images.contributions([v.name for v in measurements.views], known_length, is_fit=is_fit)
 
 
+@lru_cache(maxsize=4)
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
     """Add the priors of a calibration: of twists, and of lines of arms, also of those not seen."""
     seen = [j for j, leg in enumerate(legs.nominal) if leg.arm is not None]
@@ -334,7 +341,7 @@ class _Images:
             untied = null_space(problem.parameters.tie_rows(state.legs)[1])
         basis = np.zeros((len(problem.free), untied.shape[1]))
         # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
-        basis[problem.free] = problem.parameters.jacobian(state.legs) @ untied
+        basis[problem.free] = coordinates_by_steps(problem.parameters, state.legs) @ untied
         turn = block_diag(untied, np.eye(problem.n_kept - k))
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
         if not is_fit:

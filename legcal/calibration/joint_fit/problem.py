@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -49,7 +49,9 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
     changed_cameras,
+    coordinates_by_steps,
     intrinsic_of,
+    legs_at_fixed,
 )
 from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
 from legcal.data.measurements import Measurements, row_names
@@ -177,7 +179,7 @@ class FitProblem(EstimationProblem[State]):
     def begin(self, start: Start) -> State:
         """Return the state at a start, fixed parameters at their values."""
         return State(
-            self.parameters.at_fixed(start.legs),
+            legs_at_fixed(self.parameters, start.legs),
             self.first_radii,
             self.first_cameras,
             self.first_board_scale,
@@ -327,7 +329,8 @@ def _build_problem(
 ) -> FitProblem:
     """Build the problem of measurements with the unknowns and priors of choices."""
     outlines, boards = observed.outlines, observed.boards
-    parameters, kinematic = _kinematic(legs, outlines, settings, choices)
+    seen = tuple(leg for leg, part in outlines.parts if (leg, part) in outlines.arms)
+    parameters, kinematic = _kinematic(legs, seen, settings, choices)
     owners = shared_cameras(outlines.views, cameras)
     shown = {owners[v] for v in observed.views.tolist()}
     intrinsics, keys = _intrinsics(outlines.views, cameras, owners, shown, choices)
@@ -375,15 +378,15 @@ def _build_problem(
     )
 
 
+@lru_cache(maxsize=4)  # plans ask for the same machine hundreds of times
 def _kinematic(
-    legs: FittedLegs, outlines: ObservedOutlines, settings: RefinementSettings, choices: Choices
+    legs: FittedLegs, seen: tuple[int, ...], settings: RefinementSettings, choices: Choices
 ) -> tuple[LegParameters, Variables]:
     """Estimated kinematic parameters, and their block.
 
-    The lines of visible arms have default priors; parameters with a choice have none.
+    The lines of *seen* arms have default priors; parameters with a choice have none.
     """
     names, chosen = legs.parametrization.names, {*choices.fixed, *choices.free, *choices.priors}
-    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
     sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
     arms = {name: sigma for name, sigma in sigmas.items() if name not in chosen}
     free = np.array(
@@ -410,7 +413,7 @@ def _kinematic(
         unknown,
         tuple(u for u, is_free in units if is_free),
         parameters.coordinates,
-        parameters.jacobian if parameters.turns else None,
+        partial(coordinates_by_steps, parameters) if parameters.turns else None,
         prior=prior,
     )
     return parameters, block
