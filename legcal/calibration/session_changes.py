@@ -22,9 +22,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, combinations, groupby, pairwise
 from operator import attrgetter
-from typing import Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
@@ -822,16 +823,22 @@ class _Fit:
             column = np.where(seen, c + np.cumsum(seen).reshape(seen.shape) - 1, -1)
             c += int(seen.sum())
             columns.append(column)
-        stacked = dict[str, Array]()
+        entries, shapes = dict[str, list[tuple[Array, IntArray, IntArray]]](), dict[str, int]()
         for hypothesis, column in zip(hypotheses, columns, strict=True):
             for name, values in hypothesis.columns.items():
-                n, q, d = values.shape
-                of_factor = stacked.setdefault(name, np.zeros((n, q, c)))
-                for k in range(d):
-                    blocks = np.flatnonzero(column[k] >= 0)
-                    of_factor[:, :, column[k][blocks]] = (
-                        values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
-                    )
+                n, q, _ = values.shape
+                shapes[name] = n * q
+                row, block = np.nonzero(hypothesis.share[name])
+                part = values[row] * hypothesis.share[name][row, block][:, None, None]
+                number, at = np.broadcast_arrays(
+                    q * row[:, None, None] + np.arange(q)[:, None], column[:, block].T[:, None]
+                )
+                seen = (at >= 0) & (part != 0.0)
+                entries.setdefault(name, []).append((part[seen], number[seen], at[seen]))
+        stacked = dict[str, Any]()
+        for name, found in entries.items():
+            value, number, at = (np.concatenate(of_all) for of_all in zip(*found, strict=True))
+            stacked[name] = csc_array((value, (number, at)), shape=(shapes[name], c))
         return _Scores(Projected.of(self.problem, self.linear, self.normal, stacked), columns)
 
     def better(self, least: float, by_scatter: float) -> _Solved | None:

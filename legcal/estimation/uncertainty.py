@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_array, vstack
+from scipy.sparse import csc_array, issparse, vstack
 
 from legcal.estimation.problem import (
     EstimationProblem,
@@ -192,9 +192,11 @@ def _gradients(
     problem: EstimationProblem[S],
     linear: Linearization,
     normal: NormalEquations,
-    columns: Mapping[str, Array],
+    columns: Mapping[str, Any],
 ) -> tuple[Array, Array, csc_array]:
     """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
+
+    Columns may be sparse, (n q, c).
 
     For kept unknowns with elements at their minimum (n_kept, c), and for elements in the tangent
     space of their constraints (n_elements, d, c). Columns are sparse: there may be thousands, each
@@ -207,7 +209,7 @@ def _gradients(
     for name, of_factor in columns.items():
         sparsity, rows = problem.sparsity[name], linear[name]
         n, q = rows.r.shape
-        flat = csc_array(of_factor.reshape(n * q, c))
+        flat = of_factor if issparse(of_factor) else csc_array(of_factor.reshape(n * q, c))
         stacked.append(flat)
         number = np.arange(n * q).reshape(n, q)
         for rows_of_group, unknowns in sparsity.members:
@@ -280,9 +282,12 @@ class Projected:
         problem: EstimationProblem[S],
         linear: Linearization,
         normal: NormalEquations,
-        columns: Mapping[str, Array],
+        columns: Mapping[str, Any],
     ) -> Projected:
-        """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
+        """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares.
+
+        Columns may be sparse, (n q, c).
+        """
         kept, elements, stacked = _gradients(problem, linear, normal, columns)
         c = stacked.shape[1]
         moved = normal.V_inverse @ elements
