@@ -133,6 +133,10 @@ class ImageReader:
 
     def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
+        return self.levels(k).astype(np.float32)
+
+    def levels(self, k: int) -> _Decoded:
+        """Return image k as :meth:`__call__`; levels of 8 bits stay 8-bit."""
         path = self.paths[k]
         if path is None:
             remedy = f"name one or give its outlines in {OBSERVATIONS_NAME}"
@@ -145,7 +149,7 @@ class ImageReader:
                     *self.places[k],
                 )
             )
-        return _decoded(path, self.cameras[k], self.places[k]).astype(np.float32)
+        return _decoded(path, self.cameras[k], self.places[k])
 
 
 _Decoded = NDArray[np.uint8] | Grey

@@ -209,7 +209,7 @@ def _gradients(
     for name, of_factor in columns.items():
         sparsity, rows = problem.sparsity[name], linear[name]
         n, q = rows.r.shape
-        flat = of_factor if issparse(of_factor) else csc_array(of_factor.reshape(n * q, c))
+        flat = csc_array(of_factor if issparse(of_factor) else of_factor.reshape(n * q, c))
         stacked.append(flat)
         number = np.arange(n * q).reshape(n, q)
         for rows_of_group, unknowns in sparsity.members:
