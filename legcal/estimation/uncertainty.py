@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_array, issparse, vstack
+from scipy.sparse import csc_array, vstack
 
 from legcal.estimation.problem import (
     EstimationProblem,
@@ -209,7 +209,8 @@ def _gradients(
     for name, of_factor in columns.items():
         sparsity, rows = problem.sparsity[name], linear[name]
         n, q = rows.r.shape
-        flat = csc_array(of_factor if issparse(of_factor) else of_factor.reshape(n * q, c))
+        is_dense = isinstance(of_factor, np.ndarray)
+        flat = csc_array(of_factor.reshape(n * q, c) if is_dense else of_factor)
         stacked.append(flat)
         number = np.arange(n * q).reshape(n, q)
         for rows_of_group, unknowns in sparsity.members:
