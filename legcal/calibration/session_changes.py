@@ -20,8 +20,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain, combinations, groupby, pairwise
-from operator import attrgetter
+from itertools import chain, combinations, count, groupby, pairwise
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -849,11 +848,7 @@ class _Fit:
         """
         best, asked = None, 0
         for hypotheses in (*self.of_joints(), *self.of_screws()):
-            tests = [
-                test
-                for place, hypothesis in enumerate(hypotheses)
-                for test in self.course.tests(place, hypothesis)
-            ]
+            tests = list(chain.from_iterable(map(self.course.tests, count(), hypotheses)))
             asked += len(tests)
             for solved in self.scores(hypotheses).solved(tests):
                 if solved.explains > least and solved.explains * solved.scatter > by_scatter:
@@ -970,7 +965,7 @@ class _Scores:
         """Estimate the number of each test."""
         return [
             number
-            for place, of_place in groupby(tests, key=attrgetter("place"))
+            for place, of_place in groupby(tests, key=lambda test: test.place)
             for number in self._of_hypothesis(place, list(of_place))
         ]
 

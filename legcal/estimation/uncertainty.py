@@ -196,11 +196,9 @@ def _gradients(
 ) -> tuple[Array, Array, csc_array]:
     """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
 
-    Columns may be sparse, (n q, c).
-
     For kept unknowns with elements at their minimum (n_kept, c), and for elements in the tangent
-    space of their constraints (n_elements, d, c). Columns are sparse: there may be thousands, each
-    of which acts on few measurements.
+    space of their constraints (n_elements, d, c). Columns are sparse, and may be given so (n q, c):
+    there may be thousands, each of which acts on few measurements.
     """
     c = next(iter(columns.values())).shape[-1]
     kept = np.zeros((problem.n_kept + 1, c))
@@ -209,8 +207,7 @@ def _gradients(
     for name, of_factor in columns.items():
         sparsity, rows = problem.sparsity[name], linear[name]
         n, q = rows.r.shape
-        is_dense = isinstance(of_factor, np.ndarray)
-        flat = csc_array(of_factor.reshape(n * q, c) if is_dense else of_factor)
+        flat = csc_array(of_factor.reshape(n * q, c))
         stacked.append(flat)
         number = np.arange(n * q).reshape(n, q)
         for rows_of_group, unknowns in sparsity.members:
@@ -285,10 +282,7 @@ class Projected:
         normal: NormalEquations,
         columns: Mapping[str, Any],
     ) -> Projected:
-        """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares.
-
-        Columns may be sparse, (n q, c).
-        """
+        """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
         kept, elements, stacked = _gradients(problem, linear, normal, columns)
         c = stacked.shape[1]
         moved = normal.V_inverse @ elements

@@ -38,13 +38,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
-from legcal.calibration.joint_fit.variables import (
-    FittedLegs,
-    Start,
-    State,
-    coordinates_by_steps,
-    fitted_legs,
-)
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
@@ -341,7 +335,7 @@ class _Images:
             untied = null_space(problem.parameters.tie_rows(state.legs)[1])
         basis = np.zeros((len(problem.free), untied.shape[1]))
         # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
-        basis[problem.free] = coordinates_by_steps(problem.parameters, state.legs) @ untied
+        basis[problem.free] = problem.jacobian(state)[:k, :k] @ untied
         turn = block_diag(untied, np.eye(problem.n_kept - k))
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
         if not is_fit:

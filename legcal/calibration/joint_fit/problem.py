@@ -49,9 +49,7 @@ from legcal.calibration.joint_fit.variables import (
     Start,
     State,
     changed_cameras,
-    coordinates_by_steps,
     intrinsic_of,
-    legs_at_fixed,
 )
 from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
 from legcal.data.measurements import Measurements, row_names
@@ -179,7 +177,7 @@ class FitProblem(EstimationProblem[State]):
     def begin(self, start: Start) -> State:
         """Return the state at a start, fixed parameters at their values."""
         return State(
-            legs_at_fixed(self.parameters, start.legs),
+            self.parameters.at_fixed(start.legs),
             self.first_radii,
             self.first_cameras,
             self.first_board_scale,
@@ -413,7 +411,7 @@ def _kinematic(
         unknown,
         tuple(u for u, is_free in units if is_free),
         parameters.coordinates,
-        partial(coordinates_by_steps, parameters) if parameters.turns else None,
+        lru_cache(maxsize=4)(parameters.jacobian) if parameters.turns else None,
         prior=prior,
     )
     return parameters, block

@@ -431,18 +431,6 @@ class LegParameters:
         return J
 
 
-@lru_cache(maxsize=4)  # plans ask for the same legs hundreds of times
-def legs_at_fixed(parameters: LegParameters, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
-    """Return :meth:`LegParameters.at_fixed`."""
-    return parameters.at_fixed(geometry)
-
-
-@lru_cache(maxsize=4)
-def coordinates_by_steps(parameters: LegParameters, geometry: tuple[Leg, ...]) -> Array:
-    """Return :meth:`LegParameters.jacobian`."""
-    return parameters.jacobian(geometry)
-
-
 def with_values(
     geometry: tuple[Leg, ...], legs: FittedLegs, values: Mapping[int, float]
 ) -> tuple[Leg, ...]:

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, IntArray
@@ -81,8 +82,6 @@ def _undistorted(camera: Camera) -> tuple[Single, Single]:
 
     Distortion is undone at some pixels and is a quintic spline in between, to 1e-6 px.
     """
-    from scipy.interpolate import RectBivariateSpline  # only where something is rendered
-
     v, u = (np.linspace(0.0, n - 1.0, max(n // _SPACING, 6)) for n in (camera.height, camera.width))
     xy = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))
     rows, columns = np.arange(float(camera.height)), np.arange(float(camera.width))
