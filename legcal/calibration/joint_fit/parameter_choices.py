@@ -48,7 +48,7 @@ class KnownIntrinsics:
     covariance: Array  # (n, n) zero for what is exact
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Choices:
     """Choices of parameters by their full names.
 

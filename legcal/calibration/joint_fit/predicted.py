@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -267,7 +267,6 @@ def information_of_images(
     return images.contributions([v.name for v in measurements.views], known_length, is_fit=is_fit)
 
 
-@lru_cache(maxsize=4)
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
     """Add the priors of a calibration: of twists, and of lines of arms, also of those not seen."""
     seen = [j for j, leg in enumerate(legs.nominal) if leg.arm is not None]

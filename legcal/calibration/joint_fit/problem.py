@@ -327,8 +327,7 @@ def _build_problem(
 ) -> FitProblem:
     """Build the problem of measurements with the unknowns and priors of choices."""
     outlines, boards = observed.outlines, observed.boards
-    seen = tuple(leg for leg, part in outlines.parts if (leg, part) in outlines.arms)
-    parameters, kinematic = _kinematic(legs, seen, settings, choices)
+    parameters, kinematic = _kinematic(legs, outlines, settings, choices)
     owners = shared_cameras(outlines.views, cameras)
     shown = {owners[v] for v in observed.views.tolist()}
     intrinsics, keys = _intrinsics(outlines.views, cameras, owners, shown, choices)
@@ -376,15 +375,15 @@ def _build_problem(
     )
 
 
-@lru_cache(maxsize=4)  # plans ask for the same machine hundreds of times
 def _kinematic(
-    legs: FittedLegs, seen: tuple[int, ...], settings: RefinementSettings, choices: Choices
+    legs: FittedLegs, outlines: ObservedOutlines, settings: RefinementSettings, choices: Choices
 ) -> tuple[LegParameters, Variables]:
     """Estimated kinematic parameters, and their block.
 
-    The lines of *seen* arms have default priors; parameters with a choice have none.
+    The lines of visible arms have default priors; parameters with a choice have none.
     """
     names, chosen = legs.parametrization.names, {*choices.fixed, *choices.free, *choices.priors}
+    seen = [leg for leg, part in outlines.parts if (leg, part) in outlines.arms]
     sigmas = arm_sigmas(legs.parametrization, legs.nominal, seen, settings)
     arms = {name: sigma for name, sigma in sigmas.items() if name not in chosen}
     free = np.array(
@@ -411,7 +410,7 @@ def _kinematic(
         unknown,
         tuple(u for u, is_free in units if is_free),
         parameters.coordinates,
-        lru_cache(maxsize=4)(parameters.jacobian) if parameters.turns else None,
+        lru_cache(maxsize=1)(parameters.jacobian) if parameters.turns else None,
         prior=prior,
     )
     return parameters, block
