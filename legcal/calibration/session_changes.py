@@ -20,10 +20,11 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain, combinations, pairwise
-from typing import Literal, NamedTuple, cast
+from itertools import chain, combinations, count, groupby, pairwise
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.special import chdtrc, chdtri
 
 from legcal.calibration.joint_fit.factors import ObservedOutlines
@@ -304,7 +305,7 @@ def _tests(
     ]
     scores = fit.scores(hypotheses)
     least = math.sqrt(chdtri(1.0, DOUBT_BY_CHANCE / max(len(tests), 1)))
-    slips, solved = dict[str, list[float]](), [scores.solved(test) for test in tests]
+    slips, solved = dict[str, list[float]](), scores.solved(tests)
     for number in solved:
         if number.test.of.kind == "encoder" and number.rank and len(number.amount) == 1:
             sigma = math.sqrt(number.covariance[0, 0])
@@ -319,7 +320,7 @@ def _tests(
             noise, lacking = None, [better]
     if noise is not None:
         scores = scores.with_noise(noise)
-        solved = [scores.solved(number.test) for number in lacking]
+        solved = scores.solved([number.test for number in lacking])
         lacking, _ = _forward_selection(scores, solved, len(tests))
     named = [number for number in lacking if number.test.of.kind != "camera_file"]
     findings = [fit.finding(number, measurements, len(tests)) for number in named]
@@ -342,7 +343,7 @@ def _forward_selection(
         lacking.append(best)
         scores = _Scores(scores.scores.given(best.estimated), scores.column)
         left = [number.test for number in solved if number.test.place != best.test.place]
-        solved = [scores.solved(test) for test in left]
+        solved = scores.solved(left)
     return lacking, scores
 
 
@@ -776,16 +777,22 @@ class _Fit:
             column = np.where(seen, c + np.cumsum(seen).reshape(seen.shape) - 1, -1)
             c += int(seen.sum())
             columns.append(column)
-        stacked = dict[str, Array]()
+        entries, shapes = dict[str, list[tuple[Array, IntArray, IntArray]]](), dict[str, int]()
         for hypothesis, column in zip(hypotheses, columns, strict=True):
             for name, values in hypothesis.columns.items():
-                n, q, d = values.shape
-                of_factor = stacked.setdefault(name, np.zeros((n, q, c)))
-                for k in range(d):
-                    blocks = np.flatnonzero(column[k] >= 0)
-                    of_factor[:, :, column[k][blocks]] = (
-                        values[:, :, k, None] * hypothesis.share[name][:, None, blocks]
-                    )
+                n, q, _ = values.shape
+                shapes[name] = n * q
+                row, block = np.nonzero(hypothesis.share[name])
+                part = values[row] * hypothesis.share[name][row, block][:, None, None]
+                number, at = np.broadcast_arrays(
+                    q * row[:, None, None] + np.arange(q)[:, None], column[:, block].T[:, None]
+                )
+                seen = (at >= 0) & (part != 0.0)
+                entries.setdefault(name, []).append((part[seen], number[seen], at[seen]))
+        stacked = dict[str, Any]()
+        for name, found in entries.items():
+            value, number, at = (np.concatenate(of_all) for of_all in zip(*found, strict=True))
+            stacked[name] = csc_array((value, (number, at)), shape=(shapes[name], c))
         return _Scores(Projected.of(self.normal, stacked), columns)
 
     def better(self, least: float, by_scatter: float) -> _Solved | None:
@@ -796,13 +803,11 @@ class _Fit:
         """
         best, asked = None, 0
         for hypotheses in (*self.of_joints(), *self.of_screws()):
-            scores = self.scores(hypotheses)
-            for place, hypothesis in enumerate(hypotheses):
-                for test in self.course.tests(place, hypothesis):
-                    solved = scores.solved(test)
-                    asked += 1
-                    if solved.explains > least and solved.explains * solved.scatter > by_scatter:
-                        least, best = solved.explains, solved
+            tests = list(chain.from_iterable(map(self.course.tests, count(), hypotheses)))
+            asked += len(tests)
+            for solved in self.scores(hypotheses).solved(tests):
+                if solved.explains > least and solved.explains * solved.scatter > by_scatter:
+                    least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 
     def finding(self, number: _Solved, measurements: Measurements, n_tests: int) -> Finding:
@@ -918,26 +923,34 @@ class _Scores:
         scores = scores.less(by_noise, toward, by_noise @ scores.score[columns])
         return _Scores(scores, self.column)
 
-    def solved(self, test: _Test) -> _Solved:
-        """Estimate the number of a test."""
-        column = self.column[test.place]
+    def solved(self, tests: Sequence[_Test]) -> list[_Solved]:
+        """Estimate the number of each test."""
+        return [
+            number
+            for place, of_place in groupby(tests, key=lambda test: test.place)
+            for number in self._of_hypothesis(place, list(of_place))
+        ]
+
+    def _of_hypothesis(self, place: int, tests: Sequence[_Test]) -> Iterator[_Solved]:
+        """Yield the number of each test of one hypothesis."""
+        column, of_blocks = self.column[place], self._of_hypotheses[place]
         used = column >= 0
         number, block = np.nonzero(used)
-        chosen = (number[:, None] == np.arange(len(column))) & test.holds[block][:, None]
-        of_blocks = self._of_hypotheses[test.place]
-        found = of_blocks.estimate(np.arange(len(number)), chosen.astype(np.float64))
-        left = of_blocks.given(found)
-        variance = np.diagonal(left.information)
-        tested = variance > LEAST_SEEN * left.size
-        ratio = left.score[tested] ** 2 / variance[tested]
-        scatter = max(float(ratio.mean()), 1.0) if len(ratio) else 1.0
-        rank, square = found.rank, found.square / scatter
-        if test.of.kind == "drift":  # all numbers but the first are levels that may be anything
-            variance_of_first = max(
-                float(found.covariance[0, 0]) * scatter, np.finfo(np.float64).tiny
-            )
-            rank, square = min(rank, 1), float(found.amount[0]) ** 2 / variance_of_first
-        return _Solved(test, found._replace(columns=column[used]), rank, square, scatter)
+        holds = np.array([test.holds for test in tests])[:, block]
+        chosen = np.equal(number[:, None], np.arange(len(column))) * holds[..., None]
+        estimated = of_blocks.estimates(np.arange(len(number)), chosen.astype(np.float64))
+        score, variance = of_blocks.left(estimated)
+        tested = variance > LEAST_SEEN * of_blocks.size
+        total = np.sum(np.where(tested, score**2 / np.where(tested, variance, 1.0), 0.0), axis=1)
+        scatters = np.maximum(total / np.maximum(tested.sum(axis=1), 1), 1.0).tolist()
+        for test, found, scatter in zip(tests, estimated, scatters, strict=True):
+            rank, square = found.rank, found.square / scatter
+            if test.of.kind == "drift":  # all numbers but the first are levels that may be anything
+                variance_of_first = max(
+                    float(found.covariance[0, 0]) * scatter, np.finfo(np.float64).tiny
+                )
+                rank, square = min(rank, 1), float(found.amount[0]) ** 2 / variance_of_first
+            yield _Solved(test, found._replace(columns=column[used]), rank, square, scatter)
 
 
 class _Solved(NamedTuple):

@@ -137,6 +137,10 @@ class ImageReader:
 
     def __call__(self, k: int) -> Grey:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
+        return self.levels(k).astype(np.float32)
+
+    def levels(self, k: int) -> _Decoded:
+        """Return image k as :meth:`__call__`; levels of 8 bits stay 8-bit."""
         path = self.paths[k]
         if path is None:
             remedy = f"name one or give its outlines in {OBSERVATIONS_NAME}"
@@ -149,9 +153,8 @@ class ImageReader:
                     *self.places[k],
                 )
             )
-        grey = _decoded(path, self.cameras[k], self.places[k]).astype(np.float32)
-        move = self.moves[k]
-        return grey if move is None else move.undone(grey)
+        levels, move = _decoded(path, self.cameras[k], self.places[k]), self.moves[k]
+        return levels if move is None else move.undone(levels.astype(np.float32))
 
 
 _Decoded = NDArray[np.uint8] | Grey

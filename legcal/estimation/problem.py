@@ -545,7 +545,7 @@ class EstimationProblem(Generic[S]):
 
     def changed(self, **parts: Any) -> Self:
         """Return the problem with other fields, reusing unchanged parts of its layout."""
-        return replace(self, earlier=self.layout, **parts)
+        return replace(self, earlier=vars(self).get("layout", self.earlier), **parts)
 
     def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:
         """Replace blocks and factors by others of the same names."""

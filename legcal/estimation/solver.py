@@ -29,7 +29,7 @@ from legcal.estimation.problem import (
     Tangent,
     linearize,
 )
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 _FIRST_DAMPING = 1e-6
 _MIN_DAMPING = 1e-10
@@ -212,6 +212,46 @@ def _correct_elements(
 
 
 @dataclass(frozen=True, eq=False)
+class FreeSteps:
+    """An orthonormal basis of the steps of n unknowns along no held direction.
+
+    Its last vectors are the unknowns that no held direction touches: products with it need few
+    multiplications.
+    """
+
+    touched: IntArray  # unknowns in held directions
+    others: IntArray
+    basis: Array  # (n_touched, k) of the first vectors
+
+    @classmethod
+    def without(cls, held_directions: Array) -> FreeSteps:
+        """Find the steps without held directions (w, n)."""
+        is_touched = held_directions.any(axis=0)
+        touched, others = np.flatnonzero(is_touched), np.flatnonzero(~is_touched)
+        basis = null_space(held_directions[:, touched]) if len(touched) else np.zeros((0, 0))
+        return cls(touched, others, basis)
+
+    def restricted(self, columns: Array) -> Array:
+        """Multiply (n,) or (n, c) by the transposed basis."""
+        if not len(self.touched):
+            return columns
+        return np.concatenate([self.basis.T @ columns[self.touched], columns[self.others]])
+
+    def extended(self, steps: Array) -> Array:
+        """Multiply (f,) or (f, c) by the basis."""
+        if not len(self.touched):
+            return steps
+        k = self.basis.shape[1]
+        columns = np.empty((len(self.touched) + len(self.others), *steps.shape[1:]))
+        columns[self.touched], columns[self.others] = self.basis @ steps[:k], steps[k:]
+        return columns
+
+    def of(self, R: Array) -> Array:
+        """Return the information (f, f) of these steps of a symmetric one (n, n)."""
+        return self.restricted(self.restricted(R).T).T
+
+
+@dataclass(frozen=True, eq=False)
 class NormalEquations(Generic[P, S]):
     """The normal equations of a problem at a state."""
 
@@ -273,21 +313,25 @@ class NormalEquations(Generic[P, S]):
 
     @cached_property
     def _kept_covariance(self) -> Array:
-        if len(self.held_directions) == 0:
-            covariance = inverse_on_range(self._reduced)
-        else:
-            N = null_space(self.held_directions)
-            covariance = N @ inverse_on_range(N.T @ self._reduced @ N) @ N.T
+        free = self.free_steps
+        covariance = free.extended(free.extended(inverse_on_range(free.of(self._reduced))).T).T
         return np.asarray(0.5 * (covariance + covariance.T))  # rounding grows with the condition
+
+    @cached_property
+    def free_steps(self) -> FreeSteps:
+        """The steps of the kept unknowns along no held direction."""
+        return FreeSteps.without(self.held_directions)
 
     def moved_by(self, columns: Array) -> Array:
         """Multiply columns (n_kept, c) by the covariance of the kept unknowns."""
-        if len(self.held_directions) == 0 and "_kept_covariance" not in vars(self):
-            scale = _scale(self._reduced)
-            U, failed = dpotrf(scale[:, None] * self._reduced * scale)
+        if "_kept_covariance" not in vars(self):
+            free = self.free_steps
+            reduced = free.of(self._reduced)
+            scale = _scale(reduced)
+            U, failed = dpotrf(scale[:, None] * reduced * scale)
             if not failed and np.diagonal(U).min(initial=1.0) ** 2 > _MIN_PIVOT:
-                right = scale[:, None] * columns
-                return np.asarray(scale[:, None] * cho_solve((U, False), right))
+                solved = cho_solve((U, False), scale[:, None] * free.restricted(columns))
+                return free.extended(scale[:, None] * solved)
         return np.asarray(self._kept_covariance @ columns)
 
     def step(self, damping: float) -> tuple[Array, float]:
@@ -306,11 +350,8 @@ class NormalEquations(Generic[P, S]):
             R = U - _sum_of_products(_times_blocks(self.W, V_inverse), self.W)
         element_part = (V_inverse @ self.g_elements[..., None]).ravel()
         right = -self.g_kept + _as_matrix(self.W) @ element_part
-        if len(self.held_directions):
-            N = null_space(self.held_directions)
-            kept = N @ _solve(N.T @ R @ N, N.T @ right)
-        else:
-            kept = _solve(R, right)
+        free = self.free_steps
+        kept = free.extended(_solve(free.of(R), free.restricted(right)))
         g_total = self.g_elements + (kept @ _as_matrix(self.W)).reshape(self.g_elements.shape)
         y = -(V_inverse @ g_total[..., None])[..., 0]
         gradient_term = float(self.g_kept @ kept + np.sum(self.g_elements * y))
@@ -460,7 +501,7 @@ def inverse_on_range(S: Array) -> Array:
 
 def _inverses(scaled: Array) -> Array:
     """Pseudoinverses of matrices (k, n, n) of unit diagonal."""
-    safe = _is_regular(scaled)
+    safe = is_regular(scaled)
     if safe.all():
         return np.asarray(np.linalg.inv(scaled))
     inverse = np.empty_like(scaled)
@@ -486,7 +527,7 @@ def _pseudoinverses(scaled: Array) -> Array:
     return np.asarray((vector * reciprocal[..., None, :]) @ np.swapaxes(vector, -1, -2))
 
 
-def _is_regular(scaled: Array) -> BoolArray:
+def is_regular(scaled: Array) -> BoolArray:
     """Which matrices (k, n, n) of unit diagonal are far from singular, (k,)."""
     try:
         L = np.linalg.cholesky(scaled)

@@ -5,19 +5,20 @@ All of them follow from the normal equations at one state, eliminated elements m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import null_space
 from scipy.sparse import csc_array, vstack
 
 from legcal.estimation.problem import Linearization, Residuals
 from legcal.estimation.solver import (
+    FreeSteps,
     Minimum,
     NormalEquations,
     inverse_on_range,
+    is_regular,
     normal_equations,
 )
 from legcal.geometry.types import Array, IntArray
@@ -177,13 +178,13 @@ def response(normal: NormalEquations[Any, Any], changes: Mapping[str, Array]) ->
 
 
 def _gradients(
-    normal: NormalEquations[Any, Any], columns: Mapping[str, Array]
+    normal: NormalEquations[Any, Any], columns: Mapping[str, Any]
 ) -> tuple[Array, Array, csc_array]:
     """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
 
     For kept unknowns with elements at their minimum (n_kept, c), and for elements in the tangent
-    space of their constraints (n_elements, d, c). Columns are sparse: there may be thousands, each
-    of which acts on few measurements.
+    space of their constraints (n_elements, d, c). Columns are sparse, and may be given so (n q, c):
+    there may be thousands, each of which acts on few measurements.
     """
     problem, c = normal.problem, next(iter(columns.values())).shape[-1]
     kept = np.zeros((problem.n_kept + 1, c))
@@ -226,10 +227,7 @@ def restricted_log_likelihood(minimum: Minimum[Any]) -> float:
     normal = normal_equations(linear)
     squares = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
     squares += float(np.sum(linear.prior_r**2))
-    R = normal.reduced()
-    if len(normal.held_directions):
-        N = null_space(normal.held_directions)
-        R = N.T @ R @ N
+    R = normal.free_steps.of(normal.reduced())
     log_determinants = np.linalg.slogdet(R)[1] + np.sum(np.linalg.slogdet(normal.V)[1])
     return -0.5 * (squares + float(log_determinants)) - float(np.log(problem.priors.sigma).sum())
 
@@ -260,7 +258,7 @@ class Projected:
     gradient: Array  # (k, c)
 
     @classmethod
-    def of(cls, normal: NormalEquations[Any, Any], columns: Mapping[str, Array]) -> Projected:
+    def of(cls, normal: NormalEquations[Any, Any], columns: Mapping[str, Any]) -> Projected:
         """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
         kept, elements, stacked = _gradients(normal, columns)
         c = stacked.shape[1]
@@ -320,17 +318,32 @@ class Scores:
     def estimate(self, columns: IntArray, chosen: Array | None = None) -> Estimated:
         """Estimate numbers together: one for each column, or *chosen* (c, d) sums of columns."""
         chosen = np.eye(len(columns)) if chosen is None else chosen
-        score = chosen.T @ self.score[columns]
-        information = chosen.T @ self.information[np.ix_(columns, columns)] @ chosen
-        scale = np.sqrt(np.maximum(chosen.T @ self.size[columns], np.finfo(np.float64).tiny))
-        value, vector = np.linalg.eigh(information / scale / scale[:, None])
+        return self.estimates(columns, chosen[None])[0]
+
+    def estimates(self, columns: IntArray, chosen: Array) -> list[Estimated]:
+        """Estimate the numbers of t tests, each by itself: *chosen* (t, c, d) sums of columns."""
+        sums = np.swapaxes(chosen, 1, 2)
+        score = sums @ self.score[columns]
+        information = sums @ (self.information[np.ix_(columns, columns)] @ chosen)
+        scale = np.sqrt(np.maximum(sums @ self.size[columns], np.finfo(np.float64).tiny))
+        value, vector = np.linalg.eigh(information / scale[:, None] / scale[..., None])
         seen = value > LEAST_SEEN
-        root = vector[:, seen] / np.sqrt(value[seen]) / scale[:, None]
-        covariance = root @ root.T
-        amount = covariance @ score
-        return Estimated(
-            columns, chosen, amount, covariance, int(seen.sum()), float(score @ amount)
-        )
+        root = vector * np.sqrt(seen / np.where(seen, value, 1.0))[:, None] / scale[..., None]
+        covariance = root @ np.swapaxes(root, 1, 2)
+        amount = (covariance @ score[..., None])[..., 0]
+        square = np.sum(score * amount, axis=1).tolist()
+        found = zip(chosen, amount, covariance, seen.sum(axis=1).tolist(), square, strict=True)
+        return [Estimated(columns, *one) for one in found]
+
+    def left(self, numbers: Sequence[Estimated]) -> tuple[Array, Array]:
+        """Return scores (t, c) and variances of columns in fits that have the numbers of a test."""
+        chosen = np.stack([one.chosen for one in numbers])
+        amount = np.stack([one.amount for one in numbers])
+        covariance = np.stack([one.covariance for one in numbers])
+        toward = self.information[:, numbers[0].columns] @ chosen
+        score = self.score - (toward @ amount[..., None])[..., 0]
+        absorbed = np.sum((toward @ covariance) * toward, axis=2)
+        return score, np.diagonal(self.information) - absorbed
 
     def given(self, numbers: Estimated) -> Scores:
         """Return the scores of a fit that has these numbers as well."""
@@ -373,7 +386,7 @@ def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[Le
     """
     blocks = list[LeftOut]()
     everything = normal_equations(linear)
-    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()))
+    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()[None])[0])
     rank_of_elements = _ranks(everything.V)
     for b in range(int(block.max(initial=-1)) + 1):
         rows, squares, dof = dict(linear.rows), 0.0, 0
@@ -393,7 +406,7 @@ def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[Le
         rest = normal_equations(replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
         squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
-        dof -= rank - int(_ranks(rest.reduced())) + int(rank_of_elements[block == b].sum())
+        dof -= rank - int(_ranks(rest.reduced()[None])[0]) + int(rank_of_elements[block == b].sum())
         blocks.append(LeftOut(squares, dof, rest.reduced()))
     return blocks
 
@@ -405,11 +418,14 @@ def _reduced_gradient(normal: NormalEquations[Any, Any]) -> Array:
 
 
 def _ranks(matrices: Array) -> IntArray:
-    """Return the ranks of information matrices (..., n, n), whatever their units."""
-    diagonal = np.einsum("...ii->...i", matrices)
+    """Return the ranks of information matrices (k, n, n), whatever their units."""
+    diagonal = np.einsum("kii->ki", matrices)
     scale = np.sqrt(np.maximum(diagonal, np.finfo(np.float64).tiny))
-    scaled = matrices / scale[..., :, None] / scale[..., None, :]
-    return np.asarray(np.linalg.matrix_rank(scaled, tol=_ROUNDING, hermitian=True), dtype=np.intp)
+    scaled = matrices / scale[:, :, None] / scale[:, None, :]
+    ranks = np.full(len(matrices), matrices.shape[1])
+    singular = ~is_regular(scaled)  # at a fraction of the cost of eigenvalues
+    ranks[singular] = np.linalg.matrix_rank(scaled[singular], tol=_ROUNDING, hermitian=True)
+    return ranks
 
 
 def scores_of_block(linear: Linearization[Any, Any], name: str) -> tuple[Array, Array]:
@@ -430,11 +446,8 @@ def scores_of_block(linear: Linearization[Any, Any], name: str) -> tuple[Array, 
     others = np.setdiff1d(np.arange(len(R)), effects)
     prior_information = 1.0 / block.prior.sigma**2
     R_others, R_mixed = R[np.ix_(others, others)], R[np.ix_(others, effects)]
-    if len(normal.held_directions):
-        N = null_space(normal.held_directions[:, others])
-        inverse = N @ inverse_on_range(N.T @ R_others @ N) @ N.T
-    else:
-        inverse = inverse_on_range(R_others)
+    free = FreeSteps.without(normal.held_directions[:, others])
+    inverse = free.extended(free.extended(inverse_on_range(free.of(R_others))).T).T
     block_information = R[np.ix_(effects, effects)] - np.diag(prior_information)
     K = block_information - R_mixed.T @ inverse @ R_mixed
     K = 0.5 * (K + K.T)

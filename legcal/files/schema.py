@@ -120,21 +120,20 @@ Metres = Annotated[Number, Field(gt=-1e6, lt=1e6)]  # squares of far larger numb
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
+_FROZEN = ConfigDict(frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class FileSchema(BaseModel):
     """A block of a file: no unknown keys, no NaN, and it does not change once read."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True
-    )
+    model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True, **_FROZEN)
 
 
 @brief
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
+    model_config = ConfigDict(from_attributes=True, **_FROZEN)
 
     @classmethod
     def describing(cls, source: object, **others: Any) -> Self:

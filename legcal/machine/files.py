@@ -200,7 +200,7 @@ def _small_letters(kind: object) -> object:
 class MechanismFile(BaseModel):
     """A mechanism YAML; keys of other programs are ignored."""
 
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore")
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore", defer_build=True)
 
     closed_loop: Annotated[
         list[Annotated[list[str], Field(min_length=2, max_length=2)]], Field(min_length=1)

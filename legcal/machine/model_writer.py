@@ -9,9 +9,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError
@@ -43,28 +43,31 @@ ROUNDING = 1e-15  # displacement that counts as none [mean leg lengths]
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
     """Return the complete YAML of a mechanism."""
+    closures = [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures]
+    motors = [str(machine.legs[j].prismatic) for j in machine.motors]
+    return mechanism_yaml(closures, motors, _legcal_block(machine, urdf))
+
+
+def _legcal_block(machine: Machine, urdf: str) -> dict[str, Any]:
+    """Return the block ``legcal`` of the YAML of a mechanism."""
     q = readings_at(machine, machine.home)
     home = {str(machine.legs[j].prismatic): float(q[j]) for j in machine.motors
             if machine.legs[j].actuator is not None}  # fmt: skip
     stated = motor_entries(machine.actuators)
-    return mechanism_yaml(
-        [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures],
-        [str(machine.legs[j].prismatic) for j in machine.motors],
-        {
-            "urdf": urdf,
-            "base": machine.base,
-            "platform": machine.platform,
-            "platform_joint": machine.platform_joint,
-            "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
-            "home": motion_to_xyz_quat(machine.home),
-            **({"home_readings": home} if home else {}),
-            **({"motors": stated} if stated else {}),
-            **machine.tolerance.entries,
-            **({} if machine.spline_teeth is None else {"spline_teeth": machine.spline_teeth}),
-            **{key: x for key in ("reach", "floor") if math.isfinite(x := getattr(machine, key))},
-            "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
-        },
-    )
+    return {
+        "urdf": urdf,
+        "base": machine.base,
+        "platform": machine.platform,
+        "platform_joint": machine.platform_joint,
+        "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
+        "home": motion_to_xyz_quat(machine.home),
+        **({"home_readings": home} if home else {}),
+        **({"motors": stated} if stated else {}),
+        **machine.tolerance.entries,
+        **({} if machine.spline_teeth is None else {"spline_teeth": machine.spline_teeth}),
+        **{key: x for key in ("reach", "floor") if math.isfinite(x := getattr(machine, key))},
+        "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
+    }
 
 
 def model_name(machine: Machine) -> str:
@@ -144,7 +147,6 @@ def write_calibrated_yaml(
     gains = {a.joint: a.gain for a in actuators_of(legs)}
     there = machine if home is None else replace(machine, home=home)
     there = replace(there, legs=tuple(_with_gain(leg, gains) for leg in there.legs))
-    text = mechanism_text(there, urdf_name)
     stated = (
         {} if is_xml(machine.yaml_path) else read_yaml(machine.yaml_path, FILE_KIND, ModelError)
     )
@@ -158,9 +160,11 @@ def write_calibrated_yaml(
         changed = {"urdf"} | ({"home"} & block.keys() if home is not None else set())
         if any(a.gain != gains.get(a.joint, a.gain) for a in machine.actuators):
             changed.add("motors")
-        complete = yaml.safe_load(text)["legcal"]
+        complete = _legcal_block(there, urdf_name)
         stated["legcal"] = block | {key: complete.get(key) for key in changed}
         text = yaml_text(stated)
+    else:
+        text = mechanism_text(there, urdf_name)
     destination.write_bytes(text.encode("utf-8"))
 
 

@@ -15,7 +15,6 @@ from typing import Literal
 
 import numpy as np
 from lxml import etree
-from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
@@ -219,24 +218,29 @@ def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[l
 
     The links of each are in the order of the file.
     """
-    groups = DisjointSet(urdf.links)
-    for joint in urdf.joints.values():
-        if not joint.moves:
-            groups.merge(joint.parent, joint.child)
-    ground = groups[urdf.root]
-    on_ground = groups.subset(ground)
+    fixed = [(j.parent, j.child) for j in urdf.joints.values() if not j.moves]
+    on_ground = connected(urdf.links, fixed)[urdf.root]
     pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
     ends = [(urdf.link_of(first), urdf.link_of(second)) for first, second in closures]
-    for pair in (*pairs, *ends):
-        if on_ground.isdisjoint(pair):
-            groups.merge(*pair)
+    moving = [pair for pair in (*pairs, *ends) if on_ground.isdisjoint(pair)]
+    groups = connected(urdf.links, [*fixed, *moving])
     closed = {link for pair in ends for link in pair}
-    found = dict.fromkeys(groups[link] for link in urdf.links if link not in on_ground)
-    subsets = [groups.subset(name) for name in found]
+    found = {id(groups[link]): groups[link] for link in urdf.links if link not in on_ground}
     return [
         ([link for link in urdf.links if link in links], not closed.isdisjoint(links))
-        for links in subsets
+        for links in found.values()
     ]
+
+
+def connected(names: Iterable[str], pairs: Iterable[Sequence[str]]) -> dict[str, set[str]]:
+    """Return for each name the set, the same for all of them, of those that pairs connect it to."""
+    groups = {name: {name} for name in names}
+    for first, second in pairs:
+        group, joining = groups[first], groups[second]
+        if group is not joining:
+            group |= joining
+            groups.update(dict.fromkeys(joining, group))
+    return groups
 
 
 LoopKind = Literal["point", "weld"]

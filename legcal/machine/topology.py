@@ -14,7 +14,6 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial.transform import Rotation
 
 from legcal.errors import OutOfClass, Problem
@@ -34,7 +33,7 @@ from legcal.machine.classification import (
 from legcal.machine.files import LegcalBlock
 from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
-from legcal.machine.spanning_tree import Source
+from legcal.machine.spanning_tree import Source, connected
 from legcal.machine.urdf import Urdf
 
 Normals = tuple[Array, Array]
@@ -453,11 +452,9 @@ def _several_bodies(
     joint, a part of the platform by the joints of several legs.
     """
     base, platform = ends
-    groups = DisjointSet(name for c in bodies.connections for name in c.bodies)
-    for connection in bodies.connections:
-        if {*connection.bodies}.isdisjoint(ends):
-            groups.merge(*connection.bodies)
-    group = groups.subset(body)
+    names = [name for c in bodies.connections for name in c.bodies]
+    inside = [c.bodies for c in bodies.connections if {*c.bodies}.isdisjoint(ends)]
+    group = connected(names, inside)[body]
     on_base, on_platform = (
         [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
         for end in (base, platform)

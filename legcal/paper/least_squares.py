@@ -223,18 +223,37 @@ def inverse_of(information: Array) -> Array:
 
 def evaluated(function: ca.Function, local: Array, *observed: Array) -> Array:
     """Return the residuals (n, r) of a function of a term, of local unknowns (n, n_local)."""
-    n, none = len(local), np.zeros((len(local), function.size1_in(1)))
-    arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    return np.asarray(_mapped(function, n)(*arguments).full()).T if n else _nothing(function)
+    none = np.zeros((len(local), function.size1_in(1)))
+    values = _called(function, local, none, *observed).reshape(len(local), function.size1_out(0))
+    return np.asfortranarray(values)  # the layout of CasADi: products keep their last digits
 
 
 def derivatives(function: ca.Function, input_index: int, local: Array, *observed: Array) -> Array:
     """Return the derivatives (n, r, k) by the local unknowns (0) or the errors (1)."""
-    n, none = len(local), np.zeros((len(local), function.size1_in(1)))
-    r, k = function.size1_out(0), function.size1_in(input_index)
-    arguments = [_side_by_side(values) for values in (local, none, *observed)]
-    derivative = _mapped(_derivative(function, input_index), n)(*arguments).full()
-    return np.asarray(derivative.reshape(r, n, k).swapaxes(0, 1))
+    none = np.zeros((len(local), function.size1_in(1)))
+    by_column = _called(_derivative(function, input_index), local, none, *observed)
+    shape = len(local), function.size1_in(input_index), function.size1_out(0)
+    return np.ascontiguousarray(by_column.reshape(shape).transpose(2, 0, 1)).swapaxes(0, 1)
+
+
+def _called(function: ca.Function, *arguments: Array) -> Array:
+    """Return the dense values of a function of n observations, column by column.
+
+    CasADi reads and writes the memory of arrays: it would convert them number by number.
+    """
+    n = len(arguments[0])
+    values = np.zeros(n * function.nnz_out(0))
+    if n:
+        buffer, run = _mapped(function, n).buffer()
+        inputs = [
+            np.ascontiguousarray(x if x.ndim < 3 else np.swapaxes(x, 1, 2), dtype=np.float64)
+            for x in arguments
+        ]
+        for k, numbers in enumerate(inputs):
+            buffer.set_arg(k, numbers.data)  # type: ignore[call-arg]
+        buffer.set_res(0, values.data)  # type: ignore[call-arg]
+        run()
+    return values
 
 
 def adjusted(
@@ -259,10 +278,6 @@ def adjusted(
     left = covariance - gain @ np.swapaxes(mixed, 1, 2)
     chi = np.linalg.norm(whitener(spread) @ residual, axis=(1, 2))
     return -(gain @ residual)[..., 0], left / (_cauchy(chi) ** 2)[:, None, None], chi
-
-
-def _nothing(function: ca.Function) -> Array:
-    return np.zeros((0, function.size1_out(0)))
 
 
 @lru_cache(maxsize=64)
@@ -292,7 +307,7 @@ def _solver(problem: LeastSquares) -> ca.Function:
             continue
         place = np.where(term.index < 0, n, term.index)
         local = ca.reshape(unknowns[place.ravel().tolist()], place.shape[1], len(term))
-        values: list[ca.MX | Array] = [*map(_side_by_side, term.observed)]
+        values: list[ca.MX | ca.DM] = [ca.DM(_side_by_side(x)) for x in term.observed]
         if W.size1():
             values.insert(0, ca.reshape(W, term.n_rows, term.n_rows * len(term)))
         functions = _half_square(term.function, W.size1() > 0, problem.exact_hessian)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -120,15 +120,7 @@ class Task:
 
     def bodies(self, poses: Sequence[RigidTransform]) -> Bodies:
         """Place legs and arms at poses T_Rb_Re."""
-        machine, (R, t) = self.machine, components(poses)
-        return Bodies.at(
-            self.legs,
-            R,
-            t,
-            machine.size,
-            T_base_Rb=machine.T_base_Rb,
-            occluders=machine.occluders,
-        )
+        return _bodies(self.machine, self.legs, tuple(poses))
 
     def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
         """Return the parts visible at poses T_Rb_Re; *surely*: for all tripods in tolerance."""
@@ -203,6 +195,14 @@ class Task:
         """Return the information of the images of candidates."""
         poses = platforms_in_base(self.machine, candidates.poses.poses)
         return self.contributions(candidates.place.T_base_camera, poses, is_shot=is_shot)
+
+
+@lru_cache(maxsize=2)  # places are compared by the same poses
+def _bodies(machine: Machine, legs: tuple[Leg, ...], poses: tuple[RigidTransform, ...]) -> Bodies:
+    """Return :meth:`Task.bodies`."""
+    R, t = components(poses)
+    base, occluders = machine.T_base_Rb, machine.occluders
+    return Bodies.at(legs, R, t, machine.size, T_base_Rb=base, occluders=occluders)
 
 
 def plan_session(

@@ -20,7 +20,6 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.joint_fit.platform import PlatformAccuracy
 from legcal.calibration.joint_fit.sensitivity import INTRINSICS
-from legcal.calibration.pipeline import exact_cameras
 from legcal.calibration.summary import (
     DIGITS,
     brief_sentences,
@@ -115,6 +114,8 @@ def _written_beside(command: str) -> str:
 
 def next_steps(calibration: Calibration, folder: str, command: str) -> list[NextStep]:
     """Return what to do next, the first thing first; *command* has made the result, if any has."""
+    from legcal.calibration.pipeline import exact_cameras  # not needed to compare models
+
     result, steps = calibration.result, list[NextStep]()
     dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
 

@@ -472,7 +472,7 @@ def _crops(calibration: Calibration, numbers: Sequence[int]) -> tuple[dict[int, 
         if dataset.image_path(row) is None:
             continue
         try:
-            image = reader(row)
+            image = reader.levels(row)
         except LegcalError:
             missing += 1
             continue
@@ -494,7 +494,7 @@ def _cut(image: Image, ends: Array) -> tuple[Image, Array]:
     height, width = image.shape
     left, top = corner = np.clip(low, 0, [width - 1, height - 1])
     right, bottom = np.clip(high, corner + 1, [width, height])
-    return image[top:bottom, left:right].copy(), corner
+    return image[top:bottom, left:right].astype(np.float32), corner
 
 
 def _crop(calibration: Calibration, k: int, grey: Image, corner: Array, picture: Markup) -> Crop:

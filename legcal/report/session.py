@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from legcal.calibration.detection import DETECTION_PAGE, Examination, tables_of
-from legcal.data.new_dataset import NewDataset
 from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
@@ -21,6 +19,8 @@ from legcal.report.machine import scale_option, understood
 from legcal.report.render import Report, heading, report, table
 
 if TYPE_CHECKING:
+    from legcal.calibration.detection import Examination
+    from legcal.data.new_dataset import NewDataset
     from legcal.recordings.importing import Import
 
 _MOST = 200  # largest number of rows shown
@@ -142,6 +142,8 @@ def import_table(recording_import: Import) -> Report:
 
 def examination_table(examination: Examination, output: Path | None = None) -> Report:
     """Return the text of ``legcal doctor`` and ``legcal detect``; *output* is the folder."""
+    from legcal.calibration.detection import DETECTION_PAGE, tables_of  # not needed to simulate
+
     return report(
         heading(printable(examination.mechanism), f": {printable(examination.dataset)}"),
         *map(_with_dashes, tables_of(examination)),

@@ -402,8 +402,9 @@ class Bodies:
     ) -> Bodies:
         """Place legs at poses."""
         T = RigidTransform.identity() if T_base_Rb is None else T_base_Rb
-        A, B = ends_in_base(legs, T, R, t)
-        arms = arms_at(legs, readings_of_rods(legs, R, t))
+        q = readings_of_rods(legs, R, t)
+        A, B = ends_in_base(legs, T, R, t, q)
+        arms = arms_at(legs, q)
         ends = [T.apply(arm.reshape(-1, 3)).reshape(arm.shape) for arm in arms.values()]
         near, far = ([arm[:, k : k + 1] for arm in ends] for k in (0, 1))
         cylinders = ([cylinder_of_arm(arm)] for leg in legs if (arm := leg.arm) is not None)

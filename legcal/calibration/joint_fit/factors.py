@@ -148,7 +148,7 @@ class ObservedOutlines:
     polished: frozenset[tuple[int, str]] = frozenset()  # parts with polished surfaces
     memory: Memory = field(default_factory=Memory, repr=False)  # of the predicted offsets
 
-    @property
+    @cached_property
     def width_px(self) -> float:
         """Median width of cylinders with both edges measured [px]; infinite without any."""
         direction = self.pixels[:, 1] - self.pixels[:, 0]

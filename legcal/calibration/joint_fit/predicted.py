@@ -327,7 +327,7 @@ class _Images:
             untied = null_space(problem.parameters.tie_rows(state.legs)[1])
         basis = np.zeros((len(problem.free), untied.shape[1]))
         # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
-        basis[problem.free] = problem.parameters.jacobian(state.legs) @ untied
+        basis[problem.free] = problem.jacobian(state)[:k, :k] @ untied
         turn = block_diag(untied, np.eye(problem.n_kept - k))
         named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
         if not is_fit:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -407,7 +407,7 @@ def _kinematic(
         unknown,
         tuple(u for u, is_free in units if is_free),
         parameters.coordinates,
-        parameters.jacobian if parameters.turns else None,
+        lru_cache(maxsize=1)(parameters.jacobian) if parameters.turns else None,
         prior=prior,
     )
     return parameters, block
