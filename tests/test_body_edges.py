@@ -142,6 +142,33 @@ def test_the_part_of_a_mesh_that_has_one_section_is_a_body(with_bodies: Path) ->
     assert body.radius == pytest.approx(box.radius, rel=1e-3)
 
 
+def _plates(*places: float) -> Any:
+    plate = trimesh.creation.box((0.004, 0.030, 0.110))
+    return trimesh.util.concatenate([plate.copy().apply_translation((x, 0, 0)) for x in places])
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        pytest.param(_plates(-0.013, 0.013), id="the two plates of a fork"),
+        pytest.param(trimesh.creation.cylinder(0.015, 0.110, sections=13), id="13 sides"),
+    ],
+)
+def test_what_is_open_or_round_is_no_body(mesh: Any, tmp_path: Path) -> None:
+    """A camera sees the rod between the plates, and facets of a round mesh are no edges."""
+    file = f"body{len(mesh.faces)}.stl"
+    drawn = BODY.replace('<box size="0.03 0.03 0.11"/>', f'<mesh filename="{file}"/>')
+    drawn = drawn.replace("0.004 -0.003", "0 0")
+    model = copied_model(
+        tmp_path, "hexapod", lambda text: re.sub('<link name="leg1_tube">', rf"\g<0>{drawn}", text)
+    )
+    mesh.export(model.parent.parent / "urdf" / file)
+    machine = load_mechanism(model)
+    assert len(machine.occluders) == 1
+    assert not any(bodies_of(machine.occluders, 6))
+    assert all(bool(rod.covers) == mesh.is_convex for rod in machine.legs[0].cylinders)
+
+
 def test_a_leg_with_a_body_alone_is_identified_and_calibrated(
     with_bodies: Path, tmp_path: Path
 ) -> None:

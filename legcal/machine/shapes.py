@@ -411,11 +411,10 @@ def prismatic_part(corners: Array, triangles: IntArray) -> Array | None:
     part = _constant_part(corners, triangles, -np.inf, np.inf, _reach_of_contour)
     if part is None:
         return None
-    reach, low, high = part
-    if np.ptp(reach) <= ROUND * reach.max():
+    _, low, high = part
+    contour = _contour(corners[triangles], 0.5 * (low + high))
+    if np.isfinite(_radius_of_contour(contour)).all():
         return None
-    shapes = corners[triangles]
-    contour = _contour(shapes, 0.5 * (low + high))
     return np.concatenate(
         [np.column_stack([contour, np.full(len(contour), z)]) for z in (low, high)]
     )
@@ -817,13 +816,20 @@ def occluders_of(
             continue
         carrier, T = places[body]
         corners = matrix_applied(matrix_product(T, bodies.T_body_link[solid.link]), solid.corners)
-        parts = [Occluder(solid.link, carrier, corners, solid.triangles)]
+        parts = [whole := Occluder(solid.link, carrier, corners, solid.triangles)]
         if solid.triangles is not None and isinstance(carrier, LegHalf):
             prismatic = prismatic_part(corners, solid.triangles)
-            if prismatic is not None:
+            if prismatic is not None and _surrounds(whole, prismatic):
                 parts.append(Occluder(solid.link, carrier, prismatic))
         occluders += [_swept(part) for part in parts if not _is_flat(part)]
     return tuple(occluders)
+
+
+def _surrounds(mesh: Occluder, prismatic: Array) -> bool:
+    """Whether a mesh is all around the axis of its leg along a part: no fork, nor guide rods."""
+    low, high = prismatic[:, 2].min(), prismatic[:, 2].max()
+    closed = sum(max(0.0, min(b, high) - max(a, low)) for a, b in _enclosed(mesh, 0.0))
+    return bool(closed > 0.5 * (high - low))
 
 
 def _is_flat(occluder: Occluder) -> bool:
