@@ -69,9 +69,9 @@ def taken(background: Grey, moves: list[Move], seed: int = 0) -> list[Grey]:
 
 
 def found_in(images: list[Grey]) -> dict[int, Move]:
-    n = len(images)
+    n, (height, width) = len(images), images[0].shape
     measurements = Measurements(
-        views=(View("c1", Camera(K, WIDTH, HEIGHT)),),
+        views=(View("c1", Camera(K, width, height)),),
         view=np.zeros(n, dtype=np.intp),
         pose=np.arange(n),
         image=tuple(f"{k}.png" for k in range(n)),
@@ -111,6 +111,21 @@ def test_what_stood_still_shows_little_or_another_scene_is_left_alone() -> None:
     images = taken(background, shaken)
     images[2] = taken(texture(2), shaken)[2]
     assert sorted(found_in(images)) == [0, 1, 3, 4, 5, 6]
+
+
+def test_a_strip_of_structure_shows_no_turn_and_leaves_images_alone() -> None:
+    """As the edge of a floor below a plain wall does."""
+    strip = np.full_like(texture(4), 110.0)
+    strip[-40:] = texture(4)[-40:]
+    assert found_in(taken(strip, [move(0.7 * k) for k in range(N)])) == {}
+
+
+def test_moves_are_found_in_tall_images() -> None:
+    tall = cv2.resize(texture(6), (360, 1440))
+    noise = np.random.default_rng(0).normal(size=(N, *tall.shape)).astype(np.float32)
+    found = found_in([np.roll(tall, k, axis=0) + noise[k] for k in range(N)])
+    down = [found[k].y for k in range(N)]
+    np.testing.assert_allclose(np.diff(down), 1.0, atol=0.02)
 
 
 def test_legs_are_found_as_if_the_camera_had_stood_still(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from legcal.workers import Run
 
 LONG_SIDE = 1200  # about which images are reduced [px]
 TILE, MARGIN = 24, 4  # side of a square, and how far around it is looked [px]
-ACROSS = 16  # squares beside each other
+ACROSS = 16  # squares beside each other along the longer side
 MIN_IMAGES = 5  # of a view
 MOST_IMAGES = 60  # of a view by which its background is known, and at a time
 MIN_TILES, MIN_SHARE = 12, 0.35  # squares that show something, and the share of these that agree
@@ -38,6 +38,7 @@ ROUNDS = 10
 READ = 1.0 / 32.0  # steps in which OpenCV reads between pixels [px]
 SMOOTHING, NEAR = 2.5, 0.5  # of squares while steps are larger: far shifts are found [px]
 SETTLED = 0.01  # change of shifts at which no further round is needed [px]
+FAR = 100.0  # standard deviation of moves of which the background shows nothing [px]
 CUT = 4.0  # standard deviations beyond which a square does not count
 WEIGHED_ROUNDS = 10
 LEAST_MOVE, MAX_SIGMA = 0.1, 0.05  # of an image, to be corrected [px]
@@ -102,7 +103,7 @@ def _factor(size: tuple[int, int]) -> int:
 def _places(size: tuple[int, int]) -> tuple[IntArray, Array]:
     """Return first pixels (n, 2) of squares of a reduced image, and their middles from its own."""
     reduced = np.array(size) // _factor(size)
-    n = ACROSS, max(4, round(ACROSS * size[1] / size[0]))
+    n = [max(4, round(ACROSS * side / max(size))) for side in size]
     first = [
         np.linspace(0, side - TILE - 2 * MARGIN, k).astype(np.intp)
         for side, k in zip(reduced.tolist(), n, strict=True)
@@ -199,7 +200,9 @@ def _motions(
         off = _inside(still[shown] - image[shown]).reshape(len(slope), -1)
         pull = np.einsum("kpd,kp->kd", slope, off)
         shift = np.linalg.solve(information, pull[..., None])[..., 0]
-        motion[i], covariance, share = _common(at[i, shown] + shift, weighed, by_motion[shown])
+        motion[i], covariance, share = _common(
+            at[i, shown] + shift, weighed, by_motion[shown], everywhere / FAR**2
+        )
         if share >= MIN_SHARE:
             sigma[i] = float(np.sqrt(0.5 * np.sum(covariance * everywhere)))
     return motion, sigma
@@ -229,11 +232,13 @@ def _information(still: Samples) -> tuple[Array, Array]:
     return np.einsum("kpd,kpe->kde", slope, slope), slope
 
 
-def _common(shift: Array, information: Array, by_motion: Array) -> tuple[Array, Array, float]:
+def _common(
+    shift: Array, information: Array, by_motion: Array, prior: Array
+) -> tuple[Array, Array, float]:
     """Return the motion (6,) that most squares share, its covariance, and their share.
 
     Shifts (n, 2) of squares have this information (n, 2, 2); the weights of those that disagree
-    vanish (Tukey's biweight).
+    vanish (Tukey's biweight). What squares in one row do not show has the information of the prior.
     """
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     y, X = np.einsum("kij,kj->ki", root, shift), root @ by_motion
@@ -243,7 +248,7 @@ def _common(shift: Array, information: Array, by_motion: Array) -> tuple[Array, 
         off = np.linalg.norm(y - X @ motion, axis=1)
         scale = max(1.0, 1.2 * float(np.median(off)))
         weight = np.maximum(1.0 - (off / (CUT * scale)) ** 2, 0.0) ** 2
-        normal = np.einsum("k,kij,kil->jl", weight, X, X)
+        normal = np.einsum("k,kij,kil->jl", weight, X, X) + prior
         before, motion = motion, np.linalg.solve(normal, np.einsum("k,kij,ki->j", weight, X, y))
         if np.abs(motion - before)[:2].max() < 0.03 * SETTLED:
             break
