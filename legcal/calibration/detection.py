@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,7 +36,13 @@ from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.causes import Cause
 from legcal.data.corners import Corners, join_corners, write_corners
-from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, ImageReader
+from legcal.data.dataset import (
+    CORNERS_NAME,
+    OBSERVATIONS_NAME,
+    Dataset,
+    ImageReader,
+    rows_with_image,
+)
 from legcal.data.image_tables import inverse
 from legcal.data.landmarks import LANDMARKS_NAME, SIGMA_PX, joint_names
 from legcal.data.measurements import few_views, image_notes, places, row_names
@@ -212,13 +217,6 @@ def unique_names(names: Iterable[str]) -> list[str]:
         taken.add(chosen.lower())
         unique.append(chosen)
     return unique
-
-
-def rows_with_image(dataset: Dataset) -> IntArray:
-    """Return the rows that have an image file."""
-    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    rows = [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
-    return np.array(rows, dtype=np.intp)
 
 
 def require_images(dataset: Dataset) -> IntArray:

@@ -18,7 +18,7 @@ from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
 from legcal.causes import Cause, by_cause
 from legcal.data.cache import DetectionPlan, plan_dataset
-from legcal.data.dataset import Dataset
+from legcal.data.dataset import Dataset, rows_with_image
 from legcal.data.image_choice import dataset_at, images_to_name
 from legcal.data.image_tables import (
     Order,
@@ -248,11 +248,18 @@ def order_dataset(
 
 
 def _with_moves(dataset: Dataset, plan: DetectionPlan, pool: Run, progress: Report) -> Dataset:
-    """Return a dataset that reads images as if each camera had stood still between them."""
+    """Return a dataset that reads images as if each camera had stood still between them.
+
+    Given outlines are those of aligned images, too: all images of a view are compared with which
+    others are measured, or in which boards are looked for.
+    """
     m, moves = dataset.measurements, plan.moves
-    if len(plan.detect):
+    is_read = np.isin(m.view, m.view[plan.detect])
+    if not plan.is_cached:
+        is_read |= bool(dataset.boards) and dataset.corners is None
+        rows = [row for row in rows_with_image(dataset).tolist() if is_read[row]]
         load = dataset.image_reader(range(m.n_rows))
-        found = camera_moves(load, m, plan.detect.tolist(), pool, progress)
+        found = camera_moves(load, m, rows, pool, progress)
         moves = {m.image[row]: move for row, move in found.items()}
     notes = (*dataset.file_notes, *notes_on_moves(m, moves))
     return replace(dataset, moves=moves, file_notes=notes) if moves else dataset

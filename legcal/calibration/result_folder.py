@@ -21,7 +21,6 @@ from legcal.calibration.detection import (
     Detection,
     draw_images,
     is_overlay,
-    rows_with_image,
 )
 from legcal.calibration.documents import (
     ParameterRow,
@@ -34,7 +33,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.result import REFUSED, Calibration, Verdict
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import write_corners
-from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset
+from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, Dataset, rows_with_image
 from legcal.data.outlines import with_body_edges, write_observations
 from legcal.errors import (
     DatasetError,

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError
 
-from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
+from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset, rows_with_image
 from legcal.data.image_tables import canonical_order, reorder_measurements
 from legcal.data.measurements import places
 from legcal.data.outlines import (
@@ -85,10 +85,7 @@ def plan_detection(
 def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     """Return :func:`plan_detection` for a dataset with the files in its folder."""
     entry = _read_entry(dataset.folder / CACHE_NAME)
-    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    has_image = np.array(
-        [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
-    )
+    has_image = np.isin(np.arange(dataset.measurements.n_rows), rows_with_image(dataset))
     given_names = set(entry.given) if entry else set()
     from_user = np.array(
         [name in given_names for name in places(dataset.measurements)], dtype=np.bool_
@@ -100,6 +97,12 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     if entry is None or recorded != current or len(plan.detect):
         return plan
     return replace(plan, notes=entry.notes, is_cached=True, moves=entry.moves)
+
+
+def with_kept_moves(dataset: Dataset) -> Dataset:
+    """Return a dataset whose images are shown as its kept outlines have them."""
+    entry = _read_entry(dataset.folder / CACHE_NAME)
+    return dataset if entry is None else replace(dataset, moves=entry.moves)
 
 
 def note_on_missing_photographs(dataset: Dataset) -> list[str]:

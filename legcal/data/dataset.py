@@ -51,6 +51,7 @@ from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
 from legcal.files.motions import motion_from_xyz_quat
 from legcal.files.schema import closest, describe, few
+from legcal.geometry.types import IntArray
 from legcal.machine.files import shipped_folder, shipped_names
 from legcal.machine.leg import Link
 from legcal.machine.loader import load_mechanism
@@ -124,6 +125,13 @@ class Dataset:
     def where(self, row: int) -> Place:
         """Return the place of a row in its table."""
         return Place(str(self.table_path), row + 1)
+
+
+def rows_with_image(dataset: Dataset) -> IntArray:
+    """Return the rows that have an image file."""
+    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
+    rows = [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
+    return np.array(rows, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,9 +64,10 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Subject
                 f"--dataset could not be used: found the dataset {path} beside it, needed a result "
                 "or a model; leave one of them out."
             )
+        from legcal.data.cache import with_kept_moves
         from legcal.data.dataset import load_dataset
 
-        loaded = load_dataset(path, check_images=False)
+        loaded = with_kept_moves(load_dataset(path, check_images=False))
         return Subject(loaded.machine, str(given), dataset=loaded)
     subject = load_subject(given)
     if dataset is None:
@@ -76,9 +77,10 @@ def open_source(given: str | Path, dataset: str | Path | None = None) -> Subject
 
 def _session(machine: Machine, given: str | Path, result: EarlierResult | None) -> Dataset:
     """Return the session of a machine, with the outlines that its calibration used."""
+    from legcal.data.cache import with_kept_moves
     from legcal.data.dataset import OBSERVATIONS_NAME, load_dataset, read_observed
 
-    dataset = load_dataset(given, check_images=False)
+    dataset = with_kept_moves(load_dataset(given, check_images=False))
     names = dataset.machine.leg_names
     if sorted(names) != sorted(machine.leg_names):
         raise UsageError(
