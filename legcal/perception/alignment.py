@@ -140,7 +140,7 @@ def _moves_of_view(
     at = np.zeros((*tiles.shape[:2], 2))  # the shifts at which squares are read
     for _ in range(ROUNDS):
         before = motion
-        behind = np.median(now, axis=0) if still is None else still
+        behind = _background(now, sharp=not motion.any()) if still is None else still
         if smooth:
             motion, sigma = _motions(_smooth(now), _smooth(behind[None])[0], at, *model)
         else:
@@ -165,6 +165,13 @@ def _moves_of_view(
     motion *= np.array([factor, factor, 1.0, 1.0, 1.0 / factor, 1.0 / factor])
     moves = zip(known.tolist(), motion.tolist(), strict=True)
     return [Move(*own) if is_known else None for is_known, own in moves], np.median(now, axis=0)
+
+
+def _background(tiles: Samples, *, sharp: bool) -> Samples:
+    """Return the median of images, or, where they may be far apart, the one nearest to it."""
+    middle = np.median(tiles, axis=0)
+    off = np.abs(tiles - middle).mean(axis=(1, 2, 3))
+    return tiles[int(np.argmin(off))] if sharp else middle
 
 
 def _smooth(tiles: Samples) -> Samples:
