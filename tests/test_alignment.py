@@ -13,6 +13,7 @@ from simulated import settings, small_camera, standing
 
 from legcal import detect, load_dataset, simulate
 from legcal.data.measurements import Measurements, View
+from legcal.data.photograph_notes import notes_on_moves
 from legcal.geometry.types import Array
 from legcal.perception.alignment import camera_moves
 from legcal.progress import no_progress
@@ -68,9 +69,8 @@ def taken(background: Grey, moves: list[Move], seed: int = 0) -> list[Grey]:
     return images
 
 
-def found_in(images: list[Grey]) -> dict[int, Move]:
-    n, (height, width) = len(images), images[0].shape
-    measurements = Measurements(
+def measured(n: int, width: int, height: int) -> Measurements:
+    return Measurements(
         views=(View("c1", Camera(K, width, height)),),
         view=np.zeros(n, dtype=np.intp),
         pose=np.arange(n),
@@ -78,7 +78,12 @@ def found_in(images: list[Grey]) -> dict[int, Move]:
         q=np.zeros((n, 1)),
         sigma_q=1e-5,
     )
-    return camera_moves(images.__getitem__, measurements, range(n), in_turn, no_progress)
+
+
+def found_in(images: list[Grey]) -> dict[int, Move]:
+    n, (height, width) = len(images), images[0].shape
+    rows = measured(n, width, height)
+    return camera_moves(images.__getitem__, rows, range(n), in_turn, no_progress)
 
 
 @given(seed=st.integers(0, 99), size=st.floats(0.3, 1.5))
@@ -111,6 +116,13 @@ def test_what_stood_still_shows_little_or_another_scene_is_left_alone() -> None:
     images = taken(background, shaken)
     images[2] = taken(texture(2), shaken)[2]
     assert sorted(found_in(images)) == [0, 1, 3, 4, 5, 6]
+
+
+def test_the_note_on_moves_counts_the_corners() -> None:
+    """An autofocus moves these alone."""
+    images = [f"{k}.png" for k in range(2)]
+    (note,) = notes_on_moves(measured(2, WIDTH, HEIGHT), {images[1]: move(0.0, zoom=0.01)})
+    assert "moves by up to 4.0 px" in note
 
 
 def test_a_strip_of_structure_shows_no_turn_and_leaves_images_alone() -> None:

@@ -7,7 +7,6 @@ not compared, and neither are missing values. Every note names the images.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -257,12 +256,14 @@ def notes_on_moves(measurements: Measurements, moves: Mapping[str, Move]) -> lis
     most: dict[str, float] = {}
     for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
         if image in moves:
-            view, move = measurements.views[v], moves[image]
-            most[view.name] = max(math.hypot(move.x, move.y), most.get(view.name, 0.0))
+            view = measurements.views[v]
+            far = moves[image].farthest(view.camera.width, view.camera.height)
+            most[view.name] = max(far, most.get(view.name, 0.0))
     if not most:
         return []
     return [
         f"The camera of {few_views(list(most))} did not stand still: its background moves by up to "
         f"{max(most.values()):.1f} px from image to image. They were aligned by it. For the next "
-        "session, release the shutter without touching the camera, and turn stabilisation off."
+        "session, release the shutter without touching the camera, and turn stabilisation and "
+        "autofocus off."
     ]

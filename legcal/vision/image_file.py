@@ -601,6 +601,12 @@ class Move(NamedTuple):
             ]
         )
 
+    def farthest(self, width: int, height: int) -> float:
+        """Return by how much the corner of an image that moves most is moved [px]."""
+        corners = 0.5 * np.array([[x, y, 2.0] for x in (-width, width) for y in (-height, height)])
+        there = corners @ self.homography.T
+        return float(np.linalg.norm((there / there[:, 2:] - corners)[:, :2], axis=1).max())
+
     def undone(self, grey: Grey) -> Grey:
         """Return an image as if the camera had stood still."""
         height, width = grey.shape
