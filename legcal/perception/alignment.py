@@ -40,6 +40,7 @@ SMOOTHING, NEAR = 2.5, 0.5  # of squares while steps are larger: far shifts are 
 SETTLED = 0.01  # change of shifts at which no further round is needed [px]
 CUT = 4.0  # standard deviations beyond which a square does not count
 WEIGHED_ROUNDS = 10
+FAR = 1e3  # standard deviation of moves before any image is seen: squares may not tell all [px]
 LEAST_MOVE, MAX_SIGMA = 0.1, 0.05  # of an image, to be corrected [px]
 SIGMAS = 10.0
 
@@ -199,7 +200,9 @@ def _motions(
         off = _inside(still[shown] - image[shown]).reshape(len(slope), -1)
         pull = np.einsum("kpd,kp->kd", slope, off)
         shift = np.linalg.solve(information, pull[..., None])[..., 0]
-        motion[i], covariance, share = _common(at[i, shown] + shift, weighed, by_motion[shown])
+        motion[i], covariance, share = _common(
+            at[i, shown] + shift, weighed, by_motion[shown], everywhere / FAR**2
+        )
         if share >= MIN_SHARE:
             sigma[i] = float(np.sqrt(0.5 * np.sum(covariance * everywhere)))
     return motion, sigma
@@ -229,11 +232,13 @@ def _information(still: Samples) -> tuple[Array, Array]:
     return np.einsum("kpd,kpe->kde", slope, slope), slope
 
 
-def _common(shift: Array, information: Array, by_motion: Array) -> tuple[Array, Array, float]:
+def _common(
+    shift: Array, information: Array, by_motion: Array, prior: Array
+) -> tuple[Array, Array, float]:
     """Return the motion (6,) that most squares share, its covariance, and their share.
 
-    Shifts (n, 2) of squares have this information (n, 2, 2); the weights of those that disagree
-    vanish (Tukey's biweight).
+    Shifts (n, 2) of squares have this information (n, 2, 2), the motion that of its *prior* (6, 6);
+    the weights of squares that disagree vanish (Tukey's biweight).
     """
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     y, X = np.einsum("kij,kj->ki", root, shift), root @ by_motion
@@ -243,7 +248,7 @@ def _common(shift: Array, information: Array, by_motion: Array) -> tuple[Array, 
         off = np.linalg.norm(y - X @ motion, axis=1)
         scale = max(1.0, 1.2 * float(np.median(off)))
         weight = np.maximum(1.0 - (off / (CUT * scale)) ** 2, 0.0) ** 2
-        normal = np.einsum("k,kij,kil->jl", weight, X, X)
+        normal = np.einsum("k,kij,kil->jl", weight, X, X) + prior
         before, motion = motion, np.linalg.solve(normal, np.einsum("k,kij,ki->j", weight, X, y))
         if np.abs(motion - before)[:2].max() < 0.03 * SETTLED:
             break
