@@ -33,6 +33,7 @@ MIN_IMAGES = 5  # of a view
 MOST_IMAGES = 60  # of a view by which its background is known, and at a time
 MIN_TILES, MIN_SHARE = 12, 0.35  # squares that show something, and the share of these that agree
 SHARP = 0.1  # standard deviation of the shift of a square that shows something, at most [px]
+STRIDE = 4  # squares, and their rows, that are enough for medians
 LEAST_NOISE = 0.3  # of pixels [grey levels]
 ROUNDS = 10
 READ = 1.0 / 32.0  # steps in which OpenCV reads between pixels [px]
@@ -141,7 +142,7 @@ def _moves_of_view(
     at = np.zeros((*tiles.shape[:2], 2))  # the shifts at which squares are read
     for _ in range(ROUNDS):
         before = motion
-        behind = np.median(now, axis=0) if still is None else still
+        behind = _background(now, sharp=not motion.any()) if still is None else still
         if smooth:
             motion, sigma = _motions(_smooth(now), _smooth(behind[None])[0], at, *model)
         else:
@@ -168,6 +169,15 @@ def _moves_of_view(
     return [Move(*own) if is_known else None for is_known, own in moves], np.median(now, axis=0)
 
 
+def _background(tiles: Samples, *, sharp: bool) -> Samples:
+    """Return the median of images, or, where they may be far apart, the one nearest to it."""
+    if not sharp:
+        return np.asarray(np.median(tiles, axis=0))
+    some = tiles[:, ::STRIDE]
+    off = np.abs(some - np.median(some, axis=0)).mean(axis=(1, 2, 3))
+    return np.asarray(tiles[int(np.argmin(off))])
+
+
 def _smooth(tiles: Samples) -> Samples:
     """Return blurred squares."""
     blurred = [cv2.GaussianBlur(np.moveaxis(own, 0, 2), (0, 0), SMOOTHING) for own in tiles]
@@ -187,7 +197,8 @@ def _motions(
     With the standard deviation of shifts (n_images,) [px], rms over all places, infinite where few
     squares agree.
     """
-    noise = 1.4826 * np.median(np.abs(tiles - still), axis=(0, 2, 3))
+    off = np.abs(tiles[:, :, ::STRIDE] - still[:, ::STRIDE])
+    noise = 1.4826 * np.median(off, axis=(0, 2, 3))
     noise = np.maximum(noise, LEAST_NOISE)
     information, slope = _information(still)
     shown = np.linalg.eigvalsh(information)[:, 0] > (noise / SHARP) ** 2
