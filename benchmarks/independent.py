@@ -42,6 +42,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,16 +61,8 @@ from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
 
 VARIANTS = (
-    "none",
-    "rough",
-    "half",
-    "jpeg60",
-    "jpeg85",
-    "gamma",
-    "radii",
-    "shaken",
-    "meshes",
-    "clicks",
+    *("none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii"),
+    *("shaken", "meshes", "clicks"),
 )
 CLICK_PX = 3.0  # noise of clicks
 SHAKE_PX = 1.0  # of a camera that does not stand still
@@ -194,7 +187,8 @@ def draw_meshes(folder: Path) -> None:
         parts = [trimesh.creation.box(size).apply_translation(at) for size, at in sizes_at]
         motor = trimesh.creation.cylinder(0.4 * y, 0.2 * z).apply_translation((x, 0.0, -0.4 * z))
         name = f"body{found.start()}.stl"
-        trimesh.util.concatenate([*parts, motor]).export(file.with_name(name))
+        body: Any = trimesh.util.concatenate([*parts, motor])
+        body.export(file.with_name(name))
         return f'<mesh filename="{name}"/>'
 
     file.write_text(re.sub(r'<box size="([^"]*)"/>', as_mesh, file.read_text()))
