@@ -15,6 +15,7 @@ it lies there or otherwise:
     gamma      none, with the gamma of the camera left to be estimated
     radii      none, with the radii of the legs fixed
     shaken     none, with photographs by cameras that turn by 1 px from image to image (seed 1)
+    meshes     none, with the boxes of the model drawn as meshes: extrusions with plate and motor
     clicks     none, with landmarks.csv: the true joints in one picture of each view, as far as they
                are inside, with 3 px of noise (seed 1); where these have the cameras is printed
 
@@ -35,14 +36,17 @@ added to a file of JSON lines.
 
 import argparse
 import json
+import re
 import shutil
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
+import trimesh
 import yaml
 from real_cameras import normalised_square
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -56,7 +60,10 @@ from legcal.geometry.motions import components, pose_distance
 from legcal.machine.equations import pose_sensitivity
 from legcal.machine.parameters import geometries, vector_of
 
-VARIANTS = "none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii", "shaken", "clicks"
+VARIANTS = (
+    *("none", "rough", "half", "jpeg60", "jpeg85", "gamma", "radii"),
+    *("shaken", "meshes", "clicks"),
+)
 CLICK_PX = 3.0  # noise of clicks
 SHAKE_PX = 1.0  # of a camera that does not stand still
 OF_RADIUS = 0.3  # part of a radius within which a part is the rod whose contours are known
@@ -119,6 +126,8 @@ def varied(folder: Path, variant: str, copy: Path) -> None:
         file.write_text(yaml.safe_dump(content, sort_keys=False))
     if variant == "shaken":
         shake(copy)
+    if variant == "meshes":
+        draw_meshes(copy)
     if variant == "clicks":
         click_joints(copy, folder.with_name(folder.name + "-truth"))
     if variant == "half":
@@ -160,6 +169,29 @@ def shake(folder: Path) -> None:
         flags = cv2.INTER_LANCZOS4
         turned = cv2.warpPerspective(picture, H, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         cv2.imwrite(str(file), turned, [cv2.IMWRITE_JPEG_QUALITY, 98])
+
+
+def draw_meshes(folder: Path) -> None:
+    """Draw the boxes of a model as meshes, as CAD has extruded bodies."""
+    (file,) = (folder / "urdf").glob("*.urdf")
+
+    def as_mesh(found: re.Match[str]) -> str:
+        x, y, z = (float(size) for size in found[1].split())
+        groove = 0.1 * y
+        sizes_at = (
+            ((x - groove, y, z), (-0.5 * groove, 0.0, 0.0)),
+            ((groove, 0.5 * (y - groove), z), (0.5 * (x - groove), 0.25 * (y + groove), 0.0)),
+            ((groove, 0.5 * (y - groove), z), (0.5 * (x - groove), -0.25 * (y + groove), 0.0)),
+            ((1.1 * x, 1.1 * y, 0.03 * z), (0.0, 0.0, 0.485 * z)),
+        )
+        parts = [trimesh.creation.box(size).apply_translation(at) for size, at in sizes_at]
+        motor = trimesh.creation.cylinder(0.4 * y, 0.2 * z).apply_translation((x, 0.0, -0.4 * z))
+        name = f"body{found.start()}.stl"
+        body: Any = trimesh.util.concatenate([*parts, motor])
+        body.export(file.with_name(name))
+        return f'<mesh filename="{name}"/>'
+
+    file.write_text(re.sub(r'<box size="([^"]*)"/>', as_mesh, file.read_text()))
 
 
 def click_joints(folder: Path, truth: Path) -> None:

@@ -126,19 +126,20 @@ def test_the_note_on_moves_counts_the_corners() -> None:
     assert "moves by up to 4.0 px" in note
 
 
-def test_a_strip_of_structure_shows_no_turn_and_leaves_images_alone() -> None:
-    """As the edge of a floor below a plain wall does."""
-    strip = np.full_like(texture(4), 110.0)
-    strip[-40:] = texture(4)[-40:]
-    assert found_in(taken(strip, [move(0.7 * k) for k in range(N)])) == {}
-
-
 def test_moves_are_found_in_tall_images() -> None:
     tall = cv2.resize(texture(6), (360, 1440))
     noise = np.random.default_rng(0).normal(size=(N, *tall.shape)).astype(np.float32)
     found = found_in([np.roll(tall, k, axis=0) + noise[k] for k in range(N)])
     down = [found[k].y for k in range(N)]
     np.testing.assert_allclose(np.diff(down), 1.0, atol=0.02)
+
+
+def test_a_background_along_one_line_leaves_moves_open() -> None:
+    """As a shelf across the middle of the image, where a slant moves nothing."""
+    band = np.full((HEIGHT, WIDTH), 110.0, dtype=np.float32)
+    band[230:250] = texture(4)[230:250]
+    images = taken(band, [move(0.5 * k, 0.3 * k) for k in range(N)])
+    assert found_in([image[60:420] for image in images]) == {}
 
 
 def test_legs_are_found_as_if_the_camera_had_stood_still(tmp_path: Path) -> None:

@@ -257,6 +257,20 @@ def test_exchanged_legs_are_found_beside_another_that_names_one_of_them(
     assert sorted(cycle) == sorted([(second, third), (third, second)])
 
 
+def test_legs_are_not_taken_for_exchanged_where_the_others_lie_elsewhere_too() -> None:
+    """As where readings are wrong: two legs are near each other's place by chance."""
+    away, leg = np.full((6, 6), 0.4), np.repeat(np.arange(6), 6)
+    away[1, 2] = away[2, 1] = 0.01
+    assert list(_permuted(away[leg], leg)) == []
+    np.fill_diagonal(away, [0.002, 0.4, 0.4, 0.001, 0.002, 0.4])
+    (cycle,) = _permuted(away[leg], leg)
+    assert sorted(cycle) == [(1, 2), (2, 1)]
+    away, leg = np.full((3, 3), 0.4), np.repeat(np.arange(3), 6)
+    away[[0, 1, 2], [1, 2, 0]] = 0.01  # as from a symmetric place, where images do not agree
+    assert list(_permuted(away[leg], leg, of_all=False)) == []
+    assert len(list(_permuted(away[leg], leg))) == 1
+
+
 def _misnamed(d: Dataset, names: dict[int, int]) -> Dataset:
     """Give outlines of the second view the names of other legs."""
     given, m, legs = d.observations, d.measurements, d.machine.legs

@@ -14,7 +14,7 @@ from command_line import run
 from csv_rows import read_rows, write_rows
 from edits import keyed
 from hexapod_example import ROOT
-from machines import copied_model, created_hexapod, regular
+from machines import created_hexapod, regular
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from simulated import simulated
@@ -62,14 +62,6 @@ def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
         {"link": "leg1_b2_link", "radius": 0.01},
         {"link": "leg1_tube", "radius": 0.01},
     ]
-
-
-def test_a_home_that_plans_cannot_reach_is_noted(tmp_path: Path) -> None:
-    """A floor in millimetres, which no pose is above."""
-    path, beyond = copied_model(tmp_path, "hexapod"), "beyond legcal.reach or below legcal.floor"
-    for floor, is_noted in ((0.1, False), (100.0, True)):
-        keyed(path.name, legcal__floor=floor, legcal__reach=0.2)(path.parent)
-        assert (beyond in " ".join(_described(path)["diagnostics"])) is is_noted
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,17 @@ def test_a_signal_is_answered_while_libraries_are_loaded(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_second_signal_ends_the_process(tmp_path: Path) -> None:
+    process = _started(tmp_path / "out")
+    process.send_signal(signal.SIGINT)
+    while process.poll() is None and answers(process.pid):
+        time.sleep(0.001)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode in (130, -signal.SIGTERM)
+    assert said in ("", f"{STOPPED}\n")
+
+
 def test_nothing_that_takes_time_is_loaded_before_signals_are_answered() -> None:
     script = "import sys; import legcal.cli; sys.exit(len({'typer', 'numpy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

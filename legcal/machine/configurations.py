@@ -8,6 +8,7 @@ manifold of closed configurations. :func:`random_poses` samples the workspace, m
 collisions, and away from singularities on the way, too (:class:`Feasibility`).
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -118,7 +119,14 @@ def random_configurations(
             with suppress(DidNotConverge):  # joints of the chain do not turn so far
                 configurations.append(follow(mechanism, mechanism.home_configuration, q))
     else:
-        walk = _walk(mechanism, generator, lambda c: not beyond_travel(mechanism, c).any())
+        walk = _walk(
+            mechanism,
+            generator,
+            lambda c: (
+                not beyond_travel(mechanism, c).any()
+                and bool(mechanism.may_move_to(platform_pose(mechanism, c).translation))
+            ),
+        )
         for configuration in islice(walk, count):
             if configuration is None:
                 break
@@ -155,6 +163,8 @@ def _require(machine: Machine, count: int, n_reached: int) -> None:
     if n_reached == count:
         return
     remedy = f"check {machine.urdf.wording.home} and the limits of the sliders"
+    if math.isfinite(machine.reach) or math.isfinite(machine.floor):
+        remedy += ", and the reach and floor of the model"
     if machine.is_determined and singularity(machine, machine.home) < LOOSE:
         remedy = (
             "choose a home further from a singular pose, or joints that do not make the same "

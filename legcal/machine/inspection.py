@@ -203,13 +203,6 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
             f"{name} is at {reading} at home, outside its travel of {travel}; check the "
             f"limits, or {machine.urdf.wording.correct_home}."
         )
-    x, y, z = machine.home.translation
-    if not machine.may_move_to(machine.home.translation):
-        notes.append(
-            f"at home the platform is {np.hypot(x, y):.4g} m from the z axis of the base at z "
-            f"{z:.4g} m, beyond legcal.reach or below legcal.floor: no pose near home is planned; "
-            "correct these, in metres."
-        )
     notes += _level_note(machine, q)
     tied = ties_in_words(machine)
     notes += [] if tied is None else [tied]

@@ -88,6 +88,7 @@ from legcal.machine.urdf import Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
+_ROUNDING = 1e-9  # of home, which may lie on the floor [m]
 _METRES = "write all lengths in metres (are they millimetres?)"
 _NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 _DEVIATION = {  # messages, with an angle [deg]
@@ -199,6 +200,7 @@ def _load(source: Source) -> Machine:
         raise
     machine = replace(machine, home=pose, home_configuration=configuration)
     _check_unit(machine)
+    _check_reach(machine)
     # The geometry must agree with Pinocchio.
     _check_across(machine)
     configurations = generic_configurations(machine, CONFIGURATIONS)
@@ -663,6 +665,19 @@ def _check_frames(machine: Machine) -> None:
                 "three that span a plane" if n_d == 3 else "two that lie apart in the plane",
                 "choose other legs",
             )
+    problems.raise_if_any()
+
+
+def _check_reach(machine: Machine) -> None:
+    """Check that reach and floor let the platform be at home, from where all poses are drawn."""
+    problems, (x, y, z) = Problems(machine.yaml_path), machine.home.translation.tolist()
+    away, remedy = math.hypot(x, y), "write it in metres, or correct home"
+    if away > machine.reach + _ROUNDING:
+        found = f"{machine.reach:g} m, with home {away:.4g} m from the z axis of the base"
+        problems.add("the reach could not be used", found, "home inside it", remedy)
+    if z < machine.floor - _ROUNDING:
+        found = f"{machine.floor:g} m, with home at z = {z:.4g} m"
+        problems.add("the floor could not be used", found, "home above it", remedy)
     problems.raise_if_any()
 
 

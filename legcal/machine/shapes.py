@@ -821,7 +821,7 @@ def occluders_of(
             prismatic = prismatic_part(corners, solid.triangles)
             if prismatic is not None and _surrounds(whole, prismatic):
                 parts.append(Occluder(solid.link, carrier, prismatic))
-        occluders += [_swept(part) for part in parts if not _is_flat(part)]
+        occluders += [swept for swept in map(_swept, parts) if not _is_flat(swept)]
     return tuple(occluders)
 
 

@@ -39,9 +39,9 @@ ROUNDS = 10
 READ = 1.0 / 32.0  # steps in which OpenCV reads between pixels [px]
 SMOOTHING, NEAR = 2.5, 0.5  # of squares while steps are larger: far shifts are found [px]
 SETTLED = 0.01  # change of shifts at which no further round is needed [px]
-FAR = 100.0  # standard deviation of moves of which the background shows nothing [px]
 CUT = 4.0  # standard deviations beyond which a square does not count
 WEIGHED_ROUNDS = 10
+FAR = 1e3  # standard deviation of moves before any image is seen: squares may not tell all [px]
 LEAST_MOVE, MAX_SIGMA = 0.1, 0.05  # of an image, to be corrected [px]
 SIGMAS = 10.0
 
@@ -248,8 +248,8 @@ def _common(
 ) -> tuple[Array, Array, float]:
     """Return the motion (6,) that most squares share, its covariance, and their share.
 
-    Shifts (n, 2) of squares have this information (n, 2, 2); the weights of those that disagree
-    vanish (Tukey's biweight). What squares in one row do not show has the information of the prior.
+    Shifts (n, 2) of squares have this information (n, 2, 2), the motion that of its *prior* (6, 6);
+    the weights of squares that disagree vanish (Tukey's biweight).
     """
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     y, X = np.einsum("kij,kj->ki", root, shift), root @ by_motion

@@ -104,7 +104,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     if not groups:
         return None
     judge = _Judge(data, groups)
-    if judge.own.images > _AGREE_ALREADY * len(judge.own.row):
+    if judge.agree_already:
         return judge.exchanged_legs() or None
     common = mistakes(data)
     tried = [
@@ -204,6 +204,11 @@ class _Judge:
         self.own = Agreement.joined(self.of_groups)
         self.symmetries = symmetries(data.machine)
 
+    @property
+    def agree_already(self) -> bool:
+        """Whether nearly all images agree as given."""
+        return self.own.images > _AGREE_ALREADY * len(self.own.row)
+
     def exchanged_legs(self) -> tuple[Diagnosis, ...]:
         """Return given outlines with the names of other legs, where all else in images agrees."""
         m, machine = self.data.measurements, self.data.machine
@@ -213,7 +218,8 @@ class _Judge:
                 cameras |= group.cameras(one.cameras[0])
         ends = self.given.joints(range(m.n_rows))
         of_views = [cameras.get(v) for v in range(len(m.views))]
-        return exchanged_legs(self.data.photographs.keep, m, machine.legs, ends, of_views)
+        given = self.data.photographs.keep
+        return exchanged_legs(given, m, machine.legs, ends, of_views, of_all=self.agree_already)
 
     def in_some_images(self, tried: Sequence[Mistake]) -> list[Mistake]:
         """Return mistakes in the readings of images that follow each other in the file.

@@ -29,6 +29,8 @@ def exchanged_legs(
     # (n_rows, n_legs, 3): joints A and B in each image, in the base; NaN where they are not known
     ends: tuple[Array, Array],
     cameras: Sequence[RigidTransform | None],  # T_base_camera of each view, where it is known
+    *,
+    of_all: bool = True,  # also all legs of a view: a camera at a symmetric place sees the same
 ) -> tuple[Diagnosis, ...]:
     """Return legs whose outlines lie at each other's place in views."""
     o = along_legs(outlines, legs)
@@ -48,7 +50,7 @@ def exchanged_legs(
             off[of_view] = _distances(rays, A, B, radius[of_view])
     found = dict[tuple[tuple[int, int], ...], list[int]]()
     for v in range(len(cameras)):
-        for names in _permuted(off[at == v], o.leg[at == v]):
+        for names in _permuted(off[at == v], o.leg[at == v], of_all=of_all):
             found.setdefault(names, []).append(v)
     return tuple(_diagnosis(measurements, legs, o, off, *one) for one in found.items())
 
@@ -66,16 +68,22 @@ def _distances(rays: Array, A: Array, B: Array, radius: Array) -> Array:
     return np.asarray(np.abs(passes - radius[:, None, None]).max(axis=1))
 
 
-def _permuted(off: Array, leg: IntArray) -> Iterator[tuple[tuple[int, int], ...]]:
-    """Yield legs of a view with those whose place their outlines take, a cycle at a time."""
-    belongs = dict[int, int]()
+def _permuted(
+    off: Array, leg: IntArray, *, of_all: bool = True
+) -> Iterator[tuple[tuple[int, int], ...]]:
+    """Yield legs of a view with those whose place their outlines take, a cycle at a time.
+
+    Most of the other legs lie where they should: with wrong readings or another camera none does,
+    and some are near each other's place by chance.
+    """
+    median = dict[int, Array]()
     for j in np.unique(leg).tolist():
         of_leg = off[leg == j]
         if len(of_leg) >= _MIN_OUTLINES and np.isfinite(of_leg).all():
-            median = np.median(of_leg, axis=0)
-            k = int(np.argmin(median))
-            if median[k] < _NEARER * median[j]:
-                belongs[j] = k
+            median[j] = np.median(of_leg, axis=0)
+    nearest = {j: int(np.argmin(away)) for j, away in median.items()}
+    belongs = {j: k for j, k in nearest.items() if median[j][k] < _NEARER * median[j][j]}
+    others, cycles = [j for j in median if j not in belongs], list[list[int]]()
     while belongs:
         first, cycle = next(iter(belongs)), list[int]()
         j = first
@@ -83,9 +91,15 @@ def _permuted(off: Array, leg: IntArray) -> Iterator[tuple[tuple[int, int], ...]
             cycle.append(j)
             j = belongs[j]
         if j == first:
-            yield tuple((j, belongs[j]) for j in cycle)
+            cycles.append(cycle)
         for done in cycle if j == first else [first]:
             del belongs[done]
+    renamed = {j for cycle in cycles for j in cycle}
+    away = [float(median[j][j]) for j in others or median.keys() - renamed]
+    apart = float(np.median(away)) if away else 0.0 if of_all else np.inf
+    for cycle in cycles:
+        if apart < _NEARER * min(median[j][j] for j in cycle):
+            yield tuple((j, nearest[j]) for j in cycle)
 
 
 def _diagnosis(

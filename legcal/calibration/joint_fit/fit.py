@@ -182,8 +182,12 @@ def _with_edges(solution: Solution, edges: Outlines, gain: float) -> Solution:
     sigma = float(np.median(1.0 / weight[weight > 0.0]))
     detail = (
         f"{np.count_nonzero(weight)} of {len(edges)} edges of bodies were used; one end of an "
-        f"edge, seen from the other, is known to {sigma:.2f} px. They lower the predicted error "
-        f"of the platform by {100.0 * gain:.2g} %."
+        f"edge, seen from the other, is known to {sigma:.2f} px. "
+        + (
+            f"They lower the predicted error of the platform by {100.0 * gain:.0f} %."
+            if gain < 1.0
+            else "Without them the platform would not be determined."
+        )
     )
     return dataclasses.replace(
         solution,

@@ -101,9 +101,9 @@ def sensitivity_to_scale(linear: FitLinear, covariance: Array) -> dict[str, Arra
         n = of_motors.shape[1]
         scores = Projected.of(normal, columns).at(np.arange(n))
         alike = np.ones((n, n))  # and the differences of each one from the mean
-        covariance = problem.legs.sigma_travel**2 * (alike + np.eye(n) - alike / n)
+        prior = problem.legs.sigma_travel**2 * (alike + np.eye(n) - alike / n)
         moved = kinematic_steps(problem, response(normal, columns))
-        return {ALL_READINGS: moved @ size_left(scores, covariance)}
+        return {ALL_READINGS: moved @ size_left(scores, prior)}
     parametrization = problem.legs.parametrization
     column = parametrization.place[:, LegColumns.LENGTH]
     rods = np.flatnonzero(column >= 0)
