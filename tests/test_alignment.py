@@ -61,12 +61,13 @@ def moved(picture: Grey, move: Move) -> Grey:
 
 
 def taken(background: Grey, moves: list[Move], seed: int = 0) -> list[Grey]:
-    """Return noisy images of a background with a leg elsewhere in each."""
+    """Return noisy images of a background, with a leg elsewhere and another exposure in each."""
     images, rng = [], np.random.default_rng(seed)
     for k, one in enumerate(moves):
         scene = background.copy()
         scene[40:440, 60 + 70 * k : 140 + 70 * k] = 200.0 - 0.3 * np.arange(80)
-        images.append(moved(scene, one) + 2.0 * rng.normal(size=scene.shape).astype(np.float32))
+        noise = 2.0 * rng.normal(size=scene.shape).astype(np.float32)
+        images.append((1.0 - 0.06 * (k % 4)) * moved(scene, one) + noise)
     return images
 
 

@@ -34,6 +34,7 @@ MOST_IMAGES = 60  # of a view by which its background is known, and at a time
 MIN_TILES, MIN_SHARE = 12, 0.35  # squares that show something, and the share of these that agree
 SHARP = 0.1  # standard deviation of the shift of a square that shows something, at most [px]
 STRIDE = 4  # squares, and their rows, that are enough for medians
+MOST_GAIN = 2.0  # of the exposure of an image
 LEAST_NOISE = 0.3  # of pixels [grey levels]
 ROUNDS = 10
 READ = 1.0 / 32.0  # steps in which OpenCV reads between pixels [px]
@@ -138,6 +139,7 @@ def _moves_of_view(
     by_motion = _shifts_by_motion(middle)
     everywhere = np.einsum("kdp,kdq->pq", by_motion, by_motion) / len(by_motion)
     model = by_motion, everywhere
+    tiles = _as_exposed(tiles, still)
     motion, now, smooth = np.zeros((len(tiles), by_motion.shape[2])), tiles, True
     at = np.zeros((*tiles.shape[:2], 2))  # the shifts at which squares are read
     for _ in range(ROUNDS):
@@ -167,6 +169,15 @@ def _moves_of_view(
     motion *= np.array([factor, factor, 1.0, 1.0, 1.0 / factor, 1.0 / factor])
     moves = zip(known.tolist(), motion.tolist(), strict=True)
     return [Move(*own) if is_known else None for is_known, own in moves], np.median(now, axis=0)
+
+
+def _as_exposed(tiles: Samples, still: Samples | None) -> Samples:
+    """Return the squares of images as if all had the exposure of the background."""
+    level = tiles.mean(axis=(2, 3))
+    usual = np.median(level, axis=0) if still is None else still.mean(axis=(1, 2))
+    gain = np.median(level / np.maximum(usual, 1.0), axis=1)
+    gain = np.clip(gain, 1.0 / MOST_GAIN, MOST_GAIN)
+    return np.asarray(tiles / gain[:, None, None, None], dtype=np.float32)
 
 
 def _background(tiles: Samples, *, sharp: bool) -> Samples:
