@@ -254,8 +254,8 @@ def _with_moves(dataset: Dataset, plan: DetectionPlan, pool: Run, progress: Repo
     others are measured, or in which boards are looked for.
     """
     m, moves = dataset.measurements, plan.moves
-    is_read = np.isin(m.view, m.view[plan.detect])
     if not plan.is_cached:
+        is_read = np.isin(m.view, m.view[plan.detect])
         is_read |= bool(dataset.boards) and dataset.corners is None
         rows = [row for row in rows_with_image(dataset).tolist() if is_read[row]]
         load = dataset.image_reader(range(m.n_rows))

@@ -27,11 +27,11 @@ from legcal.vision.image_file import Move, shrink
 from legcal.workers import Run
 
 LONG_SIDE = 1200  # about which images are reduced [px]
-TILE, MARGIN = 24, 4  # side of a square, and how far around it is looked [px]
+SIDE, MARGIN = 24, 4  # of a square, and how far around it is looked [px]
 ACROSS = 16  # squares beside each other along the longer side
 MIN_IMAGES = 5  # of a view
 MOST_IMAGES = 60  # of a view by which its background is known, and at a time
-MIN_TILES, MIN_SHARE = 12, 0.35  # squares that show something, and the share of these that agree
+MIN_SQUARES, MIN_SHARE = 12, 0.35  # squares that show something, and the share of these that agree
 SHARP = 0.1  # standard deviation of the shift of a square that shows something, at most [px]
 STRIDE = 4  # squares, and their rows, that are enough for medians
 MOST_GAIN = 2.0  # of the exposure of an image
@@ -74,23 +74,23 @@ def camera_moves(
     ]
     n_read, n_total = itertools.count(1), sum(map(len, samples))
 
-    def squares(some: Sequence[int]) -> Samples:
-        read = []
+    def read(some: Sequence[int]) -> Samples:
+        found = []
         for own in run(partial(_squares, load), some):
-            read.append(own)
+            found.append(own)
             report("Comparing backgrounds", min(next(n_read), n_total), n_total)
-        return np.stack(read)
+        return np.stack(found)
 
     moves = dict[int, Move]()
     for group, sample in zip(groups, samples, strict=True):
         camera = measurements.views[measurements.view[group[0]]].camera
         size = camera.width, camera.height
-        found, still = _moves_of_view(squares(sample), size)
+        found, still = _moves_of_view(read(sample), size)
         moves |= _known(sample, found)
         rest = [row for row in group if row not in set(sample)] if still is not None else []
         for first in range(0, len(rest), MOST_IMAGES):
             some = rest[first : first + MOST_IMAGES]
-            moves |= _known(some, _moves_of_view(squares(some), size, still)[0])
+            moves |= _known(some, _moves_of_view(read(some), size, still)[0])
     return moves
 
 
@@ -107,16 +107,16 @@ def _places(size: tuple[int, int]) -> tuple[IntArray, Array]:
     reduced = np.array(size) // _factor(size)
     n = [max(4, round(ACROSS * side / max(size))) for side in size]
     first = [
-        np.linspace(0, side - TILE - 2 * MARGIN, k).astype(np.intp)
+        np.linspace(0, side - SIDE - 2 * MARGIN, k).astype(np.intp)
         for side, k in zip(reduced.tolist(), n, strict=True)
     ]
     at = np.stack(np.meshgrid(*first), axis=-1).reshape(-1, 2)
-    return at, at + 0.5 * (TILE + 2 * MARGIN) - 0.5 * reduced
+    return at, at + 0.5 * (SIDE + 2 * MARGIN) - 0.5 * reduced
 
 
 def _squares(load: Load, row: int) -> Samples:
     """Return the squares (n, side, side) of an image."""
-    grey, side = load(row), TILE + 2 * MARGIN
+    grey, side = load(row), SIDE + 2 * MARGIN
     size = grey.shape[1], grey.shape[0]
     small = shrink(grey, _factor(size))
     if min(small.shape) <= side:
@@ -125,23 +125,23 @@ def _squares(load: Load, row: int) -> Samples:
 
 
 def _moves_of_view(
-    tiles: Samples, size: tuple[int, int], still: Samples | None = None
+    squares: Samples, size: tuple[int, int], still: Samples | None = None
 ) -> tuple[list[Move | None], Samples | None]:
     """Return the move of each image by its squares (n_images, n, side, side), and their background.
 
     The *still* background is that of other images of the view, or else the median. None for an
     image that shows too little of it, and for all, and no background, if the camera stood still.
     """
-    stood: tuple[list[Move | None], None] = [None] * len(tiles), None
-    if not tiles.shape[1]:
+    stood: tuple[list[Move | None], None] = [None] * len(squares), None
+    if not squares.shape[1]:
         return stood
     middle, factor = _places(size)[1], _factor(size)
     by_motion = _shifts_by_motion(middle)
     everywhere = np.einsum("kdp,kdq->pq", by_motion, by_motion) / len(by_motion)
     model = by_motion, everywhere
-    tiles = _as_exposed(tiles, still)
-    motion, now, smooth = np.zeros((len(tiles), by_motion.shape[2])), tiles, True
-    at = np.zeros((*tiles.shape[:2], 2))  # the shifts at which squares are read
+    squares = _as_exposed(squares, still)
+    motion, now, smooth = np.zeros((len(squares), by_motion.shape[2])), squares, True
+    at = np.zeros((*squares.shape[:2], 2))  # the shifts at which squares are read
     for _ in range(ROUNDS):
         before = motion
         behind = _background(now, sharp=not motion.any()) if still is None else still
@@ -154,15 +154,15 @@ def _moves_of_view(
             if np.count_nonzero(seen) < MIN_IMAGES:
                 return stood
             motion[seen] -= np.median(motion[seen], axis=0)
-            away = factor * _size(motion, everywhere)
+            away = factor * _rms_shift(motion, everywhere)
             if not np.any(away[seen] > np.maximum(LEAST_MOVE, SIGMAS * sigma[seen])):
                 return stood
-        step = float(_size(motion - before, everywhere)[seen].max(initial=0.0))
+        step = float(_rms_shift(motion - before, everywhere)[seen].max(initial=0.0))
         if step < SETTLED and not smooth:
             break
         smooth &= step > NEAR
         at = np.round(np.einsum("kdp,np->nkd", by_motion, motion) / READ) * READ
-        now = np.stack([_moved(*one) for one in zip(tiles, at, strict=True)])
+        now = np.stack([_moved(*one) for one in zip(squares, at, strict=True)])
     known = sigma < MAX_SIGMA
     if still is None and np.count_nonzero(known) < MIN_IMAGES:
         return stood
@@ -171,54 +171,54 @@ def _moves_of_view(
     return [Move(*own) if is_known else None for is_known, own in moves], np.median(now, axis=0)
 
 
-def _as_exposed(tiles: Samples, still: Samples | None) -> Samples:
+def _as_exposed(squares: Samples, still: Samples | None) -> Samples:
     """Return the squares of images as if all had the exposure of the background."""
-    level = tiles.mean(axis=(2, 3))
+    level = squares.mean(axis=(2, 3))
     usual = np.median(level, axis=0) if still is None else still.mean(axis=(1, 2))
     gain = np.median(level / np.maximum(usual, 1.0), axis=1)
     gain = np.clip(gain, 1.0 / MOST_GAIN, MOST_GAIN)
-    return np.asarray(tiles / gain[:, None, None, None], dtype=np.float32)
+    return np.asarray(squares / gain[:, None, None, None], dtype=np.float32)
 
 
-def _background(tiles: Samples, *, sharp: bool) -> Samples:
+def _background(squares: Samples, *, sharp: bool) -> Samples:
     """Return the median of images, or, where they may be far apart, the one nearest to it."""
     if not sharp:
-        return np.asarray(np.median(tiles, axis=0))
-    some = tiles[:, ::STRIDE]
+        return np.asarray(np.median(squares, axis=0))
+    some = squares[:, ::STRIDE]
     off = np.abs(some - np.median(some, axis=0)).mean(axis=(1, 2, 3))
-    return np.asarray(tiles[int(np.argmin(off))])
+    return np.asarray(squares[int(np.argmin(off))])
 
 
-def _smooth(tiles: Samples) -> Samples:
+def _smooth(squares: Samples) -> Samples:
     """Return blurred squares."""
-    blurred = [cv2.GaussianBlur(np.moveaxis(own, 0, 2), (0, 0), SMOOTHING) for own in tiles]
+    blurred = [cv2.GaussianBlur(np.moveaxis(own, 0, 2), (0, 0), SMOOTHING) for own in squares]
     return np.moveaxis(np.stack(blurred), 3, 1).astype(np.float32)
 
 
-def _size(motion: Array, everywhere: Array) -> Array:
+def _rms_shift(motion: Array, everywhere: Array) -> Array:
     """Return how far motions (n, 6) move an image, rms over all places, (n,) [px]."""
     return np.asarray(np.sqrt(np.einsum("np,pq,nq->n", motion, everywhere, motion)))
 
 
 def _motions(
-    tiles: Samples, still: Samples, at: Array, by_motion: Array, everywhere: Array
+    squares: Samples, still: Samples, at: Array, by_motion: Array, everywhere: Array
 ) -> tuple[Array, Array]:
     """Return the motions (n_images, 6) of images against a background, read at shifts.
 
     With the standard deviation of shifts (n_images,) [px], rms over all places, infinite where few
     squares agree.
     """
-    off = np.abs(tiles[:, :, ::STRIDE] - still[:, ::STRIDE])
+    off = np.abs(squares[:, :, ::STRIDE] - still[:, ::STRIDE])
     noise = 1.4826 * np.median(off, axis=(0, 2, 3))
     noise = np.maximum(noise, LEAST_NOISE)
     information, slope = _information(still)
     shown = np.linalg.eigvalsh(information)[:, 0] > (noise / SHARP) ** 2
-    motion, sigma = np.zeros((len(tiles), by_motion.shape[2])), np.full(len(tiles), np.inf)
-    if np.count_nonzero(shown) < MIN_TILES:
+    motion, sigma = np.zeros((len(squares), by_motion.shape[2])), np.full(len(squares), np.inf)
+    if np.count_nonzero(shown) < MIN_SQUARES:
         return motion, sigma
     information, slope = information[shown], slope[shown]
     weighed = information / noise[shown, None, None] ** 2
-    for i, image in enumerate(tiles):
+    for i, image in enumerate(squares):
         off = _inside(still[shown] - image[shown]).reshape(len(slope), -1)
         pull = np.einsum("kpd,kp->kd", slope, off)
         shift = np.linalg.solve(information, pull[..., None])[..., 0]
@@ -240,9 +240,9 @@ def _shifts_by_motion(middle: Array) -> Array:
     return shifts
 
 
-def _inside(tiles: Samples) -> Samples:
+def _inside(squares: Samples) -> Samples:
     """Return squares without their margin, less their mean: the light may change."""
-    inner = tiles[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    inner = squares[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
     return np.asarray(inner - inner.mean(axis=(1, 2), keepdims=True))
 
 
@@ -277,17 +277,17 @@ def _common(
     return motion, scale**2 * np.linalg.inv(normal), float(np.mean(weight > 0.25))
 
 
-def _moved(tiles: Samples, shift: Array) -> Samples:
+def _moved(squares: Samples, shift: Array) -> Samples:
     """Return the squares (n, side, side) read at places that are shifted (n, 2) [px]."""
-    n, side, _ = tiles.shape
+    n, side, _ = squares.shape
     place = np.arange(side, dtype=np.float32)
     x, y = (np.clip(place + one[:, None], 0, side - 1) for one in shift.T.astype(np.float32))
-    x = np.broadcast_to(x[:, None, :], tiles.shape)
-    y = np.broadcast_to(y[:, :, None], tiles.shape) + side * np.arange(n)[:, None, None]
+    x = np.broadcast_to(x[:, None, :], squares.shape)
+    y = np.broadcast_to(y[:, :, None], squares.shape) + side * np.arange(n)[:, None, None]
     flat = cv2.remap(
-        tiles.reshape(-1, side),
+        squares.reshape(-1, side),
         x.reshape(-1, side).astype(np.float32),
         y.reshape(-1, side).astype(np.float32),
         cv2.INTER_LANCZOS4,  # cubic ones of OpenCV are off by up to 0.05 px
     )
-    return np.asarray(flat, dtype=np.float32).reshape(tiles.shape)
+    return np.asarray(flat, dtype=np.float32).reshape(squares.shape)
