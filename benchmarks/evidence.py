@@ -2,9 +2,10 @@
 
 ``evidence.jsonl`` beside this file has one object a line, a row of a table: ``table`` (its name in
 the page), ``title``, ``command`` and ``date`` (how and when it was recorded) and ``cells``, by
-column. A new measurement replaces the rows of its table. The page holds the text; each table stands
-between ``<!-- table: NAME -->`` and ``<!-- end -->``. ``--check`` says whether the page is what the
-records give.
+column. A new measurement replaces the rows of its table. The page holds the text. A table stands in
+it between ``<!-- table: NAME -->`` and ``<!-- end -->``, or a paragraph cites it by its name in code
+type: then all figures of the paragraph must be in the rows that it cites. ``--check`` says whether
+the page is what the records give.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from typing import Any
 RECORDS = Path(__file__).with_suffix(".jsonl")
 PAGE = Path(__file__).parents[1] / "docs/evidence.md"
 _PLACE = re.compile(r"<!-- table: (\S+) -->\n.*?<!-- end -->", re.DOTALL)
+_PARAGRAPH = re.compile(r"\n\n|\n(?=- )")
+_FIGURE = re.compile(r"(?<![\w.])\d+(?:[.,]\d+)*")
 
 
 def records() -> dict[str, list[dict[str, Any]]]:
@@ -43,11 +46,19 @@ def table_text(rows: list[dict[str, Any]]) -> str:
 
 
 def page_text(text: str) -> str:
-    """Return the text of the page with all tables written anew."""
+    """Return the text of the page with all tables written anew; raise if it says what no row does."""
     tables = records()
     used = _PLACE.findall(text)
-    if sorted(used) != sorted(tables):
-        odd = sorted(set(used) ^ set(tables))
+    for paragraph in _PARAGRAPH.split(_PLACE.sub("", text)):
+        names = [name for name in re.findall(r"`([\w-]+)`", paragraph) if name in tables]
+        rows = [(row["title"], row["cells"]) for name in names for row in tables[name]]
+        recorded = _FIGURE.findall(json.dumps(rows, ensure_ascii=False))
+        odd = sorted({*_FIGURE.findall(paragraph)} - {*recorded})
+        if names and odd:
+            raise ValueError(f"figures that {', '.join(names)} do not record: {', '.join(odd)}")
+        used += names
+    if {*used} != {*tables}:
+        odd = sorted({*used} ^ {*tables})
         raise ValueError(f"tables that are only in the page or only recorded: {', '.join(odd)}")
 
     def written(place: re.Match[str]) -> str:
