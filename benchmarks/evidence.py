@@ -3,9 +3,9 @@
 ``evidence.jsonl`` beside this file has one object a line, a row of a table: ``table`` (its name in
 the page), ``title``, ``command`` and ``date`` (how and when it was recorded) and ``cells``, by
 column. A new measurement replaces the rows of its table. The page holds the text. A table stands in
-it between ``<!-- table: NAME -->`` and ``<!-- end -->``, or a paragraph cites it by its name in code
-type: then all figures of the paragraph must be in the rows that it cites. ``--check`` says whether
-the page is what the records give.
+it between ``<!-- table: NAME -->`` and ``<!-- end -->`` (``NAME without COLUMN, COLUMN``: of less
+interest), or a paragraph cites it by its name in code type: then all figures of the paragraph must
+be in the rows that it cites. ``--check`` says whether the page is what the records give.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 RECORDS = Path(__file__).with_suffix(".jsonl")
 PAGE = Path(__file__).parents[1] / "docs/evidence.md"
-_PLACE = re.compile(r"<!-- table: (\S+) -->\n.*?<!-- end -->", re.DOTALL)
+_PLACE = re.compile(r"<!-- table: (\S+)(?: without (.+?))? -->\n.*?<!-- end -->", re.DOTALL)
 _PARAGRAPH = re.compile(r"\n\n|\n(?=- )")
 _FIGURE = re.compile(r"(?<![\w.])\d+(?:[.,]\d+)*")
 
@@ -33,12 +33,14 @@ def records() -> dict[str, list[dict[str, Any]]]:
     return tables
 
 
-def table_text(rows: list[dict[str, Any]]) -> str:
-    """Return a table in Markdown, with its command and date below."""
+def table_text(rows: list[dict[str, Any]], without: list[str]) -> str:
+    """Return a table in Markdown but for some columns, with its command and date above."""
     columns = list(rows[0]["cells"])
-    if any(list(row["cells"]) != columns for row in rows):
-        raise ValueError(f"rows of the table {rows[0]['table']} have different columns")
-    lines = [columns, ["---"] * len(columns), *(list(row["cells"].values()) for row in rows)]
+    if any(list(row["cells"]) != columns for row in rows) or not {*without} <= {*columns}:
+        raise ValueError(f"rows of the table {rows[0]['table']} have other columns")
+    columns = [column for column in columns if column not in without]
+    lines = [columns, ["---"] * len(columns)]
+    lines += [[row["cells"][column] for column in columns] for row in rows]
     cells = [[str(cell).replace("|", "\\|") for cell in line] for line in lines]
     text = "\n".join(f"| {' | '.join(line)} |" for line in cells)
     first = rows[0]
@@ -48,7 +50,7 @@ def table_text(rows: list[dict[str, Any]]) -> str:
 def page_text(text: str) -> str:
     """Return the text of the page with all tables written anew; raise if it says what no row does."""
     tables = records()
-    used = _PLACE.findall(text)
+    used = [name for name, _ in _PLACE.findall(text)]
     for paragraph in _PARAGRAPH.split(_PLACE.sub("", text)):
         names = [name for name in re.findall(r"`([\w-]+)`", paragraph) if name in tables]
         rows = [(row["title"], row["cells"]) for name in names for row in tables[name]]
@@ -62,8 +64,9 @@ def page_text(text: str) -> str:
         raise ValueError(f"tables that are only in the page or only recorded: {', '.join(odd)}")
 
     def written(place: re.Match[str]) -> str:
-        name = place[1]
-        return f"<!-- table: {name} -->\n{table_text(tables[name])}\n<!-- end -->"
+        mark = place[0].partition("\n")[0]
+        without = place[2].split(", ") if place[2] else []
+        return f"{mark}\n{table_text(tables[place[1]], without)}\n<!-- end -->"
 
     return _PLACE.sub(written, text)
 
