@@ -14,6 +14,7 @@ from simulated import simulated
 
 from legcal import doctor
 from legcal.calibration.detection import CHECKS, Examination, Finding
+from legcal.calibration.diagnosis.diagnosis import NONE_EXPLAINS
 from legcal.calibration.diagnosis.mistakes import Diagnosis
 
 pytestmark = pytest.mark.usefixtures("without_remedies")
@@ -145,6 +146,16 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
     assert outcome.code == 2
     assert outcome.out.index("error:") < outcome.out.index("Columns a and b look exchanged")
     assert "errors to fix before calibrating" in outcome.out
+
+
+def test_what_was_tried_in_vain_is_said_only_where_legs_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+    session = spoiled(tmp_path / "set", 3, ("c1", "c3"))
+    assert NONE_EXPLAINS not in [one.what for one in doctor(session.write()).findings]
+    session.entry["views"]["c3"]["T_base_camera"]["xyz"] = [2.0, 2.0, 2.0]
+    assert NONE_EXPLAINS in [one.what for one in doctor(session.write()).findings]
 
 
 def test_datasets_without_photographs_are_judged_by_what_they_have(tmp_path: Path) -> None:

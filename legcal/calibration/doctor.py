@@ -131,14 +131,16 @@ def doctor(
     with shown_progress(progress) as report, worker_pool(workers) as pool:
         exposures = _look_at_photographs(checklist, usable, pool, report)
         _look_at_parameters(checklist, usable, choices)
-        detection = None
+        detection, tried = None, None
         if exposures or (usable and dataset.observations is not None):
             data = order_dataset(dataset_at(dataset, np.array(usable)), pool, report)
-            _diagnose(checklist, data)
+            tried = _diagnose(checklist, data)
             detection = _searched(checklist, data) if exposures else None
         views = _conditions(dataset, exposures, detection)
         if detection is not None:
             _look_at_legs(checklist, detection, views, choices)
+        if tried == () and (detection is None or checklist.state("legs") in ("error", "warning")):
+            checklist.add("mistakes", "note", NONE_EXPLAINS)
         examination = Examination(
             dataset=str(dataset.folder),
             mechanism=dataset.machine.name,
@@ -459,11 +461,9 @@ def _look_at_views(checklist: _Checklist, exposures: Mapping[int, Exposure]) -> 
         )
 
 
-def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
+def _diagnose(checklist: _Checklist, data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     tried = diagnose(data)
     checklist.diagnosis = tried or ()
-    if tried == ():
-        checklist.add("mistakes", "note", NONE_EXPLAINS)
     checklist.checks["mistakes"] = (
         "one explains the images better"
         if checklist.diagnosis
@@ -486,6 +486,7 @@ def _diagnose(checklist: _Checklist, data: OrderedDataset) -> None:
         )
     for diagnosis in checklist.diagnosis:
         checklist.add("mistakes", "error", diagnosis.sentence)
+    return tried
 
 
 def _searched(checklist: _Checklist, data: OrderedDataset) -> Detection | None:
