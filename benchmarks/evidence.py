@@ -48,7 +48,7 @@ def table_text(rows: list[dict[str, Any]], without: list[str]) -> str:
 
 
 def page_text(text: str) -> str:
-    """Return the text of the page with all tables written anew; raise if it says what no row does."""
+    """Return the text of the page with all tables written anew. Raise if no row has its figures."""
     tables = records()
     used = [name for name, _ in _PLACE.findall(text)]
     for paragraph in _PARAGRAPH.split(_PLACE.sub("", text)):

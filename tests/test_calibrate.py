@@ -24,6 +24,7 @@ from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.calibration.result_folder import write_result
+from legcal.calibration.summary import sentences
 from legcal.calibration.verdict import judge
 from legcal.data.corners import found_corners
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
@@ -309,6 +310,16 @@ def test_photographs_bring_the_platform_within_0_15_mm_and_0_03_deg(example_run:
         assert f"{quoted[1]} mm" in readme
         assert f"{quoted[2]} deg" in readme
         assert mean == pytest.approx((float(quoted[1]), float(quoted[2])), rel=within)
+
+
+def test_counts_of_rejected_outlines_in_words_add_up(example_run: Run) -> None:
+    result = example_run.calibration.result
+    rejected = {"hidden": 7, "width": 5, "disagrees": 3, "partner": 2, "faint": 2, "rough": 1}
+    seen = result.observations.model_copy(update={"used": 480, "total": 500, "rejected": rejected})
+    said = sentences(result.model_copy(update={"observations": seen}))
+    (line,) = (one for one in said if one.startswith("Outlines:"))
+    used, total, *counts = map(int, re.findall(r"\d+", line))
+    assert total - used == sum(counts)
 
 
 def test_errors_from_photographs_are_as_large_as_their_sigmas(example_run: Run) -> None:

@@ -390,6 +390,8 @@ def _observation_lines(result: Result) -> list[str]:
     seen = result.observations
     most = sorted(seen.rejected.items(), key=lambda one: -one[1])[:_MAX_REASONS]
     rejected = ", ".join(f"{count} {reason_in_words(reason)}" for reason, count in most)
+    if others := sum(seen.rejected.values()) - sum(count for _, count in most):
+        rejected += f", {others} for other reasons"
     lines = [f"Outlines: {seen.used} of {seen.total} used{f'; rejected: {rejected}' * bool(most)}."]
     if seen.total == 0:  # boards are the whole measurement
         lines = ["Outlines: none, no leg was measured."]
