@@ -328,6 +328,8 @@ def test_a_split_has_all_images_of_the_poses_before_a_slip(
 def test_a_split_stands_for_all_images_of_its_poses(shared: tuple[Dataset, Start]) -> None:
     dataset, _ = shared
     (zero,) = own_zeros(dataset, ["leg1@c2:p01..p05"])
+    (by_joint,) = own_zeros(dataset, ["leg1_prismatic@c2:p01..p05"])
+    assert (by_joint.motor, by_joint.rows.tolist()) == (zero.motor, zero.rows.tolist())
     assert zero.rows.tolist() == (dataset.measurements.pose < 5).tolist()
     with pytest.raises(UsageError, match="share a pose with them"):
         own_zeros(dataset, ["leg1@c2"])

@@ -200,17 +200,18 @@ def own_zeros(
 
 
 def _motors_and_images(dataset: Dataset, text: str) -> list[tuple[str, str]]:
-    """Return both parts of ``MOTOR@IMAGES``, for each motor that it is of."""
+    """Return both parts of ``MOTOR@IMAGES``, for each motor that it is of, by joint or by leg."""
     motor, _, images = text.partition("@")
     legs = [dataset.machine.legs[j] for j in dataset.machine.motors]
     motors = [leg.motor_label for leg in legs]
+    named = [leg.motor_label for leg in legs if motor in (leg.motor_label, leg.prismatic, "all")]
     needed = f"needed MOTOR@IMAGES such as {motors[0]}@p22..p45"
-    if motor not in (*motors, "all"):
+    if not named:
         cause = f"found no motor of that name, {needed}; {closest(motor, motors)}"
     elif not images.strip():
         cause = f"found no images, {needed}; name them."
     else:
-        return [(one, images) for one in ([motor] if motor in motors else motors)]
+        return [(one, images) for one in named]
     raise UsageError(f"The split {describe(text)} could not be used: {cause}")
 
 
