@@ -359,6 +359,18 @@ def test_images_that_are_left_out_have_no_effect(healthy: Dataset) -> None:
     assert without.solution.estimates.values == pytest.approx(dict(expected.values), abs=1e-9)
 
 
+def test_images_are_chosen_by_their_file_or_their_pose(healthy: Dataset) -> None:
+    m = healthy.measurements
+    labels = [m.pose_labels[p] for p in m.pose.tolist()]
+    views = [m.view_names[v] for v in m.view.tolist()]
+    image = [f"images/{view}_{label}.png" for view, label in zip(views, labels, strict=True)]
+    dataset = replace(healthy, measurements=replace(m, image=tuple(image)))
+    for name in (image[14], image[14].removeprefix("images/"), f"c2_{labels[14]}", labels[14]):
+        assert np.flatnonzero(chosen_images(dataset, name)).tolist() == [14]
+    chosen = chosen_images(dataset, f"{labels[14]}..c2:{labels[17]}")
+    assert np.flatnonzero(chosen).tolist() == [14, 15, 16, 17]
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

@@ -2,9 +2,10 @@
 
 The order is that of their times, else of the numbers in their names. A call names images ``p22``,
 ``c2:p22``, ``p22..p45`` or ``c2``, separated by commas: a range has all images between two in that
-order, a view stands for its images. Images that a fit must predict are held out in whole poses,
-since images of one pose share its unknowns, and at random, in an order that does not depend on the
-files, so that every leg in every view loses no more than its share.
+order, a view stands for its images, a pose (its label in the table) for those that show it. Images
+that a fit must predict are held out in whole poses, since images of one pose share its unknowns,
+and at random, in an order that does not depend on the files, so that every leg in every view loses
+no more than its share.
 """
 
 from __future__ import annotations
@@ -260,15 +261,21 @@ def _rows_of(dataset: Dataset, part: str) -> IntArray:
 
 
 def _rows_named(m: Measurements, name: str) -> tuple[int, IntArray]:
-    """Return the view before an image (-1: none), and the rows of that name."""
-    names, views = np.array(row_names(m), dtype=object), m.view_names
+    """Return the view before an image (-1: none), and the rows of that name.
+
+    It is that of the table, of the file with or without its ending, or of the pose.
+    """
+    names, views = row_names(m), m.view_names
     head, colon, rest = name.partition(":")
     view = views.index(head) if colon and head in views and name not in names else -1
-    rows = np.flatnonzero((names == (name if view < 0 else rest)) & ((view < 0) | (m.view == view)))
-    if not len(rows):
-        remedy = closest(name, [*names, *views])
-        raise ValueError(f"found no image {describe(name)}, needed one of the dataset; {remedy}")
-    return view, rows
+    files = [PurePosixPath(one) for one in names]
+    poses = [m.pose_labels[p] for p in m.pose.tolist()] if m.pose_labels else names
+    for kind in (names, [one.name for one in files], [one.stem for one in files], poses):
+        is_named = np.array([one == (name if view < 0 else rest) for one in kind])
+        if len(rows := np.flatnonzero(is_named & ((view < 0) | (m.view == view)))):
+            return view, rows
+    remedy = closest(name, [*names, *views])
+    raise ValueError(f"found no image {describe(name)}, needed one of the dataset; {remedy}")
 
 
 def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]:
