@@ -256,7 +256,7 @@ def plan_new_dataset(
     stated = options.encoder_sigma
     if isinstance(stated, Mapping):
         stated = {joint: x for joint, x in stated.items() if joint not in sheet.unknown}
-    least = MIN_SIGMA * machine.size
+    least = float(f"{MIN_SIGMA * machine.size:.3g}")
     sigma, sigma_notes = _sigmas(stated, sheet.motors, sheet_readings, least)
     unknown = [
         f"The readings of {few(sheet.unknown)} are not known (empty cells): these legs count as "

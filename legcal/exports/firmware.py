@@ -458,7 +458,7 @@ def linuxcnc_files(subject: Subject, path: Path) -> Rendered:
     for side, points in (("base", machine.A_base), ("platform", machine.B_platform)):
         for j, point in enumerate(points):
             lines += [
-                f"setp genhexkins.{side}.{j}.{axis} {float(_MM * x)!r}"
+                f"setp genhexkins.{side}.{j}.{axis} {round(float(_MM * x), 9)!r}"
                 for axis, x in zip("xyz", point, strict=True)
             ]
         lines.append("")
