@@ -221,14 +221,9 @@ def _largest_changes(result: Result) -> Table | None:
 
 
 def check_summary(check: Check) -> Report:
-    """Return the result of a check: movement, test and explanations."""
+    """Return the result of a check: the verdict, what explains it, and how it was tested."""
     movement, images = check.movement, check.dataset.measurements.n_rows
-    lines = [
-        *(f"Note: {note}" for note in check.notes),
-        f"{images} image{'s' * (images != 1)} compared with {check.earlier.folder}: {movement.dof} "
-        f"of {len(check.earlier.names)} directions of the parameters, "
-        f"statistic {movement.statistic:.1f}.",
-    ]
+    lines = list[str]()
     if movement.explanations:
         best, *others = movement.explanations
         change, amount = best.what, _amount(best)
@@ -241,8 +236,14 @@ def check_summary(check: Check) -> Report:
             lines.append(f"It is explained by {change}: {amount}.")
             named = ", ".join(other.what for other in others[:_EXPLANATIONS])
             lines += [f"These images cannot distinguish that from: {named}."] if named else []
+    lines += [
+        f"{images} image{'s' * (images != 1)} compared with {check.earlier.folder}: {movement.dof} "
+        f"of {len(check.earlier.names)} directions of the parameters, "
+        f"statistic {movement.statistic:.1f}.",
+        *(f"Note: {note}" for note in check.notes),
+    ]
     style = "bold red" if movement.moved else "bold green"
-    return report([*lines, Text(check.sentence, style=style)])
+    return report(Text(check.sentence, style=style), lines)
 
 
 def _amount(change: ExplanationBlock) -> str:
