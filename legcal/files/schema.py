@@ -6,7 +6,6 @@ import re
 import reprlib
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -35,7 +34,6 @@ _MOST_NAMES = 30  # maximum number of names in a hint that lists all
 _NEAREST_NAMES = 10  # in a hint that does not
 _LONGEST_WORD = 100  # maximum length of words for the search of a similar one
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}$=-]*")  # parsed equally by all parsers
 
 _NEEDED = {
     "float_type": "a number",
@@ -191,16 +189,6 @@ _Loader.add_implicit_resolver(
 )
 
 
-class _QuickLoader(_Loader):
-    """The loader with the parser of libyaml: five times as fast, with poorer error messages."""
-
-    def __init__(self, stream: Any) -> None:
-        super().__init__("")
-        parser = yaml.CSafeLoader(stream)
-        for name in ("check_event", "peek_event", "get_event"):
-            setattr(self, name, getattr(parser, name))
-
-
 def _at(node: yaml.Node, actual: str) -> yaml.MarkedYAMLError:
     """Return a YAML error at the place of a node."""
     return yaml.MarkedYAMLError(problem=actual, problem_mark=node.start_mark)
@@ -239,33 +227,21 @@ def parse_yaml(
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
     unread = Problem(f"the {noun} could not be read", file=str(path), code=Code.BAD_SYNTAX)
     try:
-        document = _loaded(content)
+        document = yaml.load(content, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         bad = replace(unread, found=str(error.problem), needed="YAML", remedy="mend that line")
         if mark := error.problem_mark:
             bad = replace(bad, line=mark.line + 1, columns=(str(mark.column + 1),))
         raise kind(bad) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        actual, needed = _first_line(error), "YAML text in UTF-8"
+        lines = str(error).strip().splitlines()
+        actual = f"'{lines[0]}'" if lines else "text nested too deeply"
+        needed = "YAML text in UTF-8"
     else:
         if isinstance(document, dict):
             return typing.cast("dict[str, Any]", document)
         actual, needed = _kind_of(document), "'key: value' lines"
     raise kind(replace(unread, found=actual, needed=needed, remedy="write the file again"))
-
-
-def _loaded(content: bytes) -> Any:
-    """Return the content of YAML, with either parser; both agree on plain text."""
-    if yaml.__with_libyaml__ and _PLAIN_TEXT.fullmatch(content):
-        with suppress(yaml.YAMLError):
-            return yaml.load(content, Loader=_QuickLoader)
-    return yaml.load(content, Loader=_Loader)
-
-
-def _first_line(error: Exception) -> str:
-    """Return the message of an exception, on one line."""
-    text = str(error).strip().splitlines()
-    return f"'{text[0]}'" if text else "text nested too deeply"
 
 
 def _kind_of(value: object) -> str:
