@@ -204,12 +204,6 @@ def _encoder_sigmas(
     """Return the standard deviation of readings in metres, and the deviations by joint [m or rad].
 
     Hobby servos need none: their readings are commands, assumed accurate to half a degree.
-
-    Raises
-    ------
-    DatasetError
-        If one number is stated and a motor turns, if a name is not a motor joint, or if a motor has
-        no standard deviation.
     """
     turning = [a.joint for a in machine.actuators if a.turns]
     of_motor = {str(leg.prismatic): leg for leg in legs_with_readings(machine.legs)}

@@ -193,8 +193,27 @@ def init(
 ) -> Dataset:
     """Make a dataset from a folder of photographs and a table of readings, and load it.
 
-    Arguments and exceptions as in :func:`plan_new_dataset` and :func:`write_new_dataset`; *output*
-    is the folder of the dataset.
+    Parameters
+    ----------
+    folder : path
+        The photographs: in it, or in one folder for each view. It is not changed.
+    readings : path
+        A CSV with a column for each actuated leg, and a heading.
+    model : path or str
+        The nominal model, as for :func:`legcal.load_mechanism`.
+    output : path
+        The folder of the dataset.
+    options : SheetOptions
+        Cameras, unit and noise.
+    force : bool
+        Whether files that exist already are replaced.
+
+    Raises
+    ------
+    DatasetError, ModelError, UsageError
+        With one sentence for each problem.
+    OutOfResources
+        If the folder cannot be written.
     """
     write_new_dataset(plan_new_dataset(folder, readings, model, output, options), force=force)
     return load_dataset(output)
@@ -207,26 +226,7 @@ def plan_new_dataset(
     destination: str | Path,
     options: SheetOptions = SheetOptions(),
 ) -> NewDataset:
-    """Return a dataset of photographs and readings, checked and not written yet.
-
-    Parameters
-    ----------
-    folder : path
-        The photographs: in it, or in one folder for each view. It is not changed.
-    readings : path
-        A CSV with a column for each actuated leg, and a heading.
-    model : path or str
-        The nominal model, as for :func:`legcal.load_mechanism`.
-    destination : path
-        The folder of the dataset.
-    options : SheetOptions
-        Cameras, unit and noise.
-
-    Raises
-    ------
-    DatasetError, ModelError, UsageError
-        With one sentence for each problem.
-    """
+    """Return a dataset of photographs and readings, checked and not written; see :func:`init`."""
     folder, path, destination = Path(folder), Path(readings), Path(destination)
     machine = load_mechanism(model)
     check_path(destination, DATASET_FOLDER)
@@ -329,15 +329,7 @@ def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str])
 
 
 def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
-    """Write a dataset, complete or not at all; return its files, photographs excepted.
-
-    Raises
-    ------
-    UsageError
-        If a file exists already and *force* is not set.
-    OutOfResources
-        If the folder cannot be written.
-    """
+    """Write a dataset, complete or not at all; return its files, photographs excepted."""
     check_path(new.destination, DATASET_FOLDER)
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
@@ -523,15 +515,7 @@ def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
 
 
 def copy_example(destination: Path) -> None:
-    """Copy the example (a simulated hexapod, 45 photographs), complete or not at all.
-
-    Raises
-    ------
-    UsageError
-        If the folder holds files.
-    OutOfResources
-        If it does not take the files, or legcal was installed without them.
-    """
+    """Copy the example (a simulated hexapod, 45 photographs), complete or not at all."""
     check_empty(destination, _EXAMPLE_KIND)
     source = shipped_folder(_EXAMPLE)
     if not (source / DATASET_YAML).is_file():

@@ -173,11 +173,6 @@ def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) ->
 
     *photographs* are in the order of their names; *table* is for messages. A column that counts
     the photographs of each view tells their order.
-
-    Raises
-    ------
-    DatasetError
-        If rows have no photograph, or more than one in a view.
     """
     if any(row.image for row in rows) and not _are_counted(rows, photographs):
         matching = _by_name(rows, photographs, table)

@@ -128,11 +128,7 @@ def default_units(legs: Sequence[Leg]) -> dict[str, ReadingUnit]:
 def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit:
     """Return a unit for the readings of a leg.
 
-    Raises
-    ------
-    ValueError
-        If the leg cannot have readings in this unit. The text continues a sentence that names the
-        entry.
+    ValueError continues a sentence that names the entry.
     """
     motor, turns = leg.prismatic, leg.reads_angle
     if not takes_unit(name, turns=turns):
@@ -179,11 +175,6 @@ def reading_units(
     """Return the unit of the readings of each motor, by its joint.
 
     A single unit applies to the motors of its kind, sliding or turning.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each motor whose readings cannot have their unit.
     """
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
     units = default_units(legs)
@@ -258,11 +249,6 @@ def sigmas_of(
 
     A number applies to every motor in its own unit [m or rad], a text with a unit (of lengths,
     angles, or pulses of *units*) to the motors of that kind, sliding or turning.
-
-    Raises
-    ------
-    UsageError
-        If no motor can have it, or one is named that has no readings.
     """
     refused = "The encoder sigma (encoder_sigma, --encoder-sigma) could not be used"
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
@@ -311,10 +297,7 @@ def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:
 def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
     """Return a standard deviation [m or rad] from a number in the unit of readings, or with a unit.
 
-    Raises
-    ------
-    ValueError
-        If it is invalid. The text continues a sentence that names the entry.
+    ValueError continues a sentence that names the entry.
     """
     sizes = {PULSES: unit.size} if unit.name == PULSES else {}
     sizes |= ANGLE if leg.reads_angle else LENGTH

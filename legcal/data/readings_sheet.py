@@ -83,23 +83,8 @@ class SheetReadings:
 class ReadingsSheet:
     """A table of readings, one row for each photograph or time (*row_noun*).
 
-    Attributes
-    ----------
-    table : Table
-        Its rows under our names: view, image, pose and time as texts, readings by joint.
-    motors : list of Leg
-        The legs whose readings it holds.
-    unknown : list of str
-        The joints whose readings are not known: their cells are all empty.
-    taken : dict
-        Meaning of each heading in use: a joint, view, image, pose or time.
-    notes : list of str
-        Oddities, and columns that were left out.
-
-    Raises
-    ------
-    DatasetError
-        If the file, a heading or a cell cannot be read.
+    The rows of its *table* are under our names: view, image, pose and time as texts, readings by
+    joint.
     """
 
     def __init__(
@@ -111,9 +96,9 @@ class ReadingsSheet:
         may_be_unknown: bool = False,  # readings of motors that do not move joints at the base
     ) -> None:
         self.path = path
-        self.motors = [machine.legs[j] for j in machine.motors]
-        self.taken: dict[str, str] = {}
-        self.notes: list[str] = []
+        self.motors = [machine.legs[j] for j in machine.motors]  # whose readings it holds
+        self.taken: dict[str, str] = {}  # a joint, view, image, pose or time, by heading in use
+        self.notes: list[str] = []  # oddities, and columns that were left out
         self._joints = machine.motor_names
         self._heading_units: dict[str, str] = {}  # by joint
         columns = [Column(name, "text", required=False) for name in _COLUMNS]
@@ -140,19 +125,9 @@ class ReadingsSheet:
     def readings(self, unit: str | None = None, *, lengths: bool = False) -> SheetReadings:
         """Return the readings [m, rad], with the precision of their decimal digits.
 
-        Parameters
-        ----------
-        unit : str, optional
-            Unit of the motors of its kind, sliding or turning; by default the unit of the headings,
-            else the unit in which readings lie in the travel.
-        lengths : bool
-            Whether the columns are whole lengths of legs; they are too if nothing else fits.
-
-        Raises
-        ------
-        DatasetError, UsageError
-            If the unit cannot be decided or is certainly wrong, or with a sentence for each
-            reading outside its travel.
+        A *unit* is that of the motors of its kind, sliding or turning; by default it is the unit of
+        the headings, else the one in which readings lie in the travel. The columns are whole
+        *lengths* of legs also if nothing else fits.
         """
         units, unit_from, lengths = self._units(unit, lengths)
         headings = {name: text for text, name in self.taken.items()}

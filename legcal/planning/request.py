@@ -306,13 +306,7 @@ def _counts(
 
 
 def _check_visible(machine: Machine) -> None:
-    """Refuse a machine none of whose legs and arms a camera can see.
-
-    Raises
-    ------
-    ModelError
-        If the model has no cylinder along any of them.
-    """
+    """Refuse a machine none of whose legs and arms a camera can see."""
     if not any(leg.cylinders or leg.arm for leg in machine.legs):
         raise ModelError(
             Problem(

@@ -210,40 +210,25 @@ def pose_labels(n_images: int, n_given: int = 0) -> list[str]:
 @brief
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned session.
+    """A planned session."""
 
-    Attributes
-    ----------
-    machine : Machine
-        The nominal model.
-    camera : Camera
-        The camera.
-    views : tuple of PlannedView
-        Camera places, each with its poses. Of a hand-held camera every image is a view.
-    value : float
-        The criterion of the session as planned: the mean error of the platform over the workspace
-        [m], or where readings do not give its pose, the determinant's root.
-    error : PlatformError or None
-        Expected error of the platform over the workspace, one standard deviation: the root mean
-        square over the draws; None if readings do not determine its pose.
-    sigma : (p,) array
-        Expected standard deviation of each kinematic parameter [m, rad].
-    growth : (n, 2) array
-        Numbers of images, and the criterion with that many, most useful images first; beyond the
-        planned number, with copies of the planned images.
-    """
-
-    machine: Machine
+    machine: Machine  # the nominal model
     camera: Camera
     setting: Setting
     noise: PredictedNoise
     sigma_q: float  # [m] of a reading of a motor that slides
-    views: tuple[PlannedView, ...]
+    views: tuple[PlannedView, ...]  # of a camera in the hand, every image is one
+    # The criterion as planned: the mean error of the platform over the workspace [m], or where
+    # readings do not give its pose, the determinant's root
     value: float
+    # Expected over the workspace, one standard deviation: the root mean square over the draws;
+    # None if readings do not determine the pose
     error: PlatformError | None
-    sigma: Array
+    sigma: Array  # (p,) expected standard deviation of each kinematic parameter [m, rad]
     names: tuple[str, ...]
     units: tuple[str, ...]
+    # (n, 2) numbers of images, and the criterion with that many, most useful images first; beyond
+    # the planned number, with copies of the planned images
     growth: Array
     seed: int = 0
     board: LaidBoard | None = None  # on the base, in every image

@@ -144,42 +144,17 @@ class Import:
 
 
 def plan_import(
-    sources: Sequence[Path],
+    sources: Sequence[Path],  # a video, bag or folder of images with times for each camera position
     model: str | Path,
     destination: str | Path,
     *,
-    readings: Sequence[Path] = (),
+    readings: Sequence[Path] = (),  # one table for all recordings, one for each, or none for bags
     cameras: Sequence[str] = (),
     lengths: bool = False,
-    offset: float | None = None,
+    offset: float | None = None,  # clock of the camera minus clock of the readings [s]
     progress: Report = no_progress,
 ) -> Import:
-    """Select the frames of recordings in which the machine is at rest, with their readings.
-
-    Parameters
-    ----------
-    sources : sequence of path
-        A video, a ROS bag or a folder of images with times for each camera position; for a bag with
-        several cameras append the topic of one, ``run.mcap:/left/image_raw``.
-    model : path or str
-        The nominal model, as for :func:`legcal.load_mechanism`.
-    destination : path
-        The folder of the dataset.
-    readings : sequence of path
-        Tables of readings with a column of times: one for all recordings, or one for each; none
-        for bags with joint states.
-    cameras : sequence of str
-        Camera files: one for all views, or ``VIEW=FILE`` for each.
-    lengths : bool
-        Whether tables hold total lengths of legs instead of readings.
-    offset : float, optional
-        Clock of the camera minus clock of the readings [s]; determined from motion by default.
-
-    Raises
-    ------
-    DatasetError, ModelError, UsageError
-        If a file cannot be read, nothing moves or rests, or the clocks cannot be compared.
-    """
+    """Select the frames of recordings in which the machine is at rest, with their readings."""
     machine = load_mechanism(model)
     destination = Path(destination)
     check_path(destination, DATASET_FOLDER)
@@ -351,15 +326,7 @@ def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, 
 def import_recordings(
     plan: Import, *, force: bool = False, progress: Report = no_progress
 ) -> list[Path]:
-    """Write the dataset of an import, complete or not at all; return its files but the images.
-
-    Raises
-    ------
-    DatasetError
-        If the frames do not match the camera files.
-    UsageError
-        If files are in the way and *force* is not given.
-    """
+    """Write the dataset of an import, complete or not at all; return its files but the images."""
     check_path(plan.destination, DATASET_FOLDER)
     motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
@@ -444,13 +411,7 @@ def clock_offset(
     moves: BoolArray,  # (m,)
     most: float | None = None,  # largest offset [s] if both were recorded by one clock
 ) -> Offset:
-    """Return the offset with the best agreement of motion in frames and in readings.
-
-    Raises
-    ------
-    NoOffset
-        If motion does not agree, or agrees equally well with another offset.
-    """
+    """Return the offset with the best agreement of motion in frames and in readings."""
     span = max(np.ptp(frame_times), np.ptp(times))
     step = max(float(np.median(np.diff(frame_times))), span / _MOST_SAMPLES)
     frame_samples, start_of_frames = _on_grid(frame_times, frames_move, step)

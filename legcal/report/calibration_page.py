@@ -211,15 +211,7 @@ def _maps(workspace: PlatformMap) -> list[Block]:
 
 
 def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Block]:
-    """Return the errors of the nominal and the calibrated model.
-
-    Raises
-    ------
-    ModelError
-        If the truth is not a model of the same machine.
-    DidNotConverge
-        If the models reach no readings together.
-    """
+    """Return the errors of the nominal and the calibrated model."""
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
     sigma = {row.name: row.sigma for row in calibration.result.parameters}

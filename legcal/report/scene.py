@@ -54,43 +54,23 @@ class Mode(NamedTuple):
 class MachineScene:
     """A machine with the models that it is compared with.
 
-    Parameters
-    ----------
-    machine : Machine
-        The machine, whose frames R_b and R_e both models have.
-    legs : sequence of Leg
-        The legs that are shown, in R_b and R_e.
-    nominal : sequence of Leg, optional
-        The legs of the nominal model.
-    result : Result, optional
-        The document of the calibration: the source of directions and ellipsoids.
-    parameters : Parametrization, optional
-        The parameters of the calibration, by default those of the machine.
-
-    Attributes
-    ----------
-    size : float
-        Size of the machine at home [m].
-    rims : dict
-        Joints, or motors of the base, in order around base and platform, the first twice.
-    directions : list of (str, (p,) array)
-        Names and steps of the parameters along weak and held directions.
-    ellipsoids : dict
-        Half axes of one sigma at the joints, (n, 3, 3) [m], by side.
+    *legs* are shown, in R_b and R_e of the machine, beside *nominal* ones; the *result* of a
+    calibration is the source of directions and ellipsoids.
     """
 
     def __init__(
         self,
         machine: Machine,
         legs: Sequence[Leg],
-        nominal: Sequence[Leg] | None = None,
-        result: Result | None = None,
-        parameters: Parametrization | None = None,
+        nominal: Sequence[Leg] | None,
+        result: Result | None,
+        parameters: Parametrization | None = None,  # of the calibration, else of the machine
     ) -> None:
         self.machine, self.legs, self.nominal = machine, legs, nominal
         A, B = machine.A_base, machine.home.apply(machine.B_platform)
-        self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
+        self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())  # at home [m]
         anchors = motor_lines(machine.legs, A[None]).anchors
+        # Joints, or motors of the base, in order around base and platform, the first twice
         self.rims = {"base": around(corners_of_base(A, anchors)), "platform": around(B)}
         self._parameters = parameters or parametrization_of(machine, twists=True)
         length = float(np.mean(np.linalg.norm(B - A, axis=1)))

@@ -34,13 +34,7 @@ class Address:
 
 
 def check_address(address: Address) -> None:
-    """Refuse a host or a port that cannot be served.
-
-    Raises
-    ------
-    UsageError
-        If the host is unknown or another machine, or the port is in use or not allowed.
-    """
+    """Refuse a host or a port that cannot be served."""
     host, port = address.host, address.port
     try:
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
