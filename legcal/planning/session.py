@@ -397,9 +397,3 @@ class PlanDocument(SparseDocument):
     growth: list[Growth]
     notes: list[str]
     parts: list[PartSigma] | None = None  # left out where not asked for (--only)
-
-
-def views_in_words(views: Sequence[PlannedView]) -> str:
-    """Describe the numbers of images and places."""
-    n = sum(len(view.poses.poses) for view in views)
-    return f"{n} photographs from {len(views)} place{'s' * (len(views) != 1)}"

@@ -16,7 +16,7 @@ from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Block, Drawing, Items, Picture, Row, data_url, page_html
 from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
-from legcal.planning.session import Plan, poses_to_take, settings_in_words, views_in_words
+from legcal.planning.session import Plan, poses_to_take, settings_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
 from legcal.report.scene import pyramid
@@ -65,7 +65,13 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         else f" --only {plan.only}"
     )
     return report(
-        [heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"), plan.sentence],
+        [
+            heading(
+                printable(plan.machine.name),
+                f": {plan.n_images} photographs from {len(views)} place{'s' * (len(views) != 1)}",
+            ),
+            plan.sentence,
+        ],
         table(
             "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {printable(legs)}",
             rows=[tuple(map(printable, row)) for row in views],
