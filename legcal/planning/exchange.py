@@ -104,10 +104,9 @@ class Session:
         columns = self.columns[slot]
         block, p = self.covariance[np.ix_(columns, columns)], self.p
         candidates = self.slots[slot]
-        sites = [(slot, site) for site in candidates.site[images].tolist()]
-        rows = candidates.gains(
-            images, 1 + np.array([len(self._chosen_at.get(s, ())) for s in sites])
-        )
+        sites = candidates.site[images].tolist()
+        number = [1 + len(self._chosen_at.get((slot, site), ())) for site in sites]
+        rows = candidates.gains(images, np.array(number))
         rows_covariance = rows @ block
         S = np.eye(rows.shape[1]) + rows_covariance @ np.swapaxes(rows, 1, 2)
         half = rows_covariance[..., :p]

@@ -12,7 +12,6 @@ import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
@@ -223,7 +222,7 @@ def understood(columns: Mapping[str, str], noun: str, unit: str) -> list[str]:
     """Return lines on how the headings of a table and the unit of its readings were read."""
     renamed = [f"{text} is {name}" for text, name in columns.items() if text != name]
     return [
-        printable(f"Columns: {', '.join(renamed)}.") if renamed else "",
+        f"Columns: {', '.join(renamed)}." if renamed else "",
         f"Unit of the {noun}: {unit}." if unit else "",
     ]
 
@@ -237,7 +236,7 @@ def poses_table(poses: ToolPoses) -> Report:
         )
     ]
     return report(
-        heading(printable(poses.source), f": {len(poses)} tool poses"),
+        heading(poses.source, f": {len(poses)} tool poses"),
         understood(poses.columns, "readings", poses.unit),
         table(">row", ">x [mm]", ">y [mm]", ">z [mm]", "orientation", rows=rows),
     )

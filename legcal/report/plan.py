@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.model import readings_at
@@ -67,19 +66,19 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
     return report(
         [
             heading(
-                printable(plan.machine.name),
+                plan.machine.name,
                 f": {plan.n_images} photographs from {len(views)} place{'s' * (len(views) != 1)}",
             ),
             plan.sentence,
         ],
         table(
-            "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {printable(legs)}",
-            rows=[tuple(map(printable, row)) for row in views],
+            "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {legs}",
+            rows=views,
         ),
         table(
             "view", *(f">distance to A{j + 1} [mm]" for j in plan.machine.frame_legs),
             ">height above the base joints [mm]",
-            rows=[tuple(map(printable, row)) for row in distances],
+            rows=distances,
             title="Distances to measure, from the middle of the lens to joints of the base"
             + plan.machine.at_zero,
         ),
@@ -88,15 +87,13 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
             ">images", ">expected", rows=growth,
             title="Expected error vs. number of images",
         ),
-        list(map(printable, plan.notes)),
+        plan.notes,
         [] if output is None else [
-            printable(f"written: {output}"),
-            *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
+            f"written: {output}",
+            *([f"afterwards, {_to_be_added(plan)}"] if plan.given else []),
             "photograph it, and calibrate:",
-            printable(f"  legcal shoot {shlex.quote(str(output))} --watch FOLDER"),
-            printable(
-                f"  legcal calibrate {shlex.quote(str(plan.given or output))} -o OUT{option}"
-            ),
+            f"  legcal shoot {shlex.quote(str(output))} --watch FOLDER",
+            f"  legcal calibrate {shlex.quote(str(plan.given or output))} -o OUT{option}",
         ],
     )  # fmt: skip
 
@@ -225,8 +222,8 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     if plan.has_ways:
         settings.insert(2, 3)
     poses = table(
-        *(f"{'>' * (i >= first_motor)}{printable(header[i])}" for i in settings),
-        rows=[[printable(row[i]) for i in settings] for row in rows],
+        *(f"{'>' * (i >= first_motor)}{header[i]}" for i in settings),
+        rows=[[row[i] for i in settings] for row in rows],
         title="Poses to take, in this order",
     )
     blocks: list[Block] = [

@@ -13,7 +13,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from legcal.errors import escaped
+from legcal.errors import escaped, printable
 from legcal.pages.document import (
     Block,
     Cell,
@@ -88,11 +88,11 @@ def table(
 
 def heading(name: str, rest: str) -> Text:
     """Return the heading of a report, the name in bold."""
-    return Text.assemble((escaped(name), "bold"), escaped(rest))
+    return Text.assemble((printable(name), "bold"), printable(rest))
 
 
 def safe_text(text: str | Text) -> Text:
-    """Return text with control characters and markup escaped for the terminal.
+    """Return text without control characters and markup; what is styled is not cut.
 
     Commands to copy stay on one line.
     """
@@ -100,7 +100,7 @@ def safe_text(text: str | Text) -> Text:
         if text.plain != (plain := escaped(text.plain)):
             return Text(plain, style=text.style, overflow=text.overflow)
         return text
-    return Text(escaped(text), overflow="ignore" if text.startswith(COMMAND) else None)
+    return Text(printable(text), overflow="ignore" if text.startswith(COMMAND) else None)
 
 
 def _number(word: str) -> Cell:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
@@ -60,7 +59,7 @@ def matching_table(new: NewDataset) -> Report:
     unit_in_table = new.readings.unit and f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
         heading(
-            printable(str(new.destination)),
+            str(new.destination),
             f": {len(pairs)} photographs, {len(counts)} view{'s' * (len(counts) != 1)}, "
             f"{len(new.readings.joints)} encoders",
         ),
@@ -74,17 +73,15 @@ def matching_table(new: NewDataset) -> Report:
             "photograph",
             "view",
             *(f">{joint} [{unit}]" for joint, _, unit in shown),
-            rows=[tuple(map(printable, row)) for row in rows],
+            rows=rows,
         ),
         [
             *(
-                printable(
-                    f"View {view}: {counts[view]} photograph{'s' * (counts[view] != 1)}, camera "
-                    f"file {camera}."
-                )
+                f"View {view}: {counts[view]} photograph{'s' * (counts[view] != 1)}, camera file "
+                f"{camera}."
                 for view, camera in new.cameras.items()
             ),
-            *(Text(printable(f"note: {note}")) for note in new.notes),
+            *(f"note: {note}" for note in new.notes),
         ],
     )
 
@@ -95,16 +92,16 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
     folder, length = shlex.quote(str(destination)), scale_option(machine, board=False)
     return report(
         [
-            Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),
+            Text(f"Written to {destination}: {names}.", overflow="ignore"),
             "Calibrate it:",
-            printable(f"  legcal calibrate {folder} -o OUT{length}"),
+            f"  legcal calibrate {folder} -o OUT{length}",
         ]
     )
 
 
 def import_table(recording_import: Import) -> Report:
     """Return the used frames of recordings, and the reasons for leaving out others."""
-    blocks: list[Text | Table | list[str] | list[Text]] = []
+    blocks: list[Text | Table | list[str]] = []
     for view in recording_import.views:
         block = view.block
         stills, unused = block.stills, Counter(s.why_not for s in block.stills if s.why_not)
@@ -120,16 +117,16 @@ def import_table(recording_import: Import) -> Report:
         reasons = [f"{n} {why_not}" for why_not, n in unused.items()]
         blocks += [
             heading(
-                printable(view.name),
+                view.name,
                 f": {block.used} of {len(stills)} rests in {block.frames} frames are used",
             ),
             [
-                printable(f"Clock of {block.recording} less that of {block.readings}: {offset}."),
+                f"Clock of {block.recording} less that of {block.readings}: {offset}.",
                 f"Unit of the readings: {view.unit}.",
                 f"Not used: {', '.join(reasons)}." if reasons else "",
             ],
             table(">rest from [s]", ">for [s]", "used", rows=rows),
-            [Text(printable(f"note: {note}")) for note in block.notes],
+            [f"note: {note}" for note in block.notes],
         ]  # fmt: skip
     sigma = recording_import.encoder_sigma
     scatter_in_words = (
@@ -145,12 +142,10 @@ def examination_table(examination: Examination, output: Path | None = None) -> R
     from legcal.calibration.detection import DETECTION_PAGE, tables_of  # not needed to simulate
 
     return report(
-        heading(printable(examination.mechanism), f": {printable(examination.dataset)}"),
+        heading(examination.mechanism, f": {examination.dataset}"),
         *map(_with_dashes, tables_of(examination)),
         [
-            Text.assemble(
-                (f"{finding.severity}: ", _STYLES[finding.severity]), printable(finding.what)
-            )
+            Text.assemble((f"{finding.severity}: ", _STYLES[finding.severity]), finding.what)
             for finding in examination.findings
         ],
         [examination.sentence, "" if output is None else f"Look at {output / DETECTION_PAGE}."],
@@ -160,7 +155,7 @@ def examination_table(examination: Examination, output: Path | None = None) -> R
 def _with_dashes(table: Table) -> Table:
     """Return a table whose empty cells have dashes."""
     texts = [[cell if isinstance(cell, str) else cell.text for cell in row] for row in table.rows]
-    return replace(table, rows=[[printable(text) or "-" for text in row] for row in texts])
+    return replace(table, rows=[[text or "-" for text in row] for row in texts])
 
 
 def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Report:
