@@ -36,7 +36,8 @@ _LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 
 def matching_table(new: NewDataset) -> Report:
     """Return the interpretation of a folder and a table: columns, units, matched photographs."""
-    pairs = list(zip(new.matching.pairs, new.views, strict=True))
+    table_of, pairs = new.sheet.table, new.pairs
+    images, times = table_of.text("image"), table_of.text("time")
     shown = [
         (joint, *SHOWN_IN[leg.reading_unit])
         for leg in (new.machine.legs[j] for j in new.machine.motors)
@@ -45,16 +46,16 @@ def matching_table(new: NewDataset) -> Report:
     rows = [
         (
             str(k + 1),
-            new.rows[k].image or new.rows[k].time,
+            images[k] or times[k],
             photograph.name,
-            view,
+            photograph.view,
             *(f"{size * new.readings_of(k)[joint]:z.3f}" for joint, size, _ in shown),
         )
-        for (k, photograph), view in pairs[:_MOST]
+        for k, photograph in pairs[:_MOST]
     ]
     if len(pairs) > _MOST:
         rows.append(("...", "", f"{len(pairs) - _MOST} more", "", *("" for _ in shown)))
-    counts = {view: new.views.count(view) for view in new.cameras}
+    counts = Counter(photograph.view for _, photograph in pairs)
     noun = "whole lengths of legs" if new.readings.are_lengths else "readings"
     unit_in_table = new.readings.unit and f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
@@ -64,8 +65,8 @@ def matching_table(new: NewDataset) -> Report:
             f"{len(new.readings.joints)} encoders",
         ),
         [
-            *understood(new.columns, noun, unit_in_table),
-            f"Photographs are matched {new.matching.how}.",
+            *understood(new.sheet.taken, noun, unit_in_table),
+            f"Photographs are matched {new.matched}.",
         ],
         table(
             ">row",
