@@ -102,11 +102,6 @@ class View:
     unit: str  # of the readings, in words
     block: RecordingBlock
 
-    @property
-    def used(self) -> list[int]:
-        """Indices of the used frames."""
-        return [still.frame for still in self.block.stills if still.frame is not None]
-
 
 @dataclass(frozen=True, eq=False)
 class Import:
@@ -241,7 +236,8 @@ def _view(
     if len(times) < 3:
         raise DatasetError(f"{start} found {len(times)} frames, needed those of a recording.")
     frames_move = moving(changes)
-    moves = moving(reading_speeds(series.times, series.q))
+    speeds = np.abs(np.diff(series.q, axis=0)).max(axis=1) / np.diff(series.times)
+    moves = moving(speeds)
     for signal, motion in (("frames", frames_move), ("readings", moves)):
         if motion is None:
             raise DatasetError(
@@ -292,7 +288,7 @@ def _view(
         offset_sigma_s=apart.sigma,
         agreement=apart.agreement,
         stills=stills,
-        notes=[*recording.notes(), *series.notes],
+        notes=[*recording.notes, *series.notes],
     )
     return View(name, recording, q, scatter, series.unit, block)
 
@@ -337,7 +333,7 @@ def import_recordings(
         rows: list[tuple[object, ...]] = []
         for view in plan.views:
             (folder / _SHOTS / view.name).mkdir(parents=True)
-            used = view.used
+            used = [still.frame for still in view.block.stills if still.frame is not None]
             for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
                 name = f"{view.name}/{view.name}_{k + 1:03d}.png"
                 done, content = cv2.imencode(".png", frame.image)
@@ -397,11 +393,6 @@ def moving(speeds: Array) -> BoolArray | None:
     rest = np.median(logs[~fast])
     scatter = 1.4826 * np.median(np.abs(logs[~fast] - rest))
     return fast if np.median(logs[fast]) - rest > MIN_CONTRAST * scatter else None
-
-
-def reading_speeds(times: Array, q: Array) -> Array:
-    """Return the speeds (n - 1,) [m/s] of readings (n, n_motors) between times (n,)."""
-    return np.asarray(np.abs(np.diff(q, axis=0)).max(axis=1) / np.diff(times))
 
 
 def clock_offset(
