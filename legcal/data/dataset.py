@@ -372,6 +372,11 @@ def load_dataset(
         measurements, of_clicks = place_by_landmarks(
             path, machine, measurements, landmarks, may_be_wrong=not check_clicks
         )
+    unused = [
+        f"{yaml_path}: view {view.name} has no row in the table of measurements and is left out."
+        for v, view in enumerate(rows.views)
+        if not np.any(rows.view == v)
+    ]
     observations, body_edges = read_observed(folder, machine, measurements)
     dataset = Dataset(
         folder=folder,
@@ -387,7 +392,7 @@ def load_dataset(
         observations=observations,
         units=units,
         body_edges=body_edges,
-        table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),
+        table_notes=(*notes, *of_clicks, *unused),
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
@@ -486,15 +491,6 @@ def read_observed(
     table = read_observations(path, machine.legs, measurements, skip_stale=is_own)
     of_bodies = are_of_bodies(table)
     return table.choose(~of_bodies), table.choose(of_bodies) if of_bodies.any() else None
-
-
-def _unused_views(path: Path, measurements: Measurements) -> list[str]:
-    """Return a note for each view without a row."""
-    return [
-        f"{path}: view {view.name} has no row in the table of measurements and is left out."
-        for v, view in enumerate(measurements.views)
-        if not np.any(measurements.view == v)
-    ]
 
 
 def read_given_corners(

@@ -29,7 +29,7 @@ from legcal.data.photograph_matching import (
 from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import OutputKind, check_empty, check_path, new_files, result_folder
+from legcal.files.folder import OutputKind, check_destination, check_path, new_files, result_folder
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
 from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
@@ -250,9 +250,14 @@ def plan_new_dataset(
         "passive. Where the others do not determine the pose, click joints with legcal detect "
         "DATASET -o OUT --edit: at the base in a picture of each view, at the platform in all."
     ]
+    is_shipped = str(model) in shipped_names() and not os.path.isfile(model)
+    relative_path = os.path.relpath(machine.yaml_path.resolve(), destination.resolve())
+    stated_options = {"--encoder-sigma": options.encoder_sigma, "--unit": options.unit}
+    unused = [name for name, value in stated_options.items() if value]
+    unused_note = f"{' and '.join(unused)} had no effect: the table has no reading."
     return NewDataset(
         machine=machine,
-        model=_model_name(model, machine, destination),
+        model=str(model) if is_shipped else Path(relative_path).as_posix(),
         destination=destination,
         sheet=sheet,
         readings=sheet_readings,
@@ -263,7 +268,7 @@ def plan_new_dataset(
         notes=(
             *sheet.notes,
             *(unknown if sheet.unknown else []),
-            *_unused_notes(options, sheet.motors),
+            *([] if sheet.motors or not unused else [unused_note]),
             *sheet_readings.notes,
             *matching_notes,
             *sigma_notes,
@@ -350,15 +355,6 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
             except OSError:  # no links there
                 shutil.copy2(path, folder / name)
     return [new.destination / name for name in dataset_files]
-
-
-def _unused_notes(options: SheetOptions, motors: Sequence[Leg]) -> list[str]:
-    """Return a note on options that are of readings, where none is known."""
-    given = {"--encoder-sigma": options.encoder_sigma, "--unit": options.unit}
-    unused = [name for name, value in given.items() if value]
-    if motors or not unused:
-        return []
-    return [f"{' and '.join(unused)} had no effect: the table has no reading."]
 
 
 def _sigmas(
@@ -489,16 +485,9 @@ def _camera_by_exif(paths: Sequence[Path]) -> Camera | None:
     )
 
 
-def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
-    """Return the name of a model in a dataset: a relative path, or the name of a shipped model."""
-    if str(model) in shipped_names() and not os.path.isfile(model):
-        return str(model)
-    return Path(os.path.relpath(machine.yaml_path.resolve(), destination.resolve())).as_posix()
-
-
 def copy_example(destination: Path) -> None:
     """Copy the example (a simulated hexapod, 45 photographs), complete or not at all."""
-    check_empty(destination, _EXAMPLE_KIND)
+    check_destination(destination, _EXAMPLE_KIND, replaces=False)
     source = shipped_folder(_EXAMPLE)
     if not (source / DATASET_YAML).is_file():
         raise OutOfResources(

@@ -160,6 +160,9 @@ def plan(
     choices, scale_notes = Choices.by_tolerances(machine, only), tuple[str, ...]()
     if only is None:
         choices, scale_notes = measured_length(machine, board=board is not None)
+    laid = None if board is None else board_of(board)
+    if laid is not None:
+        parse_board(board_document(laid), Path("--board"))  # as a dataset does
     task = Task(
         Predictor(machine, selected_camera, predicted_noise, sigma_q, choices, sigma_by_joint),
         n_images,
@@ -169,7 +172,7 @@ def plan(
         listed,
         () if shot is None else _given_candidates(machine, shot),
         "" if shot is None else str(shot.folder),
-        None if board is None else _load_board(board),
+        laid,
         hand_held,
         seed,
     )
@@ -364,13 +367,6 @@ def _check(
         )
     if problems:
         raise UsageError(problems)
-
-
-def _load_board(board: str | Path | Board) -> Board:
-    """Load a board; DatasetError if a dataset could not use it."""
-    loaded = board_of(board)
-    parse_board(board_document(loaded), Path("--board"))
-    return loaded
 
 
 def _notes_on_missing_images(shot: Dataset | None) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from legcal.data.dataset_file import dataset_texts
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.files.folder import (
     OutputKind,
-    check_empty,
+    check_destination,
     output_path,
     result_folder,
 )
@@ -57,7 +57,7 @@ PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 def check_session(output: str | Path) -> Path:
     """Return the folder of a session; refuse to replace other files."""
     destination = output_path(output, PLANNED)
-    check_empty(destination, PLANNED)
+    check_destination(destination, PLANNED, replaces=False)
     return destination
 
 

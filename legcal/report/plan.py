@@ -54,9 +54,11 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         for i in worst
     ]
     growth = [(f"{n:.0f}", _scaled_in_words(plan, value)) for n, value in _selected_growth(plan)]
-    distances = [
-        (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
-    ]
+    A, distances = _measured_joints(plan), []
+    for view in plan.views:
+        centre = view.T_base_camera.translation
+        lengths = [*np.linalg.norm(A - centre, axis=1), centre[2] - A[:, 2].mean()]
+        distances.append((view.name, *(f"{1e3 * x:.0f}" for x in lengths)))
     legs = ", ".join(names)
     option = (
         scale_option(plan.machine, board=plan.board is not None)
@@ -109,12 +111,8 @@ def _to_be_added(plan: Plan) -> str:
 def _selected_growth(plan: Plan) -> list[tuple[float, float]]:
     """Return the criterion at selected numbers of images."""
     n = plan.n_images
-    chosen = {
-        max(n // 3, 1),
-        max(2 * n // 3, 1),
-        n,
-        *(k for k in plan.growth[:, 0] if n < k <= 4 * n),
-    }
+    more = plan.growth[:, 0][(plan.growth[:, 0] > n) & (plan.growth[:, 0] <= 4 * n)]
+    chosen = {max(n // 3, 1), max(2 * n // 3, 1), n, *more}
     return [(k, value) for k, value in plan.growth.tolist() if k in chosen]
 
 
@@ -129,19 +127,6 @@ def _scaled_in_words(plan: Plan, value: float) -> str:
 def _measured_joints(plan: Plan) -> Array:
     """Return the joints to which distances are measured, motors at zero, (3, 3) [m]."""
     return np.asarray(plan.machine.A_base[list(plan.machine.frame_legs)])
-
-
-def camera_distances(plan: Plan) -> dict[str, list[float]]:
-    """Return the distances of the lens of each view from joints of the base, and its height [m]."""
-    A = _measured_joints(plan)
-    distances = {}
-    for view in plan.views:
-        centre = view.T_base_camera.translation
-        distances[view.name] = [
-            *np.linalg.norm(A - centre, axis=1).tolist(),
-            float(centre[2] - A[:, 2].mean()),
-        ]
-    return distances
 
 
 def checklist(plan: Plan) -> list[str]:

@@ -6,8 +6,6 @@ import platform as system
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table as RichTable
@@ -18,7 +16,6 @@ from legcal.pages.document import (
     Block,
     Cell,
     Facts,
-    Items,
     Number,
     Page,
     Section,
@@ -30,7 +27,7 @@ from legcal.pages.document import Text as Paragraphs
 from legcal.version import __version__
 
 Part = str | Text | Table
-_ITEM, COMMAND = "- ", "  legcal "
+_COMMAND = "  legcal "
 _NAME = 8  # characters of names in a first column that do not break
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
 
@@ -100,7 +97,7 @@ def safe_text(text: str | Text) -> Text:
         if text.plain != (plain := escaped(text.plain)):
             return Text(plain, style=text.style, overflow=text.overflow)
         return text
-    return Text(printable(text), overflow="ignore" if text.startswith(COMMAND) else None)
+    return Text(printable(text), overflow="ignore" if text.startswith(_COMMAND) else None)
 
 
 def _number(word: str) -> Cell:
@@ -161,20 +158,14 @@ def record_section(command: str, when: str, more: Mapping[str, str]) -> Section:
     return Section("record", "Reproducibility", [Facts(facts)])
 
 
-def _blocks(report: Report, omitted: str) -> list[Any]:
+def _blocks(report: Report, omitted: str) -> list[Block]:
     """Return the parts of a report as blocks, without an omitted line."""
-    blocks: list[Any] = []
+    blocks: list[Block] = []
     for part in (part for group in report.groups for part in group):
         if isinstance(part, Table):
             blocks.append(part)
             continue
         lines = [line for line in part.plain.splitlines() if line.strip() and line != omitted]
-        for is_item, group in groupby(lines, lambda line: line.startswith(_ITEM)):
-            kind, texts = (
-                (Items if is_item else Paragraphs),
-                [line_of_group.removeprefix(_ITEM) for line_of_group in group],
-            )
-            if blocks and type(blocks[-1]) is kind:
-                texts = [*(blocks.pop().items if is_item else blocks.pop().paragraphs), *texts]
-            blocks.append(kind(texts))
+        before = blocks.pop().paragraphs if blocks and isinstance(blocks[-1], Paragraphs) else ()
+        blocks.append(Paragraphs([*before, *lines]))
     return blocks

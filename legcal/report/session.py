@@ -182,7 +182,7 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Repor
         table("view", ">images", *(f">{leg}" for leg in legs), rows=rows),
         [
             "Images of each view that show 40 % of a leg or more in one piece.",
-            _left_out(left_out) if left_out else "",
+            f"{left_out} image{'s' * (left_out > 1)} without legs are left out." * bool(left_out),
             _hidden(views.values(), n_images),
             f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
             "travel.",
@@ -223,14 +223,6 @@ def _hidden(views: Iterable[dict[str, Any]], n_images: int) -> str:
     )
 
 
-def _left_out(n: int) -> str:
-    return (
-        "1 image shows no leg and is left out."
-        if n == 1
-        else f"{n} images show no leg and are left out."
-    )
-
-
 def study_table(document: Mapping[str, Any]) -> Report:
     """Return the document of ``study paper`` as text, with the printed figures."""
     printed = document["as_printed"]
@@ -252,7 +244,7 @@ def study_table(document: Mapping[str, Any]) -> Report:
     rows.append((" before", *_printed_cells(printed["initial"])))
     rows.append((" after", *_printed_cells(printed["calibrated"])))
     notes = [*failures, printed["note"], *document["readings"]]
-    return report(table(*_COLUMNS, rows=rows), [Text(f"- {note}", style="dim") for note in notes])
+    return report(table(*_COLUMNS, rows=rows), [Text(note, style="dim") for note in notes])
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:

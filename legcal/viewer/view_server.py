@@ -288,29 +288,21 @@ class ViewServer(PageServer):
             for j in machine.motors:
                 leg = machine.legs[j]
                 label = machine.leg_names[j] if leg.actuator is None else leg.actuator.joint
+                reading = partial(lambda j: float(motion.posture.q[j]), j)
                 sliders[f"q{j}"] = _Slider(
-                    label,
-                    leg.reading_unit,
-                    ranges[j],
-                    partial(self._reading, j),
-                    partial(motion.read, j),
+                    label, leg.reading_unit, ranges[j], reading, partial(motion.read, j)
                 )
         for k, ends in enumerate(motion.ranges_of_coordinates()):
             which = int(motion.columns[k])
+            coordinate = partial(lambda k: float(motion.coordinates[k]), k)
             sliders[f"x{k}"] = _Slider(
                 COORDINATES[which],
                 "m" if which < 3 else "rad",
                 ends,
-                partial(self._coordinate, k),
+                coordinate,
                 partial(motion.place, k),
             )
         return sliders
-
-    def _reading(self, leg: int) -> float:
-        return float(self.motion.posture.q[leg])
-
-    def _coordinate(self, k: int) -> float:
-        return float(self.motion.coordinates[k])
 
     def _show_pose(self, value: float) -> None:
         self._pose = int(np.clip(round(value) - 1, 0, len(self._photographs.q) - 1))
