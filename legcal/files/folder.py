@@ -156,10 +156,8 @@ def check_destination(
     if is_earlier:
         found, remedy = f"an earlier {kind.noun}", f"{remedy}, or remove that one"
     elif replaces:
-        found, needed = (
-            "a folder with other files and",
-            f"{needed} or that of an earlier {kind.noun}",
-        )
+        found = "a folder with other files and"
+        needed += f" or that of an earlier {kind.noun}"
         if (destination / kind.marker).is_file():
             found += f" a {kind.marker} that is damaged or not of legcal"
             remedy = f"remove a damaged {kind.noun}, or {remedy}"

@@ -166,6 +166,8 @@ def _blocks(report: Report, omitted: str) -> list[Block]:
             blocks.append(part)
             continue
         lines = [line for line in part.plain.splitlines() if line.strip() and line != omitted]
-        before = blocks.pop().paragraphs if blocks and isinstance(blocks[-1], Paragraphs) else ()
-        blocks.append(Paragraphs([*before, *lines]))
+        if blocks and isinstance(before := blocks[-1], Paragraphs):
+            lines = [*before.paragraphs, *lines]
+            blocks.pop()
+        blocks.append(Paragraphs(lines))
     return blocks
