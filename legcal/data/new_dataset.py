@@ -408,31 +408,26 @@ def _cameras(
             f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
             f"cannot show, needed {NAME_NEEDED}; rename it."
         )
-    for_all = [file for view, file in map(split_camera, options) if not view]
-    of_one, problems = dict[str, str](), list[str]()
+    stated, problems = dict[str, str](), list[str]()  # camera files by view, "" for all
     for name, file in map(split_camera, options):
         if name and name not in views:
             problems.append(
                 f"--camera {name}={file} could not be used: found no view of that name, needed one "
                 f"of {few(views)}; correct it."
             )
-        elif name and of_one.setdefault(name, file) != file:
+        elif stated.setdefault(name, file) != file:
+            whose = f"{name}=" * bool(name)
             problems.append(
-                f"The camera file of view {describe(name)} could not be decided: found "
-                f"--camera {name}={of_one[name]} and --camera {name}={file}, needed one; leave "
+                f"The camera files could not be used: found --camera {whose}{stated[name]} and "
+                f"--camera {whose}{file}, needed one for all views, or VIEW=FILE for each; leave "
                 "the other out."
             )
-    if len(for_all) > 1:
-        problems.append(
-            f"The camera files could not be used: found {few(for_all)}, needed one for all views, "
-            "or --camera VIEW=FILE for each; correct them."
-        )
     path_of_view, made = dict[str, Path](), dict[Path, tuple[Camera, str]]()
     for view in views:
         images = [photograph.path for photograph in photographs if photograph.view == view]
         near = (images[0].parent, folder, folder.parent)
         files = [path / name for path in near for name in _CAMERA_NAMES]
-        text = of_one.get(view, for_all[0] if for_all else None)
+        text = stated.get(view, stated.get("", ""))
         if text or any(path.is_file() for path in files):
             path_of_view[view] = Path(text or next(path for path in files if path.is_file()))
         elif camera := _camera_by_exif(images):

@@ -11,7 +11,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from markupsafe import Markup, escape
 
-from legcal.errors import OutOfResources, UsageError, printable
+from legcal.errors import UsageError, printable
+from legcal.files.folder import out_of_resources
 from legcal.geometry.types import Array, IntArray
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
@@ -55,13 +56,8 @@ class Figure(Markup):
                 f"{file}: the drawing could not be written: found the suffix '{file.suffix}', "
                 "needed .svg; change the name."
             )
-        try:
+        with out_of_resources(file, "the drawing", "give another path"):
             file.write_text(str(self), encoding="utf-8")
-        except OSError as error:
-            raise OutOfResources(
-                f"{file}: the drawing could not be written: found '{error.strerror}', needed a "
-                "folder that can be written to; give another path."
-            ) from error
 
 
 @dataclass
