@@ -303,7 +303,9 @@ def load_dataset(
             cameras[camera_path] = read_camera(camera_path)
         except DatasetError as error:
             problems += error.facts
-    mechanism = _mechanism_path(folder, entry.mechanism)
+    mechanism = folder / entry.mechanism
+    if not os.path.isfile(mechanism) and entry.mechanism in shipped_names():
+        mechanism = shipped_folder("models") / f"{entry.mechanism}.yaml"
     if not os.path.exists(mechanism):
         found = f"{describe(entry.mechanism)}, no file there"
         needed = "the model, relative to this file, or the name of a shipped one"
@@ -459,14 +461,6 @@ def _invisible(dataset: Dataset) -> list[str]:
         for joint, names in rods.items()
         if not shown.intersection(names)
     ]
-
-
-def _mechanism_path(folder: Path, named: str) -> Path:
-    """Return the model's path relative to the dataset if there is one, else a shipped one."""
-    path = folder / named
-    if not os.path.isfile(path) and named in shipped_names():
-        return shipped_folder("models") / f"{named}.yaml"
-    return path
 
 
 def _view(name: str, entry: ViewEntry, camera: Camera, unit: float) -> View:

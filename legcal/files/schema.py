@@ -240,16 +240,10 @@ def parse_yaml(
     else:
         if isinstance(document, dict):
             return typing.cast("dict[str, Any]", document)
-        actual, needed = _kind_of(document), "'key: value' lines"
+        # The kind of content of a foreign file, without showing any of it
+        kinds = {str: "text", list: "a list", bool: "true or false", type(None): "nothing"}
+        actual, needed = kinds.get(type(document), "a number or date"), "'key: value' lines"
     raise kind(replace(unread, found=actual, needed=needed, remedy="write the file again"))
-
-
-def _kind_of(value: object) -> str:
-    """Return the kind of content in a foreign file, without showing any of it."""
-    if value is None:
-        return "nothing"
-    kinds = {str: "text", list: "a list", bool: "true or false", int: "a number", float: "a number"}
-    return kinds.get(type(value), "one value")
 
 
 def validate(
@@ -337,7 +331,9 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
 
     match error["type"]:
         case "extra_forbidden":
-            remedy = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
+            block = _annotation_at(schema, loc[:-1])
+            fields = getattr(block, "model_fields", {}).items()
+            remedy = closest(str(loc[-1]), [field.alias or name for name, field in fields])
             return refused("an unknown key", "", remedy, "used", Code.UNKNOWN_KEY)
         case "missing" if is_short:
             return refused(f"{loc[-1]} numbers", "more", "add what is missing")
@@ -356,14 +352,6 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
     template = _NEEDED.get(error["type"])
     needed = error["msg"] if template is None else template.format(**context)
     return refused(describe(error["input"]), needed, "correct the value")
-
-
-def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
-    """Return the keys of a schema at a location."""
-    annotation = _annotation_at(schema, loc)
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [f.alias or name for name, f in annotation.model_fields.items()]
-    return []
 
 
 def _annotation_at(schema: type[BaseModel], loc: Iterable[int | str]) -> Any:

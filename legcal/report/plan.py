@@ -53,7 +53,7 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         )
         for i in worst
     ]
-    growth = [(f"{n:.0f}", _scaled_in_words(plan, value)) for n, value in _selected_growth(plan)]
+    growth = _growth(plan)
     A, distances = _measured_joints(plan), []
     for view in plan.views:
         centre = view.T_base_camera.translation
@@ -108,20 +108,16 @@ def _to_be_added(plan: Plan) -> str:
     )
 
 
-def _selected_growth(plan: Plan) -> list[tuple[float, float]]:
-    """Return the criterion at selected numbers of images."""
-    n = plan.n_images
-    more = plan.growth[:, 0][(plan.growth[:, 0] > n) & (plan.growth[:, 0] <= 4 * n)]
-    chosen = {max(n // 3, 1), max(2 * n // 3, 1), n, *more}
-    return [(k, value) for k, value in plan.growth.tolist() if k in chosen]
-
-
-def _scaled_in_words(plan: Plan, value: float) -> str:
-    """Return the expected error at another value of the criterion, in words."""
-    ratio = value / plan.value
-    if plan.error is None:
-        return f"{ratio:.2f} relative to the plan"
-    return f"{1e3 * ratio * plan.error.mean_displacement:.3f} mm"
+def _growth(plan: Plan) -> list[tuple[str, str]]:
+    """Return the expected error at selected numbers of images."""
+    n, rows = plan.n_images, list[tuple[str, str]]()
+    for k, value in plan.growth.tolist():
+        if k in (max(n // 3, 1), max(2 * n // 3, 1), n) or n < k <= 4 * n:
+            ratio, words = value / plan.value, "{:.2f} relative to the plan"
+            if plan.error is not None:
+                ratio, words = 1e3 * ratio * plan.error.mean_displacement, "{:.3f} mm"
+            rows.append((f"{k:.0f}", words.format(ratio)))
+    return rows
 
 
 def _measured_joints(plan: Plan) -> Array:
