@@ -230,26 +230,23 @@ def _encoder_sigmas(
                     f"{too_large[1]}; give one standard deviation of a reading in metres."
                 )
         return stated, {}
-    motors = machine.motor_names
-    for name in stated:
-        if name not in motors:
-            raise DatasetError(
-                f"{path}: encoder_sigma.{name} could not be used: found no motor of that name, "
-                f"needed each of {', '.join(motors)}; {closest(name, motors)}"
-            )
-    missing = [name for name in motors if name not in stated and name not in commanded]
-    if missing:
-        raise DatasetError(
+    motors, sigmas, problems = machine.motor_names, dict[str, float](), list[str]()
+    for name, sigma in stated.items():
+        try:
+            if name not in motors:
+                raise ValueError(
+                    f"found no motor of that name, needed each of {', '.join(motors)}; "
+                    f"{closest(name, motors)}"
+                )
+            sigmas[name] = sigma_in(sigma, units[name], of_motor[name])
+        except ValueError as error:
+            problems.append(f"{path}: encoder_sigma.{name} could not be used: {error}")
+    if missing := [name for name in motors if name not in stated and name not in commanded]:
+        problems.append(
             f"{path}: encoder_sigma is incomplete: found none for {few(missing)}, needed one "
             f"standard deviation of a reading{'' if machine.actuators else ' [m]'}, for each motor "
             "in the unit of its readings where one turns; add it."
         )
-    sigmas, problems = dict[str, float](), list[str]()
-    for name, sigma in stated.items():
-        try:
-            sigmas[name] = sigma_in(sigma, units[name], of_motor[name])
-        except ValueError as error:
-            problems.append(f"{path}: encoder_sigma.{name} could not be used: {error}")
     if problems:
         raise DatasetError(problems)
     linear = [sigma for name, sigma in sigmas.items() if name not in turning]

@@ -293,24 +293,18 @@ def readings_in(
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
     notes += still_encoders(table.path, motors, readings)
-    groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
+    usual = f"correct the {what} or the limits"
+    remedies: dict[tuple[int, ...], str] = {(j,): usual for j in outside}  # by columns
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
         if not lengths and (cause := likely_cause(values[:, alike], *of_alike, place)):
-            groups |= {j: ([], "") for j in alike} | {alike[0]: (alike, cause)}
-    for j, actual in outside.items():
-        columns, remedy = groups.get(j, ([j], f"correct the {what} or the limits"))
-        if not columns:
-            continue
-        where = f"in {names[j]} " * (len(columns) > 1)
-        table.refuse_file(
-            Problem(
-                f"{what} are outside the travel: {where}{actual}",
-                remedy=remedy,
-                file=str(table.path),
-                columns=tuple(names[k] for k in columns),
-            )
-        )
+            kept = {columns: text for columns, text in remedies.items() if columns[0] not in alike}
+            remedies = {**kept, tuple(alike): cause}
+    for columns, remedy in remedies.items():
+        where = f"in {names[columns[0]]} " * (len(columns) > 1)
+        said = f"{what} are outside the travel: {where}{outside[columns[0]]}"
+        of_columns = tuple(names[k] for k in columns)
+        table.refuse_file(Problem(said, remedy=remedy, file=str(table.path), columns=of_columns))
     if not outside and not lengths:
         for problem in doubtful_units(table.path, values, motors, stated, place):
             table.refuse_file(problem)

@@ -69,18 +69,12 @@ class Canvas:
     title: str
     parts: list[str] = field(default_factory=list)
 
-    def line(
-        self, x1: float, y1: float, x2: float, y2: float, colour: str = RULE, width: float = 1.0
-    ) -> None:
-        """Draw a line."""
-        self.segment((x1, y1), (x2, y2), colour, width)
-
     def segment(
         self,
         start: Sequence[float] | Array,
         end: Sequence[float] | Array,
-        colour: str,
-        width: float,
+        colour: str = RULE,
+        width: float = 1.0,
         opacity: float = 1.0,
     ) -> None:
         """Draw a line between two points."""
@@ -224,7 +218,7 @@ def log_bars(
         canvas.text(left + 28.0, y + 9.0, bars.label, colour=DIM)
     for decade in np.arange(np.ceil(low), high + 1.0).tolist():
         x = place(10.0**decade)
-        canvas.line(x, top, x, canvas.height - 22.0)
+        canvas.segment((x, top), (x, canvas.height - 22.0))
         label = f"{10.0**decade:g}"
         canvas.text(x, canvas.height - 6.0, label, anchor="middle", colour=DIM)
     for k, name in enumerate(names):
@@ -235,7 +229,7 @@ def log_bars(
                 tip = f"{name}, {bars.label}: {value:.3g} {unit}"
                 canvas.box(left, y + dy, place(value) - left, 7.0, colour, tip)
         if marks and (value := marks.values[k]):
-            canvas.line(place(value), y - 1.5, place(value), y + 9.5, INK, 2.0)
+            canvas.segment((place(value), y - 1.5), (place(value), y + 9.5), INK, 2.0)
     return canvas
 
 
@@ -328,7 +322,7 @@ def scatter(
     canvas = Canvas(width, height, title)
     for tick, word in y_ticks:
         v = float(bottom - (bottom - top) * y_axis.share(np.array(tick)))
-        canvas.line(left, v, width - 6.0, v, GREY if tick == 0.0 else RULE)
+        canvas.segment((left, v), (width - 6.0, v), GREY if tick == 0.0 else RULE)
         canvas.text(left - 6.0, v + 4.0, word, anchor="end", size=11, colour=DIM)
     every = -(-len(names) // 24)
     marks = list(zip(range(len(names)), names, strict=True))[::every] if words else [
@@ -337,7 +331,7 @@ def scatter(
     for tick, word in marks:
         u = float(left + (width - left - 6.0) * x_axis.share(np.array(tick)))
         if not words:
-            canvas.line(u, top, u, bottom)
+            canvas.segment((u, top), (u, bottom))
         if upwards:
             canvas.text(
                 u + 4.0, bottom + 6.0, word, anchor="end", size=11, colour=DIM, upwards=True
@@ -345,7 +339,7 @@ def scatter(
         else:
             at = min(u, width - 3.3 * len(word))  # so that the last one is not cut
             canvas.text(at, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
-    canvas.line(left, top, left, bottom, GREY)
+    canvas.segment((left, top), (left, bottom), GREY)
     if diagonal:
         ends = np.array([max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)])
         canvas.path(on_paper(ends, ends), GREY, 1.0)

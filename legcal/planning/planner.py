@@ -332,13 +332,8 @@ def _visible_places(
             visible.append((place, contributions))
         progress("Camera places", k + 1, len(places))
     n_needed = 1 if task.hand_held else task.n_views
-    if not visible or (task.places and len(visible) < n_needed):
-        raise NotVisible(_no_visible_places(task, blind, len(places), n_needed))
-    return visible
-
-
-def _no_visible_places(task: Task, blind: Sequence[Place], n_places: int, needed: int) -> str:
-    """Describe that too few places see legs, and the board."""
+    if visible and not (task.places and len(visible) < n_needed):
+        return visible
     names = ", ".join(place.name for place in blind if place.name) or "the cameras"
     remedy = (
         f"point {names} at the machine, from where no plate or other leg hides the legs, near "
@@ -349,12 +344,12 @@ def _no_visible_places(task: Task, blind: Sequence[Place], n_places: int, needed
             "use a board with larger squares, or a smaller one that is whole in the image from "
             f"{names}"
         )
-    return (
-        f"{task.machine.yaml_path}: no session could be planned: only {n_places - len(blind)} of "
-        f"{n_places} camera positions see legs{' and the board' * (task.board is not None)} with "
-        f"the tripod tolerance of {1e2 * task.setting.shift:.2g} cm and "
-        f"{np.degrees(task.setting.turn):g} deg; {needed} {'are' if needed > 1 else 'is'} needed; "
-        f"{remedy}."
+    raise NotVisible(
+        f"{task.machine.yaml_path}: no session could be planned: only {len(visible)} of "
+        f"{len(places)} camera positions see legs{' and the board' * (task.board is not None)} "
+        f"with the tripod tolerance of {1e2 * task.setting.shift:.2g} cm and "
+        f"{np.degrees(task.setting.turn):g} deg; {n_needed} {'are' if n_needed > 1 else 'is'} "
+        f"needed; {remedy}."
     )
 
 
