@@ -22,7 +22,6 @@ from legcal.causes import Cause, by_cause
 from legcal.data.reading_units import (
     ReadingUnit,
     UnitPlace,
-    default_unit,
     doubtful_units,
     joint_values,
     legs_with_readings,
@@ -239,18 +238,13 @@ def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
     return f"{len(rows)} images of {of_views} ({few([names[row] for row in rows])})"
 
 
-def reading_columns(units: Mapping[str, ReadingUnit]) -> list[Column]:
-    """Return the columns of readings, in some units by motor."""
-    return [Column(name, what="reading", unit=unit.words) for name, unit in units.items()]
-
-
 def readings_in(
     table: Table,
     legs: Sequence[Leg],
-    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
+    units: Mapping[str, ReadingUnit],
     sigma: Array | None = None,
     *,
-    place: UnitPlace = "",
+    place: UnitPlace,
     lengths: bool = False,
     headings: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Array, tuple[str, ...]]:
@@ -260,13 +254,13 @@ def readings_in(
     they exceed rounding and noise. Many readings that hardly move in their unit and use the travel
     in a larger one are refused as well.
 
-    *units* are stated in a *place*, m and rad by default; *sigma* (n_motors,) are their standard
-    deviations. The numbers may be whole *lengths* of legs, under *headings* of the owner.
+    *units* are stated in a *place*; *sigma* (n_motors,) are their standard deviations. The numbers
+    may be whole *lengths* of legs, under *headings* of the owner.
     """
     motors = legs_with_readings(legs)
     values = table.numbers(str(leg.prismatic) for leg in motors)
     names = [headings.get(str(leg.prismatic), str(leg.prismatic)) for leg in motors]
-    stated = [units.get(str(leg.prismatic), default_unit(leg)) for leg in motors]
+    stated = [units[str(leg.prismatic)] for leg in motors]
     readings = joint_values(values, stated)
     readings = readings_of_lengths(readings, motors) if lengths else readings
     noise = np.zeros(len(motors)) if sigma is None else NOISY * sigma
@@ -342,7 +336,7 @@ def measurement_table(
         [
             *(Column(name, "text", required=name != "pose") for name in _TEXTS),
             Column("time", unit="seconds", required=False, blank=True),
-            *reading_columns(units),
+            *(Column(name, what="reading", unit=unit.words) for name, unit in units.items()),
         ],
         needed="one row for each image; record measurements",
     )

@@ -318,7 +318,6 @@ def _view_notes(pattern: str | None, photographs: Sequence[Photograph]) -> Itera
 
 def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
     """Write a dataset, complete or not at all; return its files, photographs excepted."""
-    check_path(new.destination, DATASET_FOLDER)
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
     names |= {camera: camera.name for camera in new.made_cameras}

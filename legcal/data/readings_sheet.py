@@ -22,6 +22,7 @@ from legcal.data.reading_units import (
     UNITS,
     Meaning,
     ReadingUnit,
+    default_unit,
     in_travel,
     is_known,
     meanings,
@@ -290,7 +291,9 @@ class ReadingsSheet:
                     "the headings."
                 )
             if not stated and in_si:
-                stated, origin = {"rad" if turns else "m"}, "as joints of the model have it"
+                units |= dict(zip(joints, map(default_unit, legs), strict=True))
+                origins.append("as joints of the model have it")
+                continue
             if not stated:
                 origin = "the unit in which the readings lie in the travel of the legs"
             meaning = self._meaning(legs, "".join(stated), lengths)

@@ -323,7 +323,6 @@ def import_recordings(
     plan: Import, *, force: bool = False, progress: Report = no_progress
 ) -> list[Path]:
     """Write the dataset of an import, complete or not at all; return its files but the images."""
-    check_path(plan.destination, DATASET_FOLDER)
     motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     with (
