@@ -420,12 +420,12 @@ def _without_readings(path: Path, machine: Machine, unread: Sequence[str]) -> st
 
 def _without_photographs(dataset: Dataset) -> str:
     """Return the problem of a dataset with no image file at all; "" if there are some."""
-    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    if len(paths) < 2 or any(path is None or os.path.exists(path) for path in paths):
+    images = dataset.measurements.image
+    if len(images) < 2 or not all(images) or len(rows_with_image(dataset)):
         return ""
     return (
-        f"{dataset.table_path}: the photographs could not be read: found none of the {len(paths)} "
-        f"that it names, the first of them {dataset.measurements.image[0]}, needed their files in "
+        f"{dataset.table_path}: the photographs could not be read: found none of the {len(images)} "
+        f"that it names, the first of them {images[0]}, needed their files in "
         f"{dataset.folder}; take or copy them there under these names, or correct the column image."
     )
 

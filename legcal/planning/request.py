@@ -15,7 +15,7 @@ from legcal.calibration.joint_fit.predicted import (
     Predictor,
     read_noise,
 )
-from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset import Dataset, load_dataset, rows_with_image
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError
 from legcal.geometry.types import Array
@@ -367,8 +367,7 @@ def _notes_on_missing_images(shot: Dataset | None) -> tuple[str, ...]:
     if shot is None or shot.observations is not None:
         return ()
     n = shot.measurements.n_rows
-    paths = [shot.image_path(row) for row in range(n)]
-    missing = sum(path is not None and not path.is_file() for path in paths)
+    missing = sum(map(bool, shot.measurements.image)) - len(rows_with_image(shot))
     if not missing:
         return ()
     return (

@@ -238,15 +238,15 @@ def _view(
     frames_move = moving(changes)
     speeds = np.abs(np.diff(series.q, axis=0)).max(axis=1) / np.diff(series.times)
     moves = moving(speeds)
-    for signal, motion in (("frames", frames_move), ("readings", moves)):
-        if motion is None:
-            raise DatasetError(
-                f"{start} found {signal} that change at one rate all the time, needed a machine "
-                "that rests at each pose and moves between; for photographs of single poses use "
-                f"legcal init. ({series.source if signal == 'readings' else recording.path})"
-            )
-    assert frames_move is not None
-    assert moves is not None
+    if frames_move is None or moves is None:
+        signal, source = (
+            ("readings", series.source) if moves is None else ("frames", recording.path)
+        )
+        raise DatasetError(
+            f"{start} found {signal} that change at one rate all the time, needed a machine that "
+            "rests at each pose and moves between; for photographs of single poses use legcal "
+            f"init. ({source})"
+        )
     if given is not None:
         apart = Offset(given, 0.0, None)
     else:
