@@ -273,14 +273,6 @@ class Plan:
     def document(self) -> dict[str, Any]:
         """Return the document of ``legcal plan --json``, a :class:`PlanDocument`."""
         error, names, setting, noise = self.error, self.machine.leg_names, self.setting, self.noise
-        expected = None
-        if error is not None:
-            expected = ExpectedError(
-                dX_m=error.mean_displacement,
-                dE_rad=error.mean_rotation,
-                dX_max_m=error.max_displacement,
-                dE_max_rad=error.max_rotation,
-            )
         rows = zip(self.names, self.sigma.tolist(), self.units, strict=True)
         return PlanDocument.describing(
             self,
@@ -289,7 +281,7 @@ class Plan:
             mechanism=self.machine.name,
             images=self.n_images,
             criterion="d" if error is None else "mean",
-            expected=expected,
+            expected=None if error is None else ExpectedError(**error.fields()),
             tolerance=Tolerance(
                 camera_m=setting.shift,
                 camera_rad=setting.turn,
