@@ -98,23 +98,9 @@ def worker_pool(
     one thread in each. When the block is left by an exception, processes end at once, in the middle
     of their work.
 
-    Parameters
-    ----------
-    workers : int, str or Submitter
-        Number of processes, the address of a Dask scheduler, or a Dask client or executor.
-    failure : str
-        Beginning of the message if workers are lost.
-    in_order : bool
-        Whether results come in the order of the rows, which are all taken at once. Otherwise they
-        come as they are finished, and rows are taken as workers become free: memory does not grow
-        with their number.
-
-    Raises
-    ------
-    OutOfResources
-        If a process is ended from outside, or a cluster does not answer or is lost.
-    UsageError
-        If workers cannot be used.
+    Results come in the order of the rows, which are all taken at once, or, unless *in_order*, as
+    they are finished, and rows are taken as workers become free: memory does not grow with their
+    number. A message about workers that are lost begins with *failure*.
     """
     if isinstance(workers, SupportsIndex) and workers <= 1:
         yield in_turn

@@ -2,16 +2,10 @@
 
 from pathlib import Path
 
-import numpy as np
-import pytest
-import yaml
-from fuzzing.mutations import mutate
 from fuzzing.running import count_cases, drawn_cases
 from machines import copied_model
-from made_inputs import made_input
 
 from legcal import LegcalError, load_mechanism
-from legcal.files.schema import _PLAIN_TEXT, _Loader, _QuickLoader
 
 
 def test_mutated_files_are_used_or_refused_in_time_and_memory() -> None:
@@ -21,23 +15,6 @@ def test_mutated_files_are_used_or_refused_in_time_and_memory() -> None:
     assert count.n_cases == len(cases)
     assert not count.faults, [(ended.case.name, ended.fault) for ended in count.faults]
     assert min(count.codes["0"], count.codes["2"]) > 0
-
-
-@pytest.mark.skipif(not yaml.__with_libyaml__, reason="there is one parser of YAML")
-def test_both_parsers_of_yaml_read_the_same() -> None:
-    chance, n_read = np.random.default_rng(0), 0
-    valid = (made_input("plain") / "dataset.yaml").read_bytes()
-    for _ in range(300):
-        content = mutate(valid, "yaml", chance)
-        if not _PLAIN_TEXT.fullmatch(content):
-            continue
-        try:
-            quick = yaml.load(content, Loader=_QuickLoader)
-        except (yaml.YAMLError, RecursionError):  # the other one says what is wrong
-            continue
-        n_read += 1
-        assert repr(yaml.load(content, Loader=_Loader)) == repr(quick), content
-    assert n_read > 50
 
 
 def test_text_from_files_is_shown_on_one_short_line_without_control_characters() -> None:

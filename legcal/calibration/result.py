@@ -390,24 +390,14 @@ def _platform(calibration: Calibration) -> PlatformBlock | None:
         ],
         workspace=None if workspace is None else WorkspaceAccuracy(**_predicted(workspace)),
         sensitivities=[
-            SensitivityRow(what=what, **_errors(error)) for what, error in platform.effects.items()
+            SensitivityRow(what=what, **error.fields()) for what, error in platform.effects.items()
         ],
     )
 
 
-def _errors(error: PlatformError, prefix: str = "") -> dict[str, Any]:
-    """Return means and maxima of an error of the platform, as the document names them."""
-    return {
-        f"{prefix}dX_m": error.mean_displacement,
-        f"{prefix}dE_rad": error.mean_rotation,
-        f"{prefix}dX_max_m": error.max_displacement,
-        f"{prefix}dE_max_rad": error.max_rotation,
-    }
-
-
 def _predicted(error: PlatformError) -> dict[str, Any]:
     """Return the fields of :class:`WorkspaceAccuracy`."""
-    return {"poses": len(error.displacement), **_errors(error, "sigma_")}
+    return {"poses": len(error.displacement), **error.fields("sigma_")}
 
 
 # Joints in the links of the model

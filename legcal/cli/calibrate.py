@@ -259,13 +259,7 @@ def _page_of_check(output: Path) -> Path:
             f"{output}: the page of the check could not be written: found the result of a "
             "calibration, needed another folder; give one."
         )
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(
-            f"{output}: the page of the check could not be written: found '{error.strerror}', "
-            "needed a path that can be created; give another output folder."
-        ) from error
+    output.mkdir(parents=True, exist_ok=True)
     page = output / REPORT_NAME
     PAGE.check_place(page)
     return page

@@ -148,7 +148,7 @@ def new(
     show(
         as_json,
         lambda: description | {"paths": paths},
-        lambda: report(list(map(printable, lines))),
+        lambda: report(lines),
     )
 
 

@@ -231,17 +231,13 @@ def _writing_to_stdout() -> Iterator[None]:
             raise
         except OSError as error:
             cause = f"'{error.strerror}'"
-            _leave_stdout()
+            # The rest of the buffer is lost, so that nothing fails there again.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.stdout = None
     raise OutOfResources(
         f"The output could not be printed: found {cause}, needed a stdout that takes it; send it "
         "elsewhere."
     )
-
-
-def _leave_stdout() -> None:
-    """Discard the rest of the buffer of stdout, so that nothing fails there again."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.stdout = None
 
 
 def print_failure(
@@ -273,7 +269,8 @@ def print_failure(
 
 def open_browser(address: str) -> None:
     """Open the browser at an address, where it can have windows."""
-    if _has_screen():
+    variables = ("DISPLAY", "WAYLAND_DISPLAY")
+    if sys.platform in ("win32", "darwin") or any(map(os.environ.get, variables)):
         import webbrowser
 
         webbrowser.open(address)
@@ -285,10 +282,3 @@ def serve(server: PageServer, *, browser: bool = True) -> None:
         open_browser(str(server.address))
     with suppress(KeyboardInterrupt):
         server.run()
-
-
-def _has_screen() -> bool:
-    """Return whether a browser with windows can be opened."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -47,8 +47,7 @@ def simulate(
         typer.Option(
             metavar="N|CSV",
             help="Poses for each of the three views, every motor near an end of its travel; or a "
-            "CSV of readings in metres (radians of arms), the motors' joints in its header, for "
-            "all views.",
+            "table of readings for all views, as for init, in m and rad under the names of joints.",
             show_default="15",
         ),
     ] = None,

@@ -204,12 +204,6 @@ def _encoder_sigmas(
     """Return the standard deviation of readings in metres, and the deviations by joint [m or rad].
 
     Hobby servos need none: their readings are commands, assumed accurate to half a degree.
-
-    Raises
-    ------
-    DatasetError
-        If one number is stated and a motor turns, if a name is not a motor joint, or if a motor has
-        no standard deviation.
     """
     turning = [a.joint for a in machine.actuators if a.turns]
     of_motor = {str(leg.prismatic): leg for leg in legs_with_readings(machine.legs)}
@@ -236,26 +230,23 @@ def _encoder_sigmas(
                     f"{too_large[1]}; give one standard deviation of a reading in metres."
                 )
         return stated, {}
-    motors = machine.motor_names
-    for name in stated:
-        if name not in motors:
-            raise DatasetError(
-                f"{path}: encoder_sigma.{name} could not be used: found no motor of that name, "
-                f"needed each of {', '.join(motors)}; {closest(name, motors)}"
-            )
-    missing = [name for name in motors if name not in stated and name not in commanded]
-    if missing:
-        raise DatasetError(
+    motors, sigmas, problems = machine.motor_names, dict[str, float](), list[str]()
+    for name, sigma in stated.items():
+        try:
+            if name not in motors:
+                raise ValueError(
+                    f"found no motor of that name, needed each of {', '.join(motors)}; "
+                    f"{closest(name, motors)}"
+                )
+            sigmas[name] = sigma_in(sigma, units[name], of_motor[name])
+        except ValueError as error:
+            problems.append(f"{path}: encoder_sigma.{name} could not be used: {error}")
+    if missing := [name for name in motors if name not in stated and name not in commanded]:
+        problems.append(
             f"{path}: encoder_sigma is incomplete: found none for {few(missing)}, needed one "
             f"standard deviation of a reading{'' if machine.actuators else ' [m]'}, for each motor "
             "in the unit of its readings where one turns; add it."
         )
-    sigmas, problems = dict[str, float](), list[str]()
-    for name, sigma in stated.items():
-        try:
-            sigmas[name] = sigma_in(sigma, units[name], of_motor[name])
-        except ValueError as error:
-            problems.append(f"{path}: encoder_sigma.{name} could not be used: {error}")
     if problems:
         raise DatasetError(problems)
     linear = [sigma for name, sigma in sigmas.items() if name not in turning]
@@ -309,7 +300,9 @@ def load_dataset(
             cameras[camera_path] = read_camera(camera_path)
         except DatasetError as error:
             problems += error.facts
-    mechanism = _mechanism_path(folder, entry.mechanism)
+    mechanism = folder / entry.mechanism
+    if not os.path.isfile(mechanism) and entry.mechanism in shipped_names():
+        mechanism = shipped_folder("models") / f"{entry.mechanism}.yaml"
     if not os.path.exists(mechanism):
         found = f"{describe(entry.mechanism)}, no file there"
         needed = "the model, relative to this file, or the name of a shipped one"
@@ -378,6 +371,11 @@ def load_dataset(
         measurements, of_clicks = place_by_landmarks(
             path, machine, measurements, landmarks, may_be_wrong=not check_clicks
         )
+    unused = [
+        f"{yaml_path}: view {view.name} has no row in the table of measurements and is left out."
+        for v, view in enumerate(rows.views)
+        if not np.any(rows.view == v)
+    ]
     observations, body_edges = read_observed(folder, machine, measurements)
     dataset = Dataset(
         folder=folder,
@@ -393,7 +391,7 @@ def load_dataset(
         observations=observations,
         units=units,
         body_edges=body_edges,
-        table_notes=(*notes, *of_clicks, *_unused_views(yaml_path, rows)),
+        table_notes=(*notes, *of_clicks, *unused),
         overrides=entry.parameters.overrides(yaml_path),
         boards=boards,
         corners=read_given_corners(folder / CORNERS_NAME, boards, measurements),
@@ -422,12 +420,12 @@ def _without_readings(path: Path, machine: Machine, unread: Sequence[str]) -> st
 
 def _without_photographs(dataset: Dataset) -> str:
     """Return the problem of a dataset with no image file at all; "" if there are some."""
-    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    if len(paths) < 2 or any(path is None or os.path.exists(path) for path in paths):
+    images = dataset.measurements.image
+    if len(images) < 2 or not all(images) or len(rows_with_image(dataset)):
         return ""
     return (
-        f"{dataset.table_path}: the photographs could not be read: found none of the {len(paths)} "
-        f"that it names, the first of them {dataset.measurements.image[0]}, needed their files in "
+        f"{dataset.table_path}: the photographs could not be read: found none of the {len(images)} "
+        f"that it names, the first of them {images[0]}, needed their files in "
         f"{dataset.folder}; take or copy them there under these names, or correct the column image."
     )
 
@@ -462,14 +460,6 @@ def _invisible(dataset: Dataset) -> list[str]:
     ]
 
 
-def _mechanism_path(folder: Path, named: str) -> Path:
-    """Return the model's path relative to the dataset if there is one, else a shipped one."""
-    path = folder / named
-    if not os.path.isfile(path) and named in shipped_names():
-        return shipped_folder("models") / f"{named}.yaml"
-    return path
-
-
 def _view(name: str, entry: ViewEntry, camera: Camera, unit: float) -> View:
     """Return a view of the measurements; the unit of T_base_camera is in metres."""
     T = entry.T_base_camera
@@ -492,15 +482,6 @@ def read_observed(
     table = read_observations(path, machine.legs, measurements, skip_stale=is_own)
     of_bodies = are_of_bodies(table)
     return table.choose(~of_bodies), table.choose(of_bodies) if of_bodies.any() else None
-
-
-def _unused_views(path: Path, measurements: Measurements) -> list[str]:
-    """Return a note for each view without a row."""
-    return [
-        f"{path}: view {view.name} has no row in the table of measurements and is left out."
-        for v, view in enumerate(measurements.views)
-        if not np.any(measurements.view == v)
-    ]
 
 
 def read_given_corners(

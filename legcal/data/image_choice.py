@@ -140,13 +140,7 @@ def sequences_of(dataset: Dataset) -> tuple[IntArray, ...]:
 
 
 def chosen_images(dataset: Dataset, text: str) -> BoolArray:
-    """Return the images that a text names, (n_rows,).
-
-    Raises
-    ------
-    UsageError
-        If it names images that the dataset does not have, all of them, or a range without order.
-    """
+    """Return the images that a text names, (n_rows,): some, not all of the dataset's."""
     chosen = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
     try:
         for part in text.split(","):
@@ -164,13 +158,7 @@ def own_zeros(
     """Return the images of each ``MOTOR@IMAGES``, in which that motor has a zero of its own.
 
     ``all@IMAGES`` gives all motors one, as after homing. All images of a pose have its readings,
-    and so belong to it if one of them is named.
-
-    Raises
-    ------
-    UsageError
-        If there is no such motor, or images cannot be used: other ones of the motor, or none, have
-        to remain.
+    and so belong to it if one of them is named. Other images of the motor have to remain.
     """
     pose, zeros = dataset.measurements.pose, list[OwnZero]()
     kept = np.ones(len(pose), dtype=np.bool_) if left_out is None else ~left_out

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 
 from legcal.data.measurements import Measurements
-from legcal.data.reasons import Reason, Rejection, have_reason
+from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.tables import Table
 from legcal.geometry.types import BoolArray, IntArray
 
@@ -62,7 +62,8 @@ class ImageTable(Table):
 
     def rejected_for(self, *reasons: Reason) -> BoolArray:
         """Return a mask (n,) of the observations rejected for any of some reasons."""
-        return have_reason(self.columns()["reason"], *reasons)
+        why = self.columns()["reason"]
+        return np.array([rejection.reason in reasons for rejection in why], dtype=np.bool_)
 
 
 _Table = TypeVar("_Table", bound=ImageTable)

@@ -139,12 +139,6 @@ def place_by_landmarks(
 
     The clicks of a view take precedence over its ``T_base_camera``. If they *may_be_wrong*, a
     problem is a note, and the view stays as it is.
-
-    Raises
-    ------
-    DatasetError
-        If a view has too few clicks to place its camera, or a click contradicts the others of its
-        view: with one sentence for each view or click.
     """
     views, problems, notes = list(measurements.views), list[str](), list[str]()
     for v, clicked_camera in cameras_by_landmarks(path, machine, measurements, landmarks).items():

@@ -22,7 +22,6 @@ from legcal.causes import Cause, by_cause
 from legcal.data.reading_units import (
     ReadingUnit,
     UnitPlace,
-    default_unit,
     doubtful_units,
     joint_values,
     legs_with_readings,
@@ -239,18 +238,13 @@ def images_in_words(measurements: Measurements, rows: Sequence[int]) -> str:
     return f"{len(rows)} images of {of_views} ({few([names[row] for row in rows])})"
 
 
-def reading_columns(units: Mapping[str, ReadingUnit]) -> list[Column]:
-    """Return the columns of readings, in some units by motor."""
-    return [Column(name, what="reading", unit=unit.words) for name, unit in units.items()]
-
-
 def readings_in(
     table: Table,
     legs: Sequence[Leg],
-    units: Mapping[str, ReadingUnit] = MappingProxyType({}),
+    units: Mapping[str, ReadingUnit],
     sigma: Array | None = None,
     *,
-    place: UnitPlace = "",
+    place: UnitPlace,
     lengths: bool = False,
     headings: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Array, tuple[str, ...]]:
@@ -260,13 +254,13 @@ def readings_in(
     they exceed rounding and noise. Many readings that hardly move in their unit and use the travel
     in a larger one are refused as well.
 
-    *units* are stated in a *place*, m and rad by default; *sigma* (n_motors,) are their standard
-    deviations. The numbers may be whole *lengths* of legs, under *headings* of the owner.
+    *units* are stated in a *place*; *sigma* (n_motors,) are their standard deviations. The numbers
+    may be whole *lengths* of legs, under *headings* of the owner.
     """
     motors = legs_with_readings(legs)
     values = table.numbers(str(leg.prismatic) for leg in motors)
     names = [headings.get(str(leg.prismatic), str(leg.prismatic)) for leg in motors]
-    stated = [units.get(str(leg.prismatic), default_unit(leg)) for leg in motors]
+    stated = [units[str(leg.prismatic)] for leg in motors]
     readings = joint_values(values, stated)
     readings = readings_of_lengths(readings, motors) if lengths else readings
     noise = np.zeros(len(motors)) if sigma is None else NOISY * sigma
@@ -293,24 +287,18 @@ def readings_in(
                 f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
     notes += still_encoders(table.path, motors, readings)
-    groups = dict[int, tuple[list[int], str]]()  # columns with one mistake, by their first one
+    usual = f"correct the {what} or the limits"
+    remedies: dict[tuple[int, ...], str] = {(j,): usual for j in outside}  # by columns
     for alike in often.values():
         of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
         if not lengths and (cause := likely_cause(values[:, alike], *of_alike, place)):
-            groups |= {j: ([], "") for j in alike} | {alike[0]: (alike, cause)}
-    for j, actual in outside.items():
-        columns, remedy = groups.get(j, ([j], f"correct the {what} or the limits"))
-        if not columns:
-            continue
-        where = f"in {names[j]} " * (len(columns) > 1)
-        table.refuse_file(
-            Problem(
-                f"{what} are outside the travel: {where}{actual}",
-                remedy=remedy,
-                file=str(table.path),
-                columns=tuple(names[k] for k in columns),
-            )
-        )
+            kept = {columns: text for columns, text in remedies.items() if columns[0] not in alike}
+            remedies = {**kept, tuple(alike): cause}
+    for columns, remedy in remedies.items():
+        where = f"in {names[columns[0]]} " * (len(columns) > 1)
+        said = f"{what} are outside the travel: {where}{outside[columns[0]]}"
+        of_columns = tuple(names[k] for k in columns)
+        table.refuse_file(Problem(said, remedy=remedy, file=str(table.path), columns=of_columns))
     if not outside and not lengths:
         for problem in doubtful_units(table.path, values, motors, stated, place):
             table.refuse_file(problem)
@@ -348,7 +336,7 @@ def measurement_table(
         [
             *(Column(name, "text", required=name != "pose") for name in _TEXTS),
             Column("time", unit="seconds", required=False, blank=True),
-            *reading_columns(units),
+            *(Column(name, what="reading", unit=unit.words) for name, unit in units.items()),
         ],
         needed="one row for each image; record measurements",
     )

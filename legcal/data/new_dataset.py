@@ -8,7 +8,6 @@ folder stay where they are; others are linked, or copied where the file system h
 
 from __future__ import annotations
 
-import itertools
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,9 +19,8 @@ from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.dataset_file import MEASUREMENTS, dataset_texts
 from legcal.data.measurements import few_views
 from legcal.data.photograph_matching import (
-    Matching,
+    ONE_VIEW,
     Photograph,
-    Row,
     find_photographs,
     likely_pattern,
     match,
@@ -31,7 +29,7 @@ from legcal.data.photograph_matching import (
 from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.folder import OutputKind, check_empty, check_path, new_files, result_folder
+from legcal.files.folder import OutputKind, check_destination, check_path, new_files, result_folder
 from legcal.files.reading import MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
 from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
@@ -57,7 +55,6 @@ _EXAMPLE_KIND = OutputKind("example", "", "")
 _EXAMPLE_FILES = (
     "dataset.yaml", "measurements.csv", "camera_info.yaml", "images", "models", "urdf"
 )  # fmt: skip
-ONE_VIEW = "c1"
 MIN_SIGMA = 2.5e-6  # [mean leg lengths] minimum default noise of readings
 _CAMERA_NAMES = ("camera_info.yaml", "camera_info.yml", "camera.yaml")
 
@@ -101,16 +98,11 @@ class NewDataset:
 
     machine: Machine  # the nominal model
     model: str  # its name in ``dataset.yaml``
-    folder: Path  # of the photographs
-    table: Path  # of the readings
     destination: Path  # the folder of the dataset
-    # Meaning of each heading of the table: a joint, view, image, pose or time
-    columns: Mapping[str, str]
-    rows: tuple[Row, ...]  # the entries of each row of the table about its photograph
-    poses: tuple[str, ...]  # the pose of each row; empty where the table does not name them
-    matching: Matching  # pairs of row and photograph
-    views: tuple[str, ...]  # the view of each pair
+    sheet: ReadingsSheet
     readings: SheetReadings  # of the motors whose readings are known
+    pairs: Sequence[tuple[int, Photograph]]  # rows of the sheet and their photographs, by views
+    matched: str  # how, in words
     cameras: Mapping[str, Path]  # the camera file of each view
     # One standard deviation of a reading [m], by joint [m or rad] where a motor turns
     encoder_sigma: float | dict[str, float]
@@ -127,22 +119,22 @@ class NewDataset:
         return NewDatasetDocument(
             dataset=str(self.destination),
             mechanism=self.model,
-            columns=dict(self.columns),
+            columns=dict(self.sheet.taken),
             unit=self.readings.unit,
             unit_from=self.readings.unit_from,
             lengths=self.readings.are_lengths,
-            matched=self.matching.how,
+            matched=self.matched,
             encoder_sigma=self.encoder_sigma,
             views={view: ViewToWrite(camera=str(path)) for view, path in self.cameras.items()},
             images=[
                 MatchedImage(
                     row=k + 1,
-                    view=view,
+                    view=photograph.view,
                     photograph=photograph.name,
                     image=self.place(photograph),
                     readings=self.readings_of(k),
                 )
-                for (k, photograph), view in zip(self.matching.pairs, self.views, strict=True)
+                for k, photograph in self.pairs
             ],
             notes=list(self.notes),
             written=[str(path) for path in written],
@@ -193,8 +185,27 @@ def init(
 ) -> Dataset:
     """Make a dataset from a folder of photographs and a table of readings, and load it.
 
-    Arguments and exceptions as in :func:`plan_new_dataset` and :func:`write_new_dataset`; *output*
-    is the folder of the dataset.
+    Parameters
+    ----------
+    folder : path
+        The photographs: in it, or in one folder for each view. It is not changed.
+    readings : path
+        A CSV with a column for each actuated leg, and a heading.
+    model : path or str
+        The nominal model, as for :func:`legcal.load_mechanism`.
+    output : path
+        The folder of the dataset.
+    options : SheetOptions
+        Cameras, unit and noise.
+    force : bool
+        Whether files that exist already are replaced.
+
+    Raises
+    ------
+    DatasetError, ModelError, UsageError
+        With one sentence for each problem.
+    OutOfResources
+        If the folder cannot be written.
     """
     write_new_dataset(plan_new_dataset(folder, readings, model, output, options), force=force)
     return load_dataset(output)
@@ -207,26 +218,7 @@ def plan_new_dataset(
     destination: str | Path,
     options: SheetOptions = SheetOptions(),
 ) -> NewDataset:
-    """Return a dataset of photographs and readings, checked and not written yet.
-
-    Parameters
-    ----------
-    folder : path
-        The photographs: in it, or in one folder for each view. It is not changed.
-    readings : path
-        A CSV with a column for each actuated leg, and a heading.
-    model : path or str
-        The nominal model, as for :func:`legcal.load_mechanism`.
-    destination : path
-        The folder of the dataset.
-    options : SheetOptions
-        Cameras, unit and noise.
-
-    Raises
-    ------
-    DatasetError, ModelError, UsageError
-        With one sentence for each problem.
-    """
+    """Return a dataset of photographs and readings, checked and not written; see :func:`init`."""
     folder, path, destination = Path(folder), Path(readings), Path(destination)
     machine = load_mechanism(model)
     check_path(destination, DATASET_FOLDER)
@@ -245,14 +237,9 @@ def plan_new_dataset(
     else:
         pattern = None  # the table names other views
     sheet_readings = sheet.readings(options.unit, lengths=options.lengths)
-    texts = map(table.text, ("image", "view", "time"))
-    rows = tuple(itertools.starmap(Row, zip(table.where, *texts, strict=True)))
-    matching = match(rows, photographs, str(path))
-    view_of = tuple(
-        rows[k].view or (photograph.folder if photograph.folder != "." else ONE_VIEW)
-        for k, photograph in matching.pairs
-    )
-    cameras, made = _cameras(folder, destination, matching, view_of, options.cameras)
+    pairs, matched, matching_notes = match(table, photographs)
+    matches = [photograph for _, photograph in pairs]
+    cameras, made = _cameras(folder, destination, matches, options.cameras)
     stated = options.encoder_sigma
     if isinstance(stated, Mapping):
         stated = {joint: x for joint, x in stated.items() if joint not in sheet.unknown}
@@ -263,30 +250,30 @@ def plan_new_dataset(
         "passive. Where the others do not determine the pose, click joints with legcal detect "
         "DATASET -o OUT --edit: at the base in a picture of each view, at the platform in all."
     ]
-    views_stated = any(row.view for row in rows)
+    is_shipped = str(model) in shipped_names() and not os.path.isfile(model)
+    relative_path = os.path.relpath(machine.yaml_path.resolve(), destination.resolve())
+    stated_options = {"--encoder-sigma": options.encoder_sigma, "--unit": options.unit}
+    unused = [name for name, value in stated_options.items() if value]
+    unused_note = f"{' and '.join(unused)} had no effect: the table has no reading."
     return NewDataset(
         machine=machine,
-        model=_model_name(model, machine, destination),
-        folder=folder,
-        table=path,
+        model=str(model) if is_shipped else Path(relative_path).as_posix(),
         destination=destination,
-        columns=sheet.taken,
-        rows=rows,
-        poses=table.text("pose") if "pose" in table else (),
-        matching=matching,
-        views=view_of,
+        sheet=sheet,
         readings=sheet_readings,
+        pairs=pairs,
+        matched=matched,
         cameras=cameras,
         encoder_sigma=sigma,
         notes=(
             *sheet.notes,
             *(unknown if sheet.unknown else []),
-            *_unused_notes(options, sheet.motors),
+            *([] if sheet.motors or not unused else [unused_note]),
             *sheet_readings.notes,
-            *matching.notes,
+            *matching_notes,
             *sigma_notes,
             *_made_notes(cameras, made),
-            *([] if views_stated else _view_notes(pattern, matching, view_of)),
+            *([] if named else _view_notes(pattern, matches)),
         ),
         made_cameras={path: text for path, (_, text) in made.items()},
     )
@@ -311,16 +298,17 @@ def _made_notes(
         )
 
 
-def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str]) -> Iterator[str]:
+def _view_notes(pattern: str | None, photographs: Sequence[Photograph]) -> Iterator[str]:
     """Yield a note on the views where no column names them, and on alternatives."""
+    views = list(dict.fromkeys(photograph.view for photograph in photographs))
     if pattern is not None:
         yield (
-            f"Views {few(list(dict.fromkeys(view_of)))} are taken from the names of the "
+            f"Views {few(views)} are taken from the names of the "
             f"photographs, '{pattern}': if that is not where the camera stood, add a column view, "
             "or put the photographs of each place in a folder."
         )
-    elif set(view_of) == {ONE_VIEW}:
-        likely = likely_pattern([photograph for _, photograph in matching.pairs])
+    elif views == [ONE_VIEW]:
+        likely = likely_pattern(photographs)
         looks = f" as the names of the files look ('{likely}')," if likely else ""
         yield (
             f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places,"
@@ -329,23 +317,14 @@ def _view_notes(pattern: str | None, matching: Matching, view_of: Sequence[str])
 
 
 def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
-    """Write a dataset, complete or not at all; return its files, photographs excepted.
-
-    Raises
-    ------
-    UsageError
-        If a file exists already and *force* is not set.
-    OutOfResources
-        If the folder cannot be written.
-    """
-    check_path(new.destination, DATASET_FOLDER)
+    """Write a dataset, complete or not at all; return its files, photographs excepted."""
     cameras = list(dict.fromkeys(new.cameras.values()))
     names = {camera: f"camera_info{f'_{k + 1}' * bool(k)}.yaml" for k, camera in enumerate(cameras)}
     names |= {camera: camera.name for camera in new.made_cameras}
     dataset_files = [DATASET_YAML, MEASUREMENTS, *names.values()]
     linked = {
         new.place(photograph): photograph.path.resolve()
-        for _, photograph in new.matching.pairs
+        for _, photograph in new.pairs
         if not photograph.path.resolve().is_relative_to(new.destination.resolve())
     }
     contents = {
@@ -354,13 +333,14 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         else camera.read_bytes()
         for camera in cameras
     }
-    joints = new.machine.motor_names
+    joints, table = new.machine.motor_names, new.sheet.table
+    columns = ["view", "image", *(["pose"] if "pose" in table else [])]
+    poses = [[pose] if "pose" in table else [] for pose in table.text("pose")]
     rows = [
-        [view, new.place(photograph), *(new.poses[k : k + 1]), *map(new.readings_of(k).get, joints)]
-        for (k, photograph), view in zip(new.matching.pairs, new.views, strict=True)
+        [photograph.view, new.place(photograph), *poses[k], *map(new.readings_of(k).get, joints)]
+        for k, photograph in new.pairs
     ]
     views = {view: {"camera": names[camera]} for view, camera in new.cameras.items()}
-    columns = ["view", "image", *(["pose"] if new.poses else [])]
     texts = dataset_texts(new.machine, new.model, views, rows, new.encoder_sigma, {}, columns)
     contents |= {name: text.encode() for name, text in texts.items()}
     names_to_write = [*dataset_files, *linked]
@@ -374,15 +354,6 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
             except OSError:  # no links there
                 shutil.copy2(path, folder / name)
     return [new.destination / name for name in dataset_files]
-
-
-def _unused_notes(options: SheetOptions, motors: Sequence[Leg]) -> list[str]:
-    """Return a note on options that are of readings, where none is known."""
-    given = {"--encoder-sigma": options.encoder_sigma, "--unit": options.unit}
-    unused = [name for name, value in given.items() if value]
-    if motors or not unused:
-        return []
-    return [f"{' and '.join(unused)} had no effect: the table has no reading."]
 
 
 def _sigmas(
@@ -421,8 +392,7 @@ def _sigmas(
 def _cameras(
     folder: Path,
     destination: Path,
-    matching: Matching,
-    view_of: Sequence[str],
+    photographs: Sequence[Photograph],
     options: Sequence[str],
 ) -> tuple[dict[str, Path], dict[Path, tuple[Camera, str]]]:
     """Return the camera file of each view, and the cameras to make with contents of their files.
@@ -430,39 +400,33 @@ def _cameras(
     It is an option, else a file beside the photographs or above them, else a camera made from the
     focal length in the metadata of the photographs. Photographs of another size are refused.
     """
-    views = list(dict.fromkeys(view_of))
+    views = list(dict.fromkeys(photograph.view for photograph in photographs))
     bad = sorted(view for view in views if not is_name(view))
     if bad:
         raise DatasetError(
             f"{folder}: the view {describe(bad[0])} could not be used: found a name that tables "
             f"cannot show, needed {NAME_NEEDED}; rename it."
         )
-    for_all = [file for view, file in map(split_camera, options) if not view]
-    of_one, problems = dict[str, str](), list[str]()
+    stated, problems = dict[str, str](), list[str]()  # camera files by view, "" for all
     for name, file in map(split_camera, options):
         if name and name not in views:
             problems.append(
                 f"--camera {name}={file} could not be used: found no view of that name, needed one "
                 f"of {few(views)}; correct it."
             )
-        elif name and of_one.setdefault(name, file) != file:
+        elif stated.setdefault(name, file) != file:
+            whose = f"{name}=" * bool(name)
             problems.append(
-                f"The camera file of view {describe(name)} could not be decided: found "
-                f"--camera {name}={of_one[name]} and --camera {name}={file}, needed one; leave "
+                f"The camera files could not be used: found --camera {whose}{stated[name]} and "
+                f"--camera {whose}{file}, needed one for all views, or VIEW=FILE for each; leave "
                 "the other out."
             )
-    if len(for_all) > 1:
-        problems.append(
-            f"The camera files could not be used: found {few(for_all)}, needed one for all views, "
-            "or --camera VIEW=FILE for each; correct them."
-        )
     path_of_view, made = dict[str, Path](), dict[Path, tuple[Camera, str]]()
     for view in views:
-        images = [photograph.path for (_, photograph), name in
-                  zip(matching.pairs, view_of, strict=True) if name == view]  # fmt: skip
+        images = [photograph.path for photograph in photographs if photograph.view == view]
         near = (images[0].parent, folder, folder.parent)
         files = [path / name for path in near for name in _CAMERA_NAMES]
-        text = of_one.get(view, for_all[0] if for_all else None)
+        text = stated.get(view, stated.get("", ""))
         if text or any(path.is_file() for path in files):
             path_of_view[view] = Path(text or next(path for path in files if path.is_file()))
         elif camera := _camera_by_exif(images):
@@ -489,8 +453,8 @@ def _cameras(
     }
     unusable = [
         problem
-        for (_, photograph), view in zip(matching.pairs, view_of, strict=True)
-        if (problem := inspect_image(photograph.path, read[path_of_view[view]])[1]) is not None
+        for photograph in photographs
+        if (problem := inspect_image(photograph.path, read[path_of_view[photograph.view]])[1])
     ]
     if unusable:
         raise DatasetError(unusable)
@@ -515,24 +479,9 @@ def _camera_by_exif(paths: Sequence[Path]) -> Camera | None:
     )
 
 
-def _model_name(model: str | Path, machine: Machine, destination: Path) -> str:
-    """Return the name of a model in a dataset: a relative path, or the name of a shipped model."""
-    if str(model) in shipped_names() and not os.path.isfile(model):
-        return str(model)
-    return Path(os.path.relpath(machine.yaml_path.resolve(), destination.resolve())).as_posix()
-
-
 def copy_example(destination: Path) -> None:
-    """Copy the example (a simulated hexapod, 45 photographs), complete or not at all.
-
-    Raises
-    ------
-    UsageError
-        If the folder holds files.
-    OutOfResources
-        If it does not take the files, or legcal was installed without them.
-    """
-    check_empty(destination, _EXAMPLE_KIND)
+    """Copy the example (a simulated hexapod, 45 photographs), complete or not at all."""
+    check_destination(destination, _EXAMPLE_KIND, replaces=False)
     source = shipped_folder(_EXAMPLE)
     if not (source / DATASET_YAML).is_file():
         raise OutOfResources(

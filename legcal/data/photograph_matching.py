@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.image_choice import DAY, seconds_in, seconds_of_column
-from legcal.errors import Code, DatasetError, Place, Problem
+from legcal.errors import Code, DatasetError, Problem
 from legcal.files.reading import FOREIGN_SUFFIXES, HEIC_SUFFIXES, MAX_IMAGE, read_bytes
 from legcal.files.schema import NAME_NEEDED, closest, describe, few, is_name
+from legcal.files.table import Table
 from legcal.vision.image_file import (
     CONVERT,
     CONVERT_HEIC,
@@ -27,6 +28,7 @@ from legcal.vision.image_file import (
 )
 
 MAX_PHOTOGRAPHS = 50_000
+ONE_VIEW = "c1"  # where neither names nor folders nor the table name views
 MAX_VIEWS = 12  # maximum number of views guessed from names of photographs
 _SEPARATORS = " _-."
 _NUMBERS = re.compile(r"(\d+)", re.ASCII)
@@ -38,7 +40,7 @@ class Photograph:
 
     path: Path
     name: str  # relative to that folder, with "/"
-    view: str = ""  # from a pattern of names
+    view: str = ""  # from a pattern of names, then that of its row
     label: str = ""  # rest of the name without the view
 
     @property
@@ -50,28 +52,8 @@ class Photograph:
         return self.view or PurePosixPath(self.name).parent.as_posix()
 
 
-@dataclass(frozen=True)
-class Row:
-    """The entries of a row of the table about its photograph; "" for none."""
-
-    where: Place
-    image: str
-    view: str
-    time: str
-
-    def problem(self, done: str, found: str, needed: str, remedy: str, code: Code) -> Problem:
-        """Return the problem of a photograph that could not be found or decided by its name."""
-        what, columns = f"the photograph could not be {done}", ("image",)
-        return Problem(what, found, needed, remedy, *self.where, columns=columns, code=code)
-
-
-@dataclass(frozen=True)
-class Matching:
-    """The photographs of rows: one for each row and view, or one for each row."""
-
-    pairs: tuple[tuple[int, Photograph], ...]  # in the order of views and rows
-    how: str  # method of matching, in words
-    notes: tuple[str, ...] = ()
+# Rows of the table, from 0, and their photographs; the method in words; and notes
+Matched = tuple[Iterable[tuple[int, Photograph]], str, list[str]]
 
 
 _VIEW_FIRST = {"{view}_*": "_", "{view}-*": "-"}  # patterns of names, and the mark beside the view
@@ -168,46 +150,49 @@ def in_order(name: str) -> tuple[object, ...]:
     return (len(parts), *keys, name)
 
 
-def match(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+def match(
+    table: Table, photographs: Sequence[Photograph]
+) -> tuple[list[tuple[int, Photograph]], str, list[str]]:
     """Match photographs to rows: by name, else by time, else in order.
 
-    *photographs* are in the order of their names; *table* is for messages. A column that counts
-    the photographs of each view tells their order.
-
-    Raises
-    ------
-    DatasetError
-        If rows have no photograph, or more than one in a view.
+    *photographs* are in the order of their names. A column that counts the photographs of each view
+    tells their order. Returns the pairs, with the views of rows, in the order of views and rows;
+    the method in words; and notes.
     """
-    if any(row.image for row in rows) and not _are_counted(rows, photographs):
-        matching = _by_name(rows, photographs, table)
-    elif any(row.time for row in rows):
-        matching = _by_time(rows, photographs, table)
+    if any(table.text("image")) and not _are_counted(table, photographs):
+        matches, how, notes = _by_name(table, photographs)
+    elif any(table.text("time")):
+        matches, how, notes = _by_time(table, photographs)
     else:
-        matching = _in_order(rows, photographs, table)
-    used = {photograph.name for _, photograph in matching.pairs}
+        matches, how, notes = _in_order(table, photographs)
+    views, pairs = table.text("view"), list[tuple[int, Photograph]]()
+    for k, photograph in matches:
+        folder = photograph.folder if photograph.folder != "." else ONE_VIEW
+        pairs.append((k, replace(photograph, view=views[k] or folder)))
+    order = list(dict.fromkeys(photograph.view for _, photograph in pairs))
+    pairs.sort(key=lambda pair: (order.index(pair[1].view), pair[0]))
+    used = {photograph.name for _, photograph in pairs}
     bad = sorted(name for name in used if not is_name(name))
     if bad:
         raise DatasetError(
-            f"{table}: the photograph {describe(bad[0])} could not be used: found a name that "
+            f"{table.path}: the photograph {describe(bad[0])} could not be used: found a name that "
             f"tables cannot show, needed {NAME_NEEDED}; rename the file."
         )
     spare = [photograph.name for photograph in photographs if photograph.name not in used]
-    notes = matching.notes
     if spare:
         is_single = len(spare) == 1
-        notes += (
+        notes.append(
             f"{len(spare)} photograph{'' if is_single else 's'} {'has' if is_single else 'have'} "
-            f"no row and {'is' if is_single else 'are'} left out: {few(spare)}.",
+            f"no row and {'is' if is_single else 'are'} left out: {few(spare)}."
         )
-    return Matching(matching.pairs, matching.how, notes)
+    return pairs, how, notes
 
 
-def _are_counted(rows: Sequence[Row], photographs: Sequence[Photograph]) -> bool:
+def _are_counted(table: Table, photographs: Sequence[Photograph]) -> bool:
     """Return whether images are counted, 1, 2, 3 in each view, and files not named by that."""
     counts: dict[str, list[str]] = {}
-    for row in rows:
-        counts.setdefault(row.view, []).append(row.image.lstrip("0"))
+    for view, image in zip(table.text("view"), table.text("image"), strict=True):
+        counts.setdefault(view, []).append(image.lstrip("0"))
     if any(of_view != [str(k + 1) for k in range(len(of_view))] for of_view in counts.values()):
         return False
     if len(counts) > 1 and not any(_in_folder(p, view) for p in photographs for view in counts):
@@ -256,12 +241,13 @@ def _in_folder(photograph: Photograph, view: str) -> bool:
     return folder == view.casefold() or folder.endswith("/" + view.casefold())
 
 
-def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+def _by_name(table: Table, photographs: Sequence[Photograph]) -> Matched:
     """Compare names, the strictest way first."""
-    named = [k for k, row in enumerate(rows) if row.image]
-    best: dict[int, list[Photograph]] = {}
+    images, views = table.text("image"), table.text("view")
+    named = [k for k, image in enumerate(images) if image]
+    best, how = dict[int, list[Photograph]](), ""
     for method, key in _KEYS:
-        if key is _number and not all(rows[k].image.isdigit() for k in named):
+        if key is _number and not all(images[k].isdigit() for k in named):
             continue
         by_key: dict[str, list[Photograph]] = {}
         for photograph in photographs:
@@ -269,93 +255,85 @@ def _by_name(rows: Sequence[Row], photographs: Sequence[Photograph], table: str)
                 by_key.setdefault(text, []).append(photograph)
         matches = {}
         for k in named:
-            same_key = by_key.get(key(rows[k].image), [])
-            if same_key and rows[k].view:
-                inside = [p for p in same_key if _in_folder(p, rows[k].view)]
+            same_key = by_key.get(key(images[k]), [])
+            if same_key and views[k]:
+                inside = [p for p in same_key if _in_folder(p, views[k])]
                 same_key = inside or same_key
-            if same_key and key(rows[k].image):
-                most = max(_alike(photograph, rows[k].image) for photograph in same_key)
-                matches[k] = [p for p in same_key if _alike(p, rows[k].image) == most]
-        if len(matches) == len(named):
-            return _named_once(rows, matches, method, table)
+            if same_key and key(images[k]):
+                most = max(_alike(photograph, images[k]) for photograph in same_key)
+                matches[k] = [p for p in same_key if _alike(p, images[k]) == most]
         if len(matches) > len(best):
-            best = matches
-    problems = []
-    taken = {photograph.name for same_key in best.values() for photograph in same_key}
-    for k in named:
-        if k not in best:
-            near = closest(rows[k].image, [p.name for p in photographs if p.name not in taken])
-            found, needed = (
-                f"no {describe(rows[k].image)}",
-                f"one of the {len(photographs)} photographs",
-            )
-            problems.append(rows[k].problem("found", found, needed, near, Code.MISSING_FILE))
-    if len(best) == 0 and len(problems) > 1:
-        problems = [
+            best, how = matches, method
+        if len(best) == len(named):
+            break
+    _refuse_names(table, best, photographs)
+    n_blank, more = len(images) - len(named), len(images) - len(named) > 1
+    blank = (
+        f"{n_blank} row{'s' * more} of {table.path} without the name of a photograph "
+        f"{'are' if more else 'is'} left out."
+    )
+    return _named_once(table, best), how, [blank] * (n_blank > 0)
+
+
+def _refuse_names(
+    table: Table, best: Mapping[int, Sequence[Photograph]], photographs: Sequence[Photograph]
+) -> None:
+    """Refuse names of photographs that are not there; *best* has those that are, by row."""
+    images = table.text("image")
+    named = [k for k, image in enumerate(images) if image]
+    if len(best) == 0 and len(named) > 1:
+        raise DatasetError(
             Problem(
                 "the photographs could not be matched by name",
-                f"none that is named like {describe(rows[named[0]].image)}",
+                f"none that is named like {describe(images[named[0]])}",
                 f"the names of files such as {describe(photographs[0].name)}",
                 "correct the column image, or remove it to match rows and photographs in order",
-                table,
+                str(table.path),
                 code=Code.MISSING_FILE,
             )
-        ]
-    raise DatasetError(problems)
+        )
+    taken = {photograph.name for same_key in best.values() for photograph in same_key}
+    spare, needed = [p.name for p in photographs if p.name not in taken], len(photographs)
+    for k in (k for k in named if k not in best):
+        found, near = f"no {describe(images[k])}", closest(images[k], spare)
+        table.refuse(
+            k, found, f"one of the {needed} photographs", "image",
+            remedy=near, what="photograph", code=Code.MISSING_FILE,
+        )  # fmt: skip
+    table.check()
 
 
-def _named_once(
-    rows: Sequence[Row], matches: dict[int, list[Photograph]], method: str, table: str
-) -> Matching:
+def _named_once(table: Table, matches: dict[int, list[Photograph]]) -> list[tuple[int, Photograph]]:
     """Return the pairs if each photograph has one row, and each row one photograph a view."""
     row_of: dict[str, int] = {}
-    problems = []
+    images, views, what = table.text("image"), table.text("view"), "photograph"
     for k, photographs in matches.items():
         folders = [photograph.folder for photograph in photographs]
-        if len(set(folders)) < len(folders) or (rows[k].view and len(photographs) > 1):
-            found = f"{describe(rows[k].image)} for {few([p.name for p in photographs])}"
+        if len(set(folders)) < len(folders) or (views[k] and len(photographs) > 1):
+            found = f"{describe(images[k])} for {few([p.name for p in photographs])}"
             remedy = "write the name with its folder and extension"
-            problems.append(rows[k].problem("decided", found, "one", remedy, Code.BAD_CELL))
+            table.refuse(k, found, "one", "image", remedy=remedy, what=what)
         for photograph in photographs:
             if (other_row := row_of.setdefault(photograph.name, k)) != k:
-                found = f"{describe(photograph.name)} also for {rows[other_row].where}"
-                needed, remedy = (
-                    "one row a photograph",
-                    "add a column view, or write names with folders",
-                )
-                problems.append(
-                    rows[k].problem("decided", found, needed, remedy, Code.REPEATED_ROW)
-                )
-    if problems:
-        raise DatasetError(problems)
-    blank = [row.where for k, row in enumerate(rows) if k not in matches]
-    notes = (
-        f"{len(blank)} row{'s' * (len(blank) > 1)} of {table} without the name of a photograph "
-        f"{'are' if len(blank) > 1 else 'is'} left out.",
-    )
-    return Matching(_sorted(rows, matches.items()), method, notes if blank else ())
+                found = f"{describe(photograph.name)} also in {table.places[other_row]}"
+                remedy = "add a column view, or write names with folders"
+                table.refuse(
+                    k, found, "one row a photograph", "image",
+                    remedy=remedy, what=what, code=Code.REPEATED_ROW,
+                )  # fmt: skip
+    table.check()
+    return [(k, photograph) for k, photographs in matches.items() for photograph in photographs]
 
 
-def _sorted(
-    rows: Sequence[Row], matches: Iterable[tuple[int, Sequence[Photograph]]]
-) -> tuple[tuple[int, Photograph], ...]:
-    """Return pairs in the order of views and, in each, of rows."""
-    pairs = [(k, photograph) for k, photographs in matches for photograph in photographs]
-    folders: dict[str, int] = {}
-    for k, photograph in pairs:
-        folders.setdefault(rows[k].view or photograph.folder, len(folders))
-    pairs.sort(key=lambda pair: (folders[rows[pair[0]].view or pair[1].folder], pair[0]))
-    return tuple(pairs)
-
-
-def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+def _in_order(table: Table, photographs: Sequence[Photograph]) -> Matched:
     """Take rows and photographs one by one: in each view, in all, or all rows in each folder."""
     folders: dict[str, list[Photograph]] = {}
     for photograph in photographs:
         folders.setdefault(photograph.folder, []).append(photograph)
     views: dict[str, list[int]] = {}
-    for k, row in enumerate(rows):
-        views.setdefault(row.view, []).append(k)
+    for k, view in enumerate(table.text("view")):
+        views.setdefault(view, []).append(k)
+    rows = list(range(len(table)))
     if "" not in views and all(any(_in_folder(p, view) for p in photographs) for view in views):
         groups = [
             (f"view {view}", members, [p for p in photographs if _in_folder(p, view)])
@@ -363,18 +341,15 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
         ]
         method = "in the order of rows and of names, view by view"
     elif len(photographs) == len(rows):
-        groups = [("all folders", list(range(len(rows))), list(photographs))]
+        groups = [("all folders", rows, list(photographs))]
         method = "in the order of rows and of names"
     else:
-        groups = [
-            (f"folder {folder}", list(range(len(rows))), inside)
-            for folder, inside in folders.items()
-        ]
+        groups = [(f"folder {folder}", rows, inside) for folder, inside in folders.items()]
         method = "in the order of rows and of names: every view shows the poses of all rows"
     problems = [
-        f"{table}: the photographs of {name} could not be matched in order: found {len(inside)} "
-        f"photographs for {len(members)} rows, needed as many; remove what has no partner, or add "
-        "a column image with their names."
+        f"{table.path}: the photographs of {name} could not be matched in order: found "
+        f"{len(inside)} photographs for {len(members)} rows, needed as many; remove what has no "
+        "partner, or add a column image with their names."
         for name, members, inside in groups
         if len(members) != len(inside)
     ]
@@ -392,7 +367,7 @@ def _in_order(rows: Sequence[Row], photographs: Sequence[Photograph], table: str
                 "image or time."
             )
         pairs += zip(members, inside, strict=True)
-    return Matching(tuple(pairs), method, tuple(notes))
+    return pairs, method, notes
 
 
 def photograph_time(photograph: Photograph) -> float | None:
@@ -403,47 +378,44 @@ def photograph_time(photograph: Photograph) -> float | None:
         return None
 
 
-def _by_time(rows: Sequence[Row], photographs: Sequence[Photograph], table: str) -> Matching:
+def _by_time(table: Table, photographs: Sequence[Photograph]) -> Matched:
     """Give each row the photograph taken nearest to its time.
 
     Clocks may differ by a constant where there are as many photographs as rows.
     """
     taken = {p.name: when for p in photographs if (when := photograph_time(p)) is not None}
     dated = sorted((p for p in photographs if p.name in taken), key=lambda p: taken[p.name])
-    if len(dated) < len(rows):
+    texts, n = table.text("time"), len(table)
+    if len(dated) < n:
         raise DatasetError(
-            f"{table}: the photographs could not be matched by time: found {len(dated)} "
-            f"photographs with a time in their EXIF data for {len(rows)} rows, needed as many or "
+            f"{table.path}: the photographs could not be matched by time: found {len(dated)} "
+            f"photographs with a time in their EXIF data for {n} rows, needed as many or "
             "more; copy the files from the camera as they are, add a column image, or remove the "
             "column time to match rows and photographs in order."
         )
-    times = seconds_of_column([row.time for row in rows], taken[dated[0].name])
-    bad = [
-        f"{row.where}, column time: the time could not be read: found {describe(row.time)}, needed "
-        "one such as 2026-11-23 10:15:00; correct the cell."
-        for row, when in zip(rows, times, strict=True)
-        if when is None
-    ]
-    if bad:
-        raise DatasetError(bad)
+    times = seconds_of_column(texts, taken[dated[0].name])
+    for k, when in enumerate(times):
+        if when is None:
+            found, needed = describe(texts[k]), "one such as 2026-11-23 10:15:00"
+            table.refuse(k, found, needed, "time", remedy="correct the cell", what="time")
+    table.check()
     moments = [when for when in times if when is not None]
-    order = sorted(range(len(rows)), key=lambda k: moments[k])
+    order = sorted(range(n), key=lambda k: moments[k])
     gaps = [moments[b] - moments[a] for a, b in pairwise(order)]
     least, shift = min(gaps, default=DAY), 0.0
-    if len(dated) == len(rows):
+    if len(dated) == n:
         apart = [taken[p.name] - moments[k] for k, p in zip(order, dated, strict=True)]
         shift = sorted(apart)[len(apart) // 2]
         pairs = dict(zip(order, dated, strict=True))
     else:
         pairs = {k: min(dated, key=lambda p: abs(taken[p.name] - moments[k])) for k in order}
     worst = max(abs(taken[p.name] - moments[k] - shift) for k, p in pairs.items())
-    if len({p.name for p in pairs.values()}) < len(rows) or 2 * worst >= least:
+    if len({p.name for p in pairs.values()}) < n or 2 * worst >= least:
         raise DatasetError(
-            f"{table}: the photographs could not be matched by time: found times up to "
+            f"{table.path}: the photographs could not be matched by time: found times up to "
             f"{worst:.0f} s apart and rows {least:.0f} s apart, "
             "needed less than half of that; leave out photographs without a row, so that a "
             "difference of the clocks shows, or add a column image."
         )
     about = f", clocks {shift:+.0f} s apart" if shift else ""
-    matches = [(k, [p]) for k, p in sorted(pairs.items())]
-    return Matching(_sorted(rows, matches), f"by time, within {worst:.0f} s{about}")
+    return sorted(pairs.items()), f"by time, within {worst:.0f} s{about}", []

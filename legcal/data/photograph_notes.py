@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from legcal.data.measurements import Measurements, few_views
 from legcal.files.schema import few
 from legcal.vision.image_file import ImageFacts, Move, size_change
+
+_T = TypeVar("_T")
 
 GOOD_QUALITY = 95  # JPEG quality from which the loss is far below the noise of a camera
 _TURNS = {1: "not to be turned", 3: "to be turned by 180 deg", 6: "to be turned by 90 deg",
@@ -157,21 +159,22 @@ def notes_on_photographs(
     for v, path in enumerate(camera_paths):
         views_of.setdefault(path, []).append(v)
     notes: list[PhotographNote] = []
+    photographs = _by_view(measurements, facts)
     for path, views in views_of.items():
-        images = {v: _images(measurements, v, facts) for v in views}
+        images = {v: photographs[v] for v in views}
         notes += [PhotographNote(x, True) for x in _against_camera(measurements, path, images)]
         for v in views:
             notes += [PhotographNote(x, False) for x in _of_view(measurements, v, images[v])]
     return notes
 
 
-def _images(
-    measurements: Measurements, view: int, facts: Mapping[str, ImageFacts]
-) -> list[tuple[str, ImageFacts]]:
-    """Return the photographs of a view with their metadata."""
-    rows = zip(measurements.view.tolist(), measurements.image, strict=True)
-    names = dict.fromkeys(image for v, image in rows if v == view and image in facts)
-    return [(name, facts[name]) for name in names]
+def _by_view(measurements: Measurements, known: Mapping[str, _T]) -> list[list[tuple[str, _T]]]:
+    """Return the images of each view of which something is known, by their names, with that."""
+    images: list[list[tuple[str, _T]]] = [[] for _ in measurements.views]
+    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
+        if image in known:
+            images[v].append((image, known[image]))
+    return images
 
 
 def _against_camera(
@@ -219,21 +222,12 @@ def _of_view(
 
 
 def compression_notes(measurements: Measurements, facts: Mapping[str, ImageFacts]) -> list[str]:
-    """Return a note on photographs that were compressed with much loss, if there are any.
-
-    Parameters
-    ----------
-    measurements : Measurements
-        The rows of the photographs.
-    facts : mapping
-        The metadata of image files, by the names of the images.
-    """
-    qualities: dict[str, int] = {}  # the least of each view
-    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
-        quality = facts[image].jpeg_quality if image in facts else None
-        if quality is not None and quality < GOOD_QUALITY:
-            view = measurements.views[v].name
-            qualities[view] = min(quality, qualities.get(view, quality))
+    """Return a note on photographs that were compressed with much loss, if there are any."""
+    qualities = dict[str, int]()  # the least of each view
+    for view, images in zip(measurements.view_names, _by_view(measurements, facts), strict=True):
+        of_view = [x.jpeg_quality for _, x in images if x.jpeg_quality is not None]
+        if min(of_view, default=GOOD_QUALITY) < GOOD_QUALITY:
+            qualities[view] = min(of_view)
     if not qualities:
         return []
     return [
@@ -244,21 +238,12 @@ def compression_notes(measurements: Measurements, facts: Mapping[str, ImageFacts
 
 
 def notes_on_moves(measurements: Measurements, moves: Mapping[str, Move]) -> list[str]:
-    """Return a note on cameras that did not stand still, if there are any.
-
-    Parameters
-    ----------
-    measurements : Measurements
-        The rows of the photographs.
-    moves : mapping
-        How images were moved, by the names of the images.
-    """
-    most: dict[str, float] = {}
-    for v, image in zip(measurements.view.tolist(), measurements.image, strict=True):
-        if image in moves:
-            view = measurements.views[v]
-            far = moves[image].farthest(view.camera.width, view.camera.height)
-            most[view.name] = max(far, most.get(view.name, 0.0))
+    """Return a note on cameras that did not stand still, if there are any."""
+    most = {
+        view.name: max(move.farthest(view.camera.width, view.camera.height) for _, move in moved)
+        for view, moved in zip(measurements.views, _by_view(measurements, moves), strict=True)
+        if moved
+    }
     if not most:
         return []
     return [

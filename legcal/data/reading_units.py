@@ -73,10 +73,8 @@ ReadingUnitName = Annotated[
         {"anyOf": [{"enum": [*UNITS[False], *UNITS[True]]}, {"pattern": f"^{COUNTS}$"}]}
     ),
 ]
-_PLURALS = {
-    "mm": "millimetres", "cm": "centimetres", "in": "inches", PULSES: "pulses of servos"
-}  # fmt: skip
-_WORDS = {"m": "metres", "rad": "radians", "deg": "degrees", "us": "us (pulses of a servo)"}
+_WORDS = {"m": "metres", "mm": "millimetres", "cm": "centimetres", "in": "inches",
+          "rad": "radians", "deg": "degrees", PULSES: "pulses of servos"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,13 +87,8 @@ class ReadingUnit:
 
     @property
     def words(self) -> str:
-        """The unit as messages about cells name it."""
-        return _WORDS.get(self.name, self.name)
-
-    @property
-    def plural(self) -> str:
         """The unit as readings in it are called."""
-        return _PLURALS.get(self.name, self.words)
+        return _WORDS.get(self.name, self.name)
 
     def values(self, readings: Array) -> Array:
         """Return the joint values [m or rad] of readings."""
@@ -120,19 +113,10 @@ def default_unit(leg: Leg) -> ReadingUnit:
     return ReadingUnit(leg.reading_unit)
 
 
-def default_units(legs: Sequence[Leg]) -> dict[str, ReadingUnit]:
-    """Return these units by motor, in the order of the legs."""
-    return {str(leg.prismatic): default_unit(leg) for leg in legs_with_readings(legs)}
-
-
 def unit_named(name: str, leg: Leg, pulses: Pulses | None = None) -> ReadingUnit:
     """Return a unit for the readings of a leg.
 
-    Raises
-    ------
-    ValueError
-        If the leg cannot have readings in this unit. The text continues a sentence that names the
-        entry.
+    ValueError continues a sentence that names the entry.
     """
     motor, turns = leg.prismatic, leg.reads_angle
     if not takes_unit(name, turns=turns):
@@ -179,14 +163,9 @@ def reading_units(
     """Return the unit of the readings of each motor, by its joint.
 
     A single unit applies to the motors of its kind, sliding or turning.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each motor whose readings cannot have their unit.
     """
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
-    units = default_units(legs)
+    units = {name: default_unit(leg) for name, leg in motors.items()}
     if stated is None:
         return units
     problems = []
@@ -258,11 +237,6 @@ def sigmas_of(
 
     A number applies to every motor in its own unit [m or rad], a text with a unit (of lengths,
     angles, or pulses of *units*) to the motors of that kind, sliding or turning.
-
-    Raises
-    ------
-    UsageError
-        If no motor can have it, or one is named that has no readings.
     """
     refused = "The encoder sigma (encoder_sigma, --encoder-sigma) could not be used"
     motors = {str(leg.prismatic): leg for leg in legs_with_readings(legs)}
@@ -311,10 +285,7 @@ def sigma_too_large(sigma: float, leg: Leg) -> tuple[str, str] | None:
 def sigma_in(stated: float | str, unit: ReadingUnit, leg: Leg) -> float:
     """Return a standard deviation [m or rad] from a number in the unit of readings, or with a unit.
 
-    Raises
-    ------
-    ValueError
-        If it is invalid. The text continues a sentence that names the entry.
+    ValueError continues a sentence that names the entry.
     """
     sizes = {PULSES: unit.size} if unit.name == PULSES else {}
     sizes |= ANGLE if leg.reads_angle else LENGTH
@@ -367,11 +338,11 @@ class Meaning:
     def said(self, legs: Sequence[Leg], stated: str, place: UnitPlace) -> str:
         """Return what the numbers look like, and what to do if *stated* is another unit."""
         unit, remedies = self.units[0], list[str]()
-        words = f"whole leg lengths{f' in {unit.plural}' * (unit.name != 'm')}"
+        words = f"whole leg lengths{f' in {unit.words}' * (unit.name != 'm')}"
         if not self.are_lengths:
-            words = "readings with the opposite sign" if self.is_reversed else unit.plural
+            words = "readings with the opposite sign" if self.is_reversed else unit.words
         if unit.name != stated:
-            remedies.append(_stating(unit.name, place, legs[0]))
+            remedies.append(_stating(unit.name, place))
         if self.are_lengths:
             remedies.append("subtract the leg lengths at reading zero (legcal inspect tells them)")
         if self.is_reversed:
@@ -380,14 +351,12 @@ class Meaning:
         return f"these look like {words}: {' and '.join(remedies)}"
 
 
-# Where the unit of readings is stated; "" where it cannot be
-UnitPlace = Literal["", "headings", "dataset file"]
+# Where the unit of readings is stated
+UnitPlace = Literal["headings", "dataset file"]
 
 
-def _stating(unit: str, place: UnitPlace, leg: Leg) -> str:
-    """Return what to do with readings of a leg in a unit."""
-    if place == "":
-        return f"convert them to {leg.reading_unit}"
+def _stating(unit: str, place: UnitPlace) -> str:
+    """Return how to state the unit of readings."""
     return f"{f'state {unit}' if place == 'headings' else f'write readings: {unit}'} in the {place}"
 
 
@@ -496,8 +465,7 @@ def doubtful_units(
                 f"that they use {100.0 * used:.2g} % of the travel in {name}, which is stated, and "
                 f"{moved:.2g} % in {other.unit}",
                 "the unit in which they are",
-                f"{_stating(other.unit, place, motors[0])}, and convert them first if they are in "
-                f"{name}",
+                f"{_stating(other.unit, place)}, and convert them first if they are in {name}",
                 str(path),
                 columns=tuple(str(leg.prismatic) for leg in motors),
             )

@@ -8,7 +8,7 @@ of the legs.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -22,14 +22,15 @@ from legcal.data.reading_units import (
     UNITS,
     Meaning,
     ReadingUnit,
+    default_unit,
     in_travel,
     is_known,
     meanings,
     takes_unit,
     unit_named,
 )
-from legcal.errors import DatasetError, UsageError
-from legcal.files.quantity import SHOWN_IN
+from legcal.errors import DatasetError, Problem, UsageError
+from legcal.files.quantity import ANGLE, LENGTH, SHOWN_IN
 from legcal.files.schema import describe, few
 from legcal.files.table import (
     WORDS,
@@ -48,7 +49,7 @@ from legcal.machine.model import Machine
 LEAST_USED = 0.01  # minimum fraction of the travel in use: with less, the unit is a larger one
 # Units tried where none is stated, of motors that slide and that turn
 GUESSED = {False: ("m", "mm"), True: ("rad", "deg", PULSES)}
-_DECIMALS = 12  # of readings in metres and radians
+_DECIMALS = 14  # of readings in metres and radians
 # Seconds in a unit of times; with a decimal, since 1200 may be a time of the day, 1200.0 is not
 _SECONDS = {"s": "1.0", "sec": "1.0", "seconds": "1.0", "ms": "1.0e-3", "us": "1.0e-6",
             "µs": "1.0e-6", "ns": "1.0e-9"}  # fmt: skip
@@ -83,23 +84,8 @@ class SheetReadings:
 class ReadingsSheet:
     """A table of readings, one row for each photograph or time (*row_noun*).
 
-    Attributes
-    ----------
-    table : Table
-        Its rows under our names: view, image, pose and time as texts, readings by joint.
-    motors : list of Leg
-        The legs whose readings it holds.
-    unknown : list of str
-        The joints whose readings are not known: their cells are all empty.
-    taken : dict
-        Meaning of each heading in use: a joint, view, image, pose or time.
-    notes : list of str
-        Oddities, and columns that were left out.
-
-    Raises
-    ------
-    DatasetError
-        If the file, a heading or a cell cannot be read.
+    The rows of its *table* are under our names: view, image, pose and time as texts, readings by
+    joint.
     """
 
     def __init__(
@@ -109,14 +95,17 @@ class ReadingsSheet:
         row_noun: str,
         *,
         may_be_unknown: bool = False,  # readings of motors that do not move joints at the base
+        others: Sequence[Column] = (),  # further columns, of lengths in m and angles in rad
+        unknown: Callable[[str], Problem | None] = lambda name: None,
     ) -> None:
         self.path = path
-        self.motors = [machine.legs[j] for j in machine.motors]
-        self.taken: dict[str, str] = {}
-        self.notes: list[str] = []
+        self.motors = [machine.legs[j] for j in machine.motors]  # whose readings it holds
+        self.taken: dict[str, str] = {}  # a joint, view, image, pose or time, by heading in use
+        self.notes: list[str] = []  # oddities, and columns that were left out
         self._joints = machine.motor_names
         self._heading_units: dict[str, str] = {}  # by joint
-        columns = [Column(name, "text", required=False) for name in _COLUMNS]
+        self._others = {split_heading(column.name)[0]: column.name for column in others}
+        columns = [*others, *(Column(name, "text", required=False) for name in _COLUMNS)]
         of_leg = zip(self._joints, self.motors, strict=True)
         columns += [
             Column(joint, what="reading", blank=may_be_unknown and leg.actuator is None)
@@ -128,6 +117,7 @@ class ReadingsSheet:
             "row",
             columns,
             needed=f"one row for each {row_noun}; write them",
+            unknown=unknown,
             reshape=self._renamed_columns,
         )
         self.unknown = [joint for joint in self._joints if not any(self.table.text(joint))]
@@ -137,24 +127,16 @@ class ReadingsSheet:
             self.table.need(self._joints, np.ones(len(self.table), dtype=np.bool_))
         self.table.check()
 
-    def readings(self, unit: str | None = None, *, lengths: bool = False) -> SheetReadings:
+    def readings(
+        self, unit: str | None = None, *, lengths: bool = False, in_si: bool = False
+    ) -> SheetReadings:
         """Return the readings [m, rad], with the precision of their decimal digits.
 
-        Parameters
-        ----------
-        unit : str, optional
-            Unit of the motors of its kind, sliding or turning; by default the unit of the headings,
-            else the unit in which readings lie in the travel.
-        lengths : bool
-            Whether the columns are whole lengths of legs; they are too if nothing else fits.
-
-        Raises
-        ------
-        DatasetError, UsageError
-            If the unit cannot be decided or is certainly wrong, or with a sentence for each
-            reading outside its travel.
+        A *unit* is that of the motors of its kind, sliding or turning; by default it is the unit of
+        the headings, else m and rad if *in_si*, else the one in which readings lie in the travel.
+        The columns are whole *lengths* of legs also if nothing else fits.
         """
-        units, unit_from, lengths = self._units(unit, lengths)
+        units, unit_from, lengths = self._units(unit, lengths, in_si)
         headings = {name: text for text, name in self.taken.items()}
         q, notes = readings_in(
             self.table, self.motors, units, place="headings", lengths=lengths, headings=headings
@@ -170,7 +152,10 @@ class ReadingsSheet:
         return SheetReadings(self._joints, q, np.array(last), in_order, unit_from, lengths, notes)
 
     def _renamed_columns(self, lines: Lines) -> Lines:
-        """Return the lines with columns renamed to our names; unknown columns are left out."""
+        """Return the lines with columns renamed to our names.
+
+        Unknown columns are left out, or kept to be refused where the sheet has others.
+        """
         number, header = lines[0]
         if sum(is_number(text) and not text.isdecimal() for text in header) > 1:
             raise DatasetError(
@@ -182,17 +167,26 @@ class ReadingsSheet:
         known = (*UNITS[False], *UNITS[True])
         readings = [split_heading(x.replace("°", "deg"), known, others=True) for x in header]
         meaning: dict[int, str] = {}
-        clock: dict[int, Decimal] = {}  # seconds in a unit of a column of times
-        for i in sorted(range(len(header)), key=lambda i: _is_vague(header[i])):
+        sizes: dict[int, Decimal] = {}  # of the units of columns of times and of others
+        for i, text in enumerate(header):
+            key, unit = split_heading(text, (*LENGTH, *ANGLE))
+            what = "".join(set(concepts(text)) - {"tool", "joint", "pose"})
+            if name := self._others.get(what, self._others.get(key, "")):
+                meaning[i] = name
+                sizes |= {i: Decimal(repr({**LENGTH, **ANGLE}[unit]))} if unit else {}
+        left = [i for i in range(len(header)) if i not in meaning]
+        for i in sorted(left, key=lambda i: _is_vague(header[i])):
             key = split[i][0]
             for name in _COLUMNS:
                 timed = _TIME.fullmatch(key) if name == "time" else None
                 if (_means(header[i]) == name or timed) and name not in meaning.values():
                     meaning[i] = name
                 if timed and meaning.get(i) == name:
-                    clock = {i: Decimal(_SECONDS[timed[1]])}
+                    sizes[i] = Decimal(_SECONDS[timed[1]])
         free = [i for i in range(len(header)) if i not in meaning]
         meaning |= self._joints_of_columns(free, readings, header)
+        if self._others:
+            meaning = {i: text.lower() for i, text in enumerate(header)} | meaning
         for i, name in meaning.items():
             self.taken[header[i]] = name
             if name in self._joints:
@@ -212,7 +206,7 @@ class ReadingsSheet:
             )
         kept = sorted(meaning)
         below = [
-            (line, [in_unit(cells[i], clock[i]) if i in clock else cells[i] for i in kept])
+            (line, [in_unit(cells[i], sizes[i]) if i in sizes else cells[i] for i in kept])
             if len(cells) == len(header)
             else (line, cells)
             for line, cells in lines[1:]
@@ -259,7 +253,9 @@ class ReadingsSheet:
             "(L1, q1, 1); rename the columns."
         )
 
-    def _units(self, option: str | None, lengths: bool) -> tuple[dict[str, ReadingUnit], str, bool]:
+    def _units(
+        self, option: str | None, lengths: bool, in_si: bool
+    ) -> tuple[dict[str, ReadingUnit], str, bool]:
         """Return the unit of each motor, the origin of the units, whether they are of lengths."""
         if (
             option is not None
@@ -294,6 +290,10 @@ class ReadingsSheet:
                     f"{' and '.join(sorted(stated))}, needed the same for all readings; correct "
                     "the headings."
                 )
+            if not stated and in_si:
+                units |= dict(zip(joints, map(default_unit, legs), strict=True))
+                origins.append("as joints of the model have it")
+                continue
             if not stated:
                 origin = "the unit in which the readings lie in the travel of the legs"
             meaning = self._meaning(legs, "".join(stated), lengths)

@@ -7,14 +7,10 @@ made where people read them. Tables of earlier versions hold sentences, which ar
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-import numpy as np
-
 from legcal.causes import Cause
-from legcal.geometry.types import BoolArray
 
 
 class Reason(StrEnum):
@@ -150,11 +146,6 @@ class Rejection:
 
 
 USED = Rejection()  # not rejected
-
-
-def have_reason(rejections: Sequence[Rejection], *reasons: Reason) -> BoolArray:
-    """Return a mask (n,) of the rejections for any of some reasons."""
-    return np.array([rejection.reason in reasons for rejection in rejections], dtype=np.bool_)
 
 
 def reason_in_words(code: str) -> str:

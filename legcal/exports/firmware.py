@@ -409,10 +409,10 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
             place = " ".join(f"{coordinate:.1f}" for coordinate in point)
             tip = f"x y z {place}: {np.linalg.norm(error):.3g} mm"
             canvas.box(x - 2.0, y - 2.0, 4.0, 4.0, GREY, tip)
-            canvas.line(x, y, x + magnified * error[0], y - magnified * error[1], BLUE, 1.5)
-            canvas.line(x, y, x, y - magnified * error[2], "#b3541e", 1.0)
+            canvas.segment((x, y), (x + magnified * error[0], y - magnified * error[1]), BLUE, 1.5)
+            canvas.segment((x, y), (x, y - magnified * error[2]), "#b3541e", 1.0)
     y = side + 10.0
-    canvas.line(12.0, y, 12.0 + magnified * longest, y, BLUE, 2.0)
+    canvas.segment((12.0, y), (12.0 + magnified * longest, y), BLUE, 2.0)
     canvas.text(
         22.0 + magnified * longest,
         y + 4.0,

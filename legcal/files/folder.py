@@ -143,33 +143,30 @@ def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
     return Path(output)
 
 
-def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
-    """Refuse an output folder that holds something else than an earlier output of its kind."""
+def check_destination(
+    destination: Path, kind: OutputKind = RESULT, *, replaces: bool = True
+) -> None:
+    """Refuse an output folder that holds files, unless it *replaces* earlier output of its kind."""
     check_path(destination, kind)
-    start = f"{destination}: the {kind.noun} could not be written: found"
+    is_earlier = kind.is_in(destination)
     is_new = not destination.is_dir() or not holds_files(destination)
-    if kind.marker and not (is_new or kind.is_in(destination)):
-        marker, remedy = f"no {kind.marker} of legcal", ""
+    if is_new or (replaces and (is_earlier or not kind.marker)):
+        return
+    found, needed, remedy = "a folder with files", "a new or empty folder", "give another folder"
+    if is_earlier:
+        found, remedy = f"an earlier {kind.noun}", f"{remedy}, or remove that one"
+    elif replaces:
+        found = "a folder with other files and"
+        needed += f" or that of an earlier {kind.noun}"
         if (destination / kind.marker).is_file():
-            marker = f"a {kind.marker} that is damaged or not of legcal"
-            remedy = f"remove a damaged {kind.noun}, or "
-        raise UsageError(
-            f"{start} a folder with other files and {marker}, needed a new or empty folder or that "
-            f"of an earlier {kind.noun}; {remedy}give another output folder."
-        )
-
-
-def check_empty(destination: Path, kind: OutputKind) -> None:
-    """Refuse an output folder that holds files."""
-    check_path(destination, kind)
-    if destination.is_dir() and holds_files(destination):
-        held, remedy = "a folder with files", ""
-        if kind.marker and kind.is_in(destination):
-            held, remedy = f"an earlier {kind.noun}", ", or remove that one"
-        raise UsageError(
-            f"{destination}: the {kind.noun} could not be written: found {held}, needed a new or "
-            f"empty folder; give another folder{remedy}."
-        )
+            found += f" a {kind.marker} that is damaged or not of legcal"
+            remedy = f"remove a damaged {kind.noun}, or {remedy}"
+        else:
+            found += f" no {kind.marker} of legcal"
+    raise UsageError(
+        f"{destination}: the {kind.noun} could not be written: found {found}, needed {needed}; "
+        f"{remedy}."
+    )
 
 
 def check_path(destination: Path, kind: OutputKind = RESULT) -> None:

@@ -6,7 +6,6 @@ import re
 import reprlib
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -35,7 +34,6 @@ _MOST_NAMES = 30  # maximum number of names in a hint that lists all
 _NEAREST_NAMES = 10  # in a hint that does not
 _LONGEST_WORD = 100  # maximum length of words for the search of a similar one
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_PLAIN_TEXT = re.compile(rb"[\w\n .,:;#'\"/()+\[\]{}$=-]*")  # parsed equally by all parsers
 
 _NEEDED = {
     "float_type": "a number",
@@ -191,16 +189,6 @@ _Loader.add_implicit_resolver(
 )
 
 
-class _QuickLoader(_Loader):
-    """The loader with the parser of libyaml: five times as fast, with poorer error messages."""
-
-    def __init__(self, stream: Any) -> None:
-        super().__init__("")
-        parser = yaml.CSafeLoader(stream)
-        for name in ("check_event", "peek_event", "get_event"):
-            setattr(self, name, getattr(parser, name))
-
-
 def _at(node: yaml.Node, actual: str) -> yaml.MarkedYAMLError:
     """Return a YAML error at the place of a node."""
     return yaml.MarkedYAMLError(problem=actual, problem_mark=node.start_mark)
@@ -239,41 +227,23 @@ def parse_yaml(
     """Return the mapping that the bytes of a YAML file hold, with its keys as text."""
     unread = Problem(f"the {noun} could not be read", file=str(path), code=Code.BAD_SYNTAX)
     try:
-        document = _loaded(content)
+        document = yaml.load(content, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         bad = replace(unread, found=str(error.problem), needed="YAML", remedy="mend that line")
         if mark := error.problem_mark:
             bad = replace(bad, line=mark.line + 1, columns=(str(mark.column + 1),))
         raise kind(bad) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        actual, needed = _first_line(error), "YAML text in UTF-8"
+        lines = str(error).strip().splitlines()
+        actual = f"'{lines[0]}'" if lines else "text nested too deeply"
+        needed = "YAML text in UTF-8"
     else:
         if isinstance(document, dict):
             return typing.cast("dict[str, Any]", document)
-        actual, needed = _kind_of(document), "'key: value' lines"
+        # The kind of content of a foreign file, without showing any of it
+        kinds = {str: "text", list: "a list", bool: "true or false", type(None): "nothing"}
+        actual, needed = kinds.get(type(document), "a number or date"), "'key: value' lines"
     raise kind(replace(unread, found=actual, needed=needed, remedy="write the file again"))
-
-
-def _loaded(content: bytes) -> Any:
-    """Return the content of YAML, with either parser; both agree on plain text."""
-    if yaml.__with_libyaml__ and _PLAIN_TEXT.fullmatch(content):
-        with suppress(yaml.YAMLError):
-            return yaml.load(content, Loader=_QuickLoader)
-    return yaml.load(content, Loader=_Loader)
-
-
-def _first_line(error: Exception) -> str:
-    """Return the message of an exception, on one line."""
-    text = str(error).strip().splitlines()
-    return f"'{text[0]}'" if text else "text nested too deeply"
-
-
-def _kind_of(value: object) -> str:
-    """Return the kind of content in a foreign file, without showing any of it."""
-    if value is None:
-        return "nothing"
-    kinds = {str: "text", list: "a list", bool: "true or false", int: "a number", float: "a number"}
-    return kinds.get(type(value), "one value")
 
 
 def validate(
@@ -361,7 +331,9 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
 
     match error["type"]:
         case "extra_forbidden":
-            remedy = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
+            block = _annotation_at(schema, loc[:-1])
+            fields = getattr(block, "model_fields", {}).items()
+            remedy = closest(str(loc[-1]), [field.alias or name for name, field in fields])
             return refused("an unknown key", "", remedy, "used", Code.UNKNOWN_KEY)
         case "missing" if is_short:
             return refused(f"{loc[-1]} numbers", "more", "add what is missing")
@@ -380,14 +352,6 @@ def _problem(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: s
     template = _NEEDED.get(error["type"])
     needed = error["msg"] if template is None else template.format(**context)
     return refused(describe(error["input"]), needed, "correct the value")
-
-
-def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
-    """Return the keys of a schema at a location."""
-    annotation = _annotation_at(schema, loc)
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [f.alias or name for name, f in annotation.model_fields.items()]
-    return []
 
 
 def _annotation_at(schema: type[BaseModel], loc: Iterable[int | str]) -> Any:

@@ -622,8 +622,11 @@ def _without_title(lines: Lines) -> Lines:
     if max(widths, default=0) < 3:
         return lines
     start = next(k for k, n in enumerate(widths) if 2 * n > max(widths))
-    end = len(lines)
-    while end > start + 1 and widths[end - 1] == 1 and _is_remark("".join(lines[end - 1][1])):
+    end, names = len(lines), SUFFIXES + FOREIGN_SUFFIXES
+    while end > start + 1 and widths[end - 1] == 1:
+        cell = "".join(lines[end - 1][1])
+        if is_number(cell) or cell.lower().endswith(names):  # of a photograph
+            break
         end -= 1
     for k in (start + 1, start):
         if not 0 < k < end or widths[k - 1] < 2:
@@ -639,11 +642,6 @@ def _without_title(lines: Lines) -> Lines:
             joined.append(f"{group} {name}".strip())
         return [(number, joined), *lines[k + 1 : end]]
     return lines[start:end]
-
-
-def _is_remark(cell: str) -> bool:
-    """Return whether the only cell of a line is neither a number nor a photograph's name."""
-    return not is_number(cell) and not cell.lower().endswith(SUFFIXES + FOREIGN_SUFFIXES)
 
 
 def _with_units(lines: Lines) -> Lines:

@@ -193,7 +193,7 @@ def draw_machine(
         shown = [(m, on_paper(m.points)) for m in marks if is_plan or not m.only_plan]
         _draw_marks(canvas, shown, names)
     step = _round_length(100.0 / scale)
-    canvas.line(12.0, foot, 12.0 + step * scale, foot, BASE_COLOUR, 2.0)
+    canvas.segment((12.0, foot), (12.0 + step * scale, foot), BASE_COLOUR, 2.0)
     canvas.text(18.0 + step * scale, foot + 4.0, f"{1e3 * step:g} mm")
     for k, text in enumerate(legend, 1):
         canvas.text(12.0, foot + _LINE * k + 7.0, text)

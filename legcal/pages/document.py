@@ -103,8 +103,6 @@ class Table(Block):
     rows: Sequence[Sequence[Cell]]
     title: str = ""
     note: str = ""
-    first: str = "first"  # adjective for the shown rows of too many: "worst"
-    folded: bool = False
     sortable: bool = True
     least: Mapping[int, int] = field(default_factory=dict)  # widths of columns of a narrow terminal
 
@@ -117,7 +115,7 @@ class Table(Block):
     def left_out(self) -> str:
         """The note on rows that are left out."""
         n = len(self.rows)
-        return f"The {self.first} {MAX_ROWS} of {n} rows are shown." if n > MAX_ROWS else ""
+        return f"The first {MAX_ROWS} of {n} rows are shown." if n > MAX_ROWS else ""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from markupsafe import Markup, escape
 
-from legcal.errors import OutOfResources, UsageError, printable
+from legcal.errors import UsageError, printable
+from legcal.files.folder import out_of_resources
 from legcal.geometry.types import Array, IntArray
 
 INK, DIM, RULE, BLUE, GREY = "#1d2126", "#667080", "#dfe3e8", "#1f5fa8", "#8b929c"
@@ -55,13 +56,8 @@ class Figure(Markup):
                 f"{file}: the drawing could not be written: found the suffix '{file.suffix}', "
                 "needed .svg; change the name."
             )
-        try:
+        with out_of_resources(file, "the drawing", "give another path"):
             file.write_text(str(self), encoding="utf-8")
-        except OSError as error:
-            raise OutOfResources(
-                f"{file}: the drawing could not be written: found '{error.strerror}', needed a "
-                "folder that can be written to; give another path."
-            ) from error
 
 
 @dataclass
@@ -73,18 +69,12 @@ class Canvas:
     title: str
     parts: list[str] = field(default_factory=list)
 
-    def line(
-        self, x1: float, y1: float, x2: float, y2: float, colour: str = RULE, width: float = 1.0
-    ) -> None:
-        """Draw a line."""
-        self.segment((x1, y1), (x2, y2), colour, width)
-
     def segment(
         self,
         start: Sequence[float] | Array,
         end: Sequence[float] | Array,
-        colour: str,
-        width: float,
+        colour: str = RULE,
+        width: float = 1.0,
         opacity: float = 1.0,
     ) -> None:
         """Draw a line between two points."""
@@ -228,7 +218,7 @@ def log_bars(
         canvas.text(left + 28.0, y + 9.0, bars.label, colour=DIM)
     for decade in np.arange(np.ceil(low), high + 1.0).tolist():
         x = place(10.0**decade)
-        canvas.line(x, top, x, canvas.height - 22.0)
+        canvas.segment((x, top), (x, canvas.height - 22.0))
         label = f"{10.0**decade:g}"
         canvas.text(x, canvas.height - 6.0, label, anchor="middle", colour=DIM)
     for k, name in enumerate(names):
@@ -239,7 +229,7 @@ def log_bars(
                 tip = f"{name}, {bars.label}: {value:.3g} {unit}"
                 canvas.box(left, y + dy, place(value) - left, 7.0, colour, tip)
         if marks and (value := marks.values[k]):
-            canvas.line(place(value), y - 1.5, place(value), y + 9.5, INK, 2.0)
+            canvas.segment((place(value), y - 1.5), (place(value), y + 9.5), INK, 2.0)
     return canvas
 
 
@@ -332,7 +322,7 @@ def scatter(
     canvas = Canvas(width, height, title)
     for tick, word in y_ticks:
         v = float(bottom - (bottom - top) * y_axis.share(np.array(tick)))
-        canvas.line(left, v, width - 6.0, v, GREY if tick == 0.0 else RULE)
+        canvas.segment((left, v), (width - 6.0, v), GREY if tick == 0.0 else RULE)
         canvas.text(left - 6.0, v + 4.0, word, anchor="end", size=11, colour=DIM)
     every = -(-len(names) // 24)
     marks = list(zip(range(len(names)), names, strict=True))[::every] if words else [
@@ -341,7 +331,7 @@ def scatter(
     for tick, word in marks:
         u = float(left + (width - left - 6.0) * x_axis.share(np.array(tick)))
         if not words:
-            canvas.line(u, top, u, bottom)
+            canvas.segment((u, top), (u, bottom))
         if upwards:
             canvas.text(
                 u + 4.0, bottom + 6.0, word, anchor="end", size=11, colour=DIM, upwards=True
@@ -349,7 +339,7 @@ def scatter(
         else:
             at = min(u, width - 3.3 * len(word))  # so that the last one is not cut
             canvas.text(at, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
-    canvas.line(left, top, left, bottom, GREY)
+    canvas.segment((left, top), (left, bottom), GREY)
     if diagonal:
         ends = np.array([max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)])
         canvas.path(on_paper(ends, ends), GREY, 1.0)

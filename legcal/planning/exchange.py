@@ -103,19 +103,14 @@ class Session:
         """Return the covariances (n, p, p) of the machine with each of *images* added."""
         columns = self.columns[slot]
         block, p = self.covariance[np.ix_(columns, columns)], self.p
-        rows = self._next_rows(slot, images)
+        candidates = self.slots[slot]
+        sites = candidates.site[images].tolist()
+        number = [1 + len(self._chosen_at.get((slot, site), ())) for site in sites]
+        rows = candidates.gains(images, np.array(number))
         rows_covariance = rows @ block
         S = np.eye(rows.shape[1]) + rows_covariance @ np.swapaxes(rows, 1, 2)
         half = rows_covariance[..., :p]
         return np.asarray(self.machine - np.swapaxes(half, 1, 2) @ np.linalg.solve(S, half))
-
-    def _next_rows(self, slot: int, images: IntArray) -> Array:
-        """Rows (n, r, m) of images, given the selected images of their sites."""
-        candidates = self.slots[slot]
-        count = [
-            len(self._chosen_at.get((slot, site), ())) for site in candidates.site[images].tolist()
-        ]
-        return candidates.gains(images, 1 + np.array(count))
 
     def fitted(self) -> Array:
         """Return the covariance (p, p) of a fit to the given images, with errors at places."""
@@ -142,7 +137,6 @@ def choose(
     criterion: Criterion,
     rng: np.random.Generator,
     least: int,  # images of each slot
-    most: int,
     *,
     is_enough: Callable[[float], bool] = lambda _: False,
     progress: Report = no_progress,
@@ -154,10 +148,7 @@ def choose(
         count = [sum(s == slot for s, _ in chosen.images) for slot in range(n_slots)]
         missing = [max(least - c, 0) for c in count]
         remaining = n_images - len(chosen.images)
-        open_slots = [
-            s for s in range(n_slots)
-            if count[s] < most and (missing[s] > 0 or sum(missing) < remaining)
-        ]  # fmt: skip
+        open_slots = [s for s in range(n_slots) if missing[s] > 0 or sum(missing) < remaining]
         slot, image, value = _best_candidate(
             session, open_slots, criterion, rng, set(chosen.images)
         )
@@ -178,7 +169,6 @@ def exchange(
     criterion: Criterion,
     rng: np.random.Generator,
     least: int,
-    most: int,
     *,
     progress: Report = no_progress,
     stop: Callable[[], bool] = lambda: False,
@@ -190,11 +180,8 @@ def exchange(
         for i, (slot, image) in enumerate(list(chosen.images)):
             if stop():
                 break
-            others = [pair for k, pair in enumerate(chosen.images) if k != i]
-            count = [sum(s == other for s, _ in others) for other in range(len(session.slots))]
-            open_slots = [s for s in range(len(count)) if count[s] < most]
-            if count[slot] < least:
-                open_slots = [slot]
+            is_needed = sum(s == slot for s, _ in chosen.images) <= least
+            open_slots = [slot] if is_needed else range(len(session.slots))
             session.changed(slot, image, -1.0)
             replacement = _best_candidate(session, open_slots, criterion, rng, set(chosen.images))
             if replacement[2] < chosen.value * (1.0 - _MIN_GAIN):

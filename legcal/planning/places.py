@@ -40,27 +40,13 @@ USUAL_SHIFT, USUAL_LENGTH, USUAL_DRAWS = 0.125, 0.005, 20  # mean leg lengths, d
 
 @dataclass(frozen=True)
 class Setting:
-    """Tolerances of tripods and of the machine.
+    """Tolerances of tripods and of the machine: the largest errors."""
 
-    Attributes
-    ----------
-    shift : float
-        Largest distance of a camera from its planned place [m].
-    length : float
-        Largest error of lengths and coordinates of the model [m].
-    turn : float
-        Largest error of the orientation of a camera [rad].
-    angle : float
-        Largest error of axes of the model [rad].
-    draws : int
-        Random sessions within these tolerances, to evaluate a plan.
-    """
-
-    shift: float
-    length: float
-    turn: float = float(np.deg2rad(5.0))
-    angle: float = float(np.deg2rad(0.1))
-    draws: int = 20
+    shift: float  # of the place of a camera [m]
+    length: float  # of lengths and coordinates of the model [m]
+    turn: float = float(np.deg2rad(5.0))  # of the orientation of a camera [rad]
+    angle: float = float(np.deg2rad(0.1))  # of axes of the model [rad]
+    draws: int = 20  # random sessions within these tolerances, to evaluate a plan
 
     def margin(self, camera: Camera, nearest: float) -> float:
         """Return the largest image shift of a point at a distance *nearest* [px]."""

@@ -319,26 +319,21 @@ def _visible_places(
     run: Run,
 ) -> list[tuple[Place, Contributions]]:
     """Return the camera places that see legs, with the information of a few poses."""
-    visible = []
+    visible, blind = [], []
     probes = np.sort(rng.permutation(len(poses.poses))[:N_PROBES]).tolist()
     in_Rb = platforms_in_base(task.machine, [poses.poses[i] for i in probes])
     contributions_of_places = run(
         partial(task.contributions, poses=in_Rb), [place.T_base_camera for place in places]
     )
     for k, (place, contributions) in enumerate(zip(places, contributions_of_places, strict=True)):
-        if contributions is not None:
+        if contributions is None:
+            blind.append(place)
+        else:
             visible.append((place, contributions))
         progress("Camera places", k + 1, len(places))
     n_needed = 1 if task.hand_held else task.n_views
-    if not visible or (task.places and len(visible) < n_needed):
-        used = {id(place) for place, _ in visible}
-        blind = [place for place in places if id(place) not in used]
-        raise NotVisible(_no_visible_places(task, blind, len(places), n_needed))
-    return visible
-
-
-def _no_visible_places(task: Task, blind: Sequence[Place], n_places: int, needed: int) -> str:
-    """Describe that too few places see legs, and the board."""
+    if visible and not (task.places and len(visible) < n_needed):
+        return visible
     names = ", ".join(place.name for place in blind if place.name) or "the cameras"
     remedy = (
         f"point {names} at the machine, from where no plate or other leg hides the legs, near "
@@ -349,12 +344,12 @@ def _no_visible_places(task: Task, blind: Sequence[Place], n_places: int, needed
             "use a board with larger squares, or a smaller one that is whole in the image from "
             f"{names}"
         )
-    return (
-        f"{task.machine.yaml_path}: no session could be planned: only {n_places - len(blind)} of "
-        f"{n_places} camera positions see legs{' and the board' * (task.board is not None)} with "
-        f"the tripod tolerance of {1e2 * task.setting.shift:.2g} cm and "
-        f"{np.degrees(task.setting.turn):g} deg; {needed} {'are' if needed > 1 else 'is'} needed; "
-        f"{remedy}."
+    raise NotVisible(
+        f"{task.machine.yaml_path}: no session could be planned: only {len(visible)} of "
+        f"{len(places)} camera positions see legs{' and the board' * (task.board is not None)} "
+        f"with the tripod tolerance of {1e2 * task.setting.shift:.2g} cm and "
+        f"{np.degrees(task.setting.turn):g} deg; {n_needed} {'are' if n_needed > 1 else 'is'} "
+        f"needed; {remedy}."
     )
 
 
@@ -428,13 +423,9 @@ class _Search:
         """Return the information of candidates, all of which see legs."""
         return [one for one in self.run(self.task.of, candidates) if one is not None]
 
-    def with_all(self, slots: Sequence[Contributions]) -> Session:
-        """Return the session with all images of all slots."""
-        return Session([], [*slots, *self.given])
-
     def value(self, slots: Sequence[Contributions]) -> float:
         """Return the criterion with all images of all slots."""
-        return float(self.criterion(self.with_all(slots).machine[None])[0])
+        return float(self.criterion(Session([], [*slots, *self.given]).machine[None])[0])
 
     def chosen(
         self, shown: Sequence[tuple[Place, Contributions]], poses: Configurations
@@ -459,13 +450,11 @@ class _Search:
         least = min([least, *count])
         session = Session(self.added(current), self.given)
         images = choose(
-            session, task.n_images, self.criterion, self.rng, least, task.n_images,
-            progress=self.progress,
-        )  # fmt: skip
+            session, task.n_images, self.criterion, self.rng, least, progress=self.progress
+        )
         images = exchange(
-            session, images, self.criterion, self.rng, least, task.n_images,
-            progress=self.progress, stop=self.stop,
-        )  # fmt: skip
+            session, images, self.criterion, self.rng, least, progress=self.progress, stop=self.stop
+        )
         self._refuse_undetermined(session)
         return _selected_candidates(current, images), least, images.value
 
@@ -491,7 +480,6 @@ class _Search:
             error_of,
             np.random.default_rng(task.seed),
             0,
-            _MOST_NEEDED,
             is_enough=lambda error: error < limit,
         )
         n = max(len(more.images), task.n_images + 1)
@@ -550,7 +538,7 @@ class _Search:
             session.changed(slot, image, 1.0)
         session.renewed()
         exchanged = exchange(
-            session, Chosen(images), self.criterion, self.rng, least, len(images), stop=self.stop
+            session, Chosen(images), self.criterion, self.rng, least, stop=self.stop
         )
         return _selected_candidates(widened, exchanged), exchanged.value
 
@@ -626,7 +614,7 @@ class _Search:
         """Numbers of images and their criterion, (n, 2), extrapolated beyond the plan."""
         n = sum(len(part.rows) for part in contributions)
         session = Session(contributions, self.given)
-        order = choose(session, n, self.criterion, np.random.default_rng(0), 0, n)
+        order = choose(session, n, self.criterion, np.random.default_rng(0), 0)
         rows = [(k + 1.0, value) for k, value in enumerate(order.history)]
         for times in _EXTRAPOLATED:
             more = [part.repeated(times) for part in contributions]

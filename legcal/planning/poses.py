@@ -156,29 +156,24 @@ def shortest_order(machine: Machine, poses: Configurations, begin: Array) -> lis
     lower, upper = motor_travel(machine)
     q = np.concatenate([begin[None], poses.configurations])[:, columns]
     q = q / (upper - lower)
-    distance = np.abs(q[:, None] - q).max(axis=2)
+    distance = np.pad(np.abs(q[:, None] - q).max(axis=2), (0, 1))  # the end is near all
     order, remaining = [0], set(range(1, len(q)))
     while remaining:
         order.append(min(remaining, key=lambda k: (distance[order[-1], k], k)))
         remaining.remove(order[-1])
+    order.append(len(q))
     for _ in range(_ROUNDS):
         shorter = False
-        for i in range(1, len(order) - 1):
-            for j in range(i + 1, len(order)):
-                next_leg = distance[order[j], order[j + 1]] if j + 1 < len(order) else 0.0
-                joined = distance[order[i], order[j + 1]] if j + 1 < len(order) else 0.0
-                gain = (
-                    distance[order[i - 1], order[i]]
-                    + next_leg
-                    - distance[order[i - 1], order[j]]
-                    - joined
-                )
-                if gain > 1e-12:
+        for i in range(1, len(order) - 2):
+            for j in range(i + 1, len(order) - 1):
+                before, first, last, after = (order[k] for k in (i - 1, i, j, j + 1))
+                now = distance[before, first] + distance[last, after]
+                if now - distance[before, last] - distance[first, after] > 1e-12:
                     order[i : j + 1] = order[i : j + 1][::-1]
                     shorter = True
         if not shorter:
             break
-    return [k - 1 for k in order[1:]]
+    return [k - 1 for k in order[1:-1]]
 
 
 def ways(machine: Machine, configurations: Array) -> tuple[tuple[str, ...], int]:

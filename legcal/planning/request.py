@@ -15,7 +15,7 @@ from legcal.calibration.joint_fit.predicted import (
     Predictor,
     read_noise,
 )
-from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset import Dataset, load_dataset, rows_with_image
 from legcal.data.reading_units import sigmas_of
 from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError
 from legcal.geometry.types import Array
@@ -160,6 +160,9 @@ def plan(
     choices, scale_notes = Choices.by_tolerances(machine, only), tuple[str, ...]()
     if only is None:
         choices, scale_notes = measured_length(machine, board=board is not None)
+    laid = None if board is None else board_of(board)
+    if laid is not None:
+        parse_board(board_document(laid), Path("--board"))  # as a dataset does
     task = Task(
         Predictor(machine, selected_camera, predicted_noise, sigma_q, choices, sigma_by_joint),
         n_images,
@@ -169,7 +172,7 @@ def plan(
         listed,
         () if shot is None else _given_candidates(machine, shot),
         "" if shot is None else str(shot.folder),
-        None if board is None else _load_board(board),
+        laid,
         hand_held,
         seed,
     )
@@ -233,7 +236,16 @@ def _plan_for_target(
         n = n_next
     if best is not None:
         return best
-    raise NotIdentifiable(_unreachable_target(task, candidate, target))
+    more = ""
+    n, value = candidate.growth[candidate.growth[:, 0] <= MOST_IMAGES][-1]
+    if n > candidate.n_images:
+        more = f", about {1e3 * error * value / candidate.value:.3f} mm with {n:.0f} similar ones"
+    raise NotIdentifiable(
+        f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm cannot be reached: "
+        f"{1e3 * error:.3f} mm are expected with {candidate.n_images} images{more}; "
+        "use better light or a longer focal length, more --cameras, --board, or a larger "
+        "--target."
+    )
 
 
 def _images_for(planned: Plan, error: float, target: float) -> int:
@@ -245,21 +257,6 @@ def _images_for(planned: Plan, error: float, target: float) -> int:
     k = int(np.argmax(scaled <= np.log(target)))
     share = 1.0 if k == 0 else (scaled[k - 1] - np.log(target)) / (scaled[k - 1] - scaled[k])
     return int(np.ceil(np.exp(n[k] if k == 0 else n[k - 1] + share * (n[k] - n[k - 1]))))
-
-
-def _unreachable_target(task: Task, planned: Plan, target: float) -> str:
-    """Describe why no number of images reaches a target."""
-    error = 0.0 if planned.error is None else planned.error.mean_displacement
-    more = ""
-    n, value = planned.growth[planned.growth[:, 0] <= MOST_IMAGES][-1]
-    if n > planned.n_images:
-        more = f", about {1e3 * error * value / planned.value:.3f} mm with {n:.0f} similar ones"
-    return (
-        f"{task.machine.yaml_path}: the target of {1e3 * target:g} mm cannot be reached: "
-        f"{1e3 * error:.3f} mm are expected with {planned.n_images} images{more}; "
-        "use better light or a longer focal length, more --cameras, --board, or a larger "
-        "--target."
-    )
 
 
 def _counts(
@@ -280,7 +277,7 @@ def _counts(
             "leave out all but one."
         )
     usual = min(3, n_places) if n_places else 3
-    n_views = _checked_number("--cameras", usual if cameras is None else cameras, 1, MOST_VIEWS)
+    n_views = _checked_number("--cameras", usual if cameras is None else cameras, MOST_VIEWS)
     if n_places and n_views > n_places:
         raise UsageError(
             f"The plan could not be made: found {n_places} place{'s' * (n_places != 1)} for "
@@ -293,10 +290,10 @@ def _counts(
         )
     n_views = 1 if hand_held else n_views
     if per_view is not None:
-        each = _checked_number("--images-per-view", per_view, 1, MOST_IMAGES // n_views)
+        each = _checked_number("--images-per-view", per_view, MOST_IMAGES // n_views)
         return n_views * each, n_views
     usual = 3 * IMAGES_PER_VIEW
-    n_images = _checked_number("--images", usual if images is None else images, 1, MOST_IMAGES)
+    n_images = _checked_number("--images", usual if images is None else images, MOST_IMAGES)
     if n_images < n_views:
         raise UsageError(
             f"The plan could not be made: found {n_images} images for {n_views} cameras, needed "
@@ -306,13 +303,7 @@ def _counts(
 
 
 def _check_visible(machine: Machine) -> None:
-    """Refuse a machine none of whose legs and arms a camera can see.
-
-    Raises
-    ------
-    ModelError
-        If the model has no cylinder along any of them.
-    """
+    """Refuse a machine none of whose legs and arms a camera can see."""
     if not any(leg.cylinders or leg.arm for leg in machine.legs):
         raise ModelError(
             Problem(
@@ -372,19 +363,11 @@ def _check(
         raise UsageError(problems)
 
 
-def _load_board(board: str | Path | Board) -> Board:
-    """Load a board; DatasetError if a dataset could not use it."""
-    loaded = board_of(board)
-    parse_board(board_document(loaded), Path("--board"))
-    return loaded
-
-
 def _notes_on_missing_images(shot: Dataset | None) -> tuple[str, ...]:
     if shot is None or shot.observations is not None:
         return ()
     n = shot.measurements.n_rows
-    paths = [shot.image_path(row) for row in range(n)]
-    missing = sum(path is not None and not path.is_file() for path in paths)
+    missing = sum(map(bool, shot.measurements.image)) - len(rows_with_image(shot))
     if not missing:
         return ()
     return (
@@ -446,11 +429,10 @@ def _given_candidates(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]
     return tuple(views)
 
 
-def _checked_number(name: str, number: int, least: int, most: int) -> int:
+def _checked_number(name: str, number: int, most: int) -> int:
     """Check the number of an option against limits."""
-    if not least <= number <= most:
+    if not 1 <= number <= most:
         raise UsageError(
-            f"The plan could not be made: found {name} {number}, needed {least} to {most}; correct "
-            "it."
+            f"The plan could not be made: found {name} {number}, needed 1 to {most}; correct it."
         )
     return number

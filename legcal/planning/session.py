@@ -28,7 +28,7 @@ from legcal.data.dataset_file import dataset_texts
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.files.folder import (
     OutputKind,
-    check_empty,
+    check_destination,
     output_path,
     result_folder,
 )
@@ -57,7 +57,7 @@ PLANNED = OutputKind("session", PLAN_NAME, "legcal_plan")
 def check_session(output: str | Path) -> Path:
     """Return the folder of a session; refuse to replace other files."""
     destination = output_path(output, PLANNED)
-    check_empty(destination, PLANNED)
+    check_destination(destination, PLANNED, replaces=False)
     return destination
 
 
@@ -210,40 +210,25 @@ def pose_labels(n_images: int, n_given: int = 0) -> list[str]:
 @brief
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned session.
+    """A planned session."""
 
-    Attributes
-    ----------
-    machine : Machine
-        The nominal model.
-    camera : Camera
-        The camera.
-    views : tuple of PlannedView
-        Camera places, each with its poses. Of a hand-held camera every image is a view.
-    value : float
-        The criterion of the session as planned: the mean error of the platform over the workspace
-        [m], or where readings do not give its pose, the determinant's root.
-    error : PlatformError or None
-        Expected error of the platform over the workspace, one standard deviation: the root mean
-        square over the draws; None if readings do not determine its pose.
-    sigma : (p,) array
-        Expected standard deviation of each kinematic parameter [m, rad].
-    growth : (n, 2) array
-        Numbers of images, and the criterion with that many, most useful images first; beyond the
-        planned number, with copies of the planned images.
-    """
-
-    machine: Machine
+    machine: Machine  # the nominal model
     camera: Camera
     setting: Setting
     noise: PredictedNoise
     sigma_q: float  # [m] of a reading of a motor that slides
-    views: tuple[PlannedView, ...]
+    views: tuple[PlannedView, ...]  # of a camera in the hand, every image is one
+    # The criterion as planned: the mean error of the platform over the workspace [m], or where
+    # readings do not give its pose, the determinant's root
     value: float
+    # Expected over the workspace, one standard deviation: the root mean square over the draws;
+    # None if readings do not determine the pose
     error: PlatformError | None
-    sigma: Array
+    sigma: Array  # (p,) expected standard deviation of each kinematic parameter [m, rad]
     names: tuple[str, ...]
     units: tuple[str, ...]
+    # (n, 2) numbers of images, and the criterion with that many, most useful images first; beyond
+    # the planned number, with copies of the planned images
     growth: Array
     seed: int = 0
     board: LaidBoard | None = None  # on the base, in every image
@@ -288,14 +273,6 @@ class Plan:
     def document(self) -> dict[str, Any]:
         """Return the document of ``legcal plan --json``, a :class:`PlanDocument`."""
         error, names, setting, noise = self.error, self.machine.leg_names, self.setting, self.noise
-        expected = None
-        if error is not None:
-            expected = ExpectedError(
-                dX_m=error.mean_displacement,
-                dE_rad=error.mean_rotation,
-                dX_max_m=error.max_displacement,
-                dE_max_rad=error.max_rotation,
-            )
         rows = zip(self.names, self.sigma.tolist(), self.units, strict=True)
         return PlanDocument.describing(
             self,
@@ -304,7 +281,7 @@ class Plan:
             mechanism=self.machine.name,
             images=self.n_images,
             criterion="d" if error is None else "mean",
-            expected=expected,
+            expected=None if error is None else ExpectedError(**error.fields()),
             tolerance=Tolerance(
                 camera_m=setting.shift,
                 camera_rad=setting.turn,
@@ -412,9 +389,3 @@ class PlanDocument(SparseDocument):
     growth: list[Growth]
     notes: list[str]
     parts: list[PartSigma] | None = None  # left out where not asked for (--only)
-
-
-def views_in_words(views: Sequence[PlannedView]) -> str:
-    """Describe the numbers of images and places."""
-    n = sum(len(view.poses.poses) for view in views)
-    return f"{n} photographs from {len(views)} place{'s' * (len(views) != 1)}"

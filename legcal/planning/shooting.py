@@ -88,22 +88,10 @@ class Checked:
 
 
 class GuidedSession:
-    """A session that is being photographed.
+    """A session that is being photographed: the folder of ``legcal plan``, or a dataset to extend.
 
-    Parameters
-    ----------
-    folder : path
-        The folder of ``legcal plan``, or a dataset to extend.
-    target : float, optional
-        Predicted error of the platform at which the session is complete [m]; without it, a session
-        is complete with its plan.
-
-    Raises
-    ------
-    DatasetError, ModelError
-        If the folder cannot be used.
-    UsageError
-        If there is neither a plan nor a target.
+    It is complete at the *target* of the predicted error of the platform [m], without one with its
+    plan.
     """
 
     def __init__(self, folder: str | Path, *, target: float | None = None) -> None:

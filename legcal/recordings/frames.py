@@ -13,8 +13,7 @@ import re
 import tempfile
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.data.image_choice import unix_seconds
+from legcal.data.image_choice import seconds_in, unix_seconds
 from legcal.data.photograph_matching import find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, OutOfResources, UsageError
@@ -82,6 +81,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.notes: tuple[str, ...] = ()  # after all frames have been read
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames in the order of their times, or *only* the frames with these indices.
@@ -90,10 +90,6 @@ class Recording:
         """
         raise NotImplementedError
 
-    def notes(self) -> tuple[str, ...]:
-        """Return notes, after all frames have been read."""
-        return ()
-
     def readings(self) -> Series | None:
         """Return the readings in the recording, if any."""
         return None
@@ -101,10 +97,6 @@ class Recording:
 
 class Video(Recording):
     """A video file, read with OpenCV."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._notes: tuple[str, ...] = ()
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the frames; a video without any is refused."""
@@ -142,14 +134,10 @@ class Video(Recording):
                 "(ffmpeg -i IN -c:v libx264 -qp 0 OUT.mp4)."
             )
         if only is None and count < (1.0 - _LOST) * promised - 1:
-            self._notes = (
+            self.notes = (
                 f"{self.path} ends after {count} of {promised:.0f} frames: it is cut off or "
                 "damaged there; copy it again to use the rest.",
             )
-
-    def notes(self) -> tuple[str, ...]:
-        """Return a note if the video was cut off."""
-        return self._notes
 
 
 class ImageFolder(Recording):
@@ -220,11 +208,10 @@ class Bag(Recording):
         super().__init__(path)
         self._machine = machine
         self._image_topic = image_topic
-        self._bad = 0
 
     def frames(self, only: Container[int] | None = None) -> Iterator[Frame]:
         """Yield the images in the order of the bag; damaged images are skipped and counted."""
-        self._bad, last, number = 0, -np.inf, -1
+        n_bad, last, number = 0, -np.inf, -1
         messages = self._messages(
             "images",
             _IMAGES,
@@ -234,26 +221,22 @@ class Bag(Recording):
         for time, kind, message in messages:
             image = _image(message) if kind == _IMAGES[0] else _decoded(message)
             if image is None or time <= last:
-                self._bad += 1
+                n_bad += 1
                 continue
             last, number = time, number + 1
             if only is None or number in only:
                 yield Frame(time, image)
-
-    def notes(self) -> tuple[str, ...]:
-        """Return a note with the number of unusable images, if any."""
-        if not self._bad:
-            return ()
-        images, were = ("image", "was") if self._bad == 1 else ("images", "were")
-        return (
-            f"{self._bad} {images} of {self.path} {were} left out: damaged, of an unknown "
-            "encoding, or not later than the one before.",
-        )
+        if n_bad:
+            images, were = ("image", "was") if n_bad == 1 else ("images", "were")
+            self.notes = (
+                f"{n_bad} {images} of {self.path} {were} left out: damaged, of an unknown "
+                "encoding, or not later than the one before.",
+            )
 
     def readings(self) -> Series | None:
         """Return the joint states, None if the bag holds none."""
         with self._opened() as reader:
-            topics = self._topics(reader, _JOINTS)
+            topics = _topics(reader, _JOINTS)
         if not topics:
             return None
         times, states = [], []
@@ -269,7 +252,7 @@ class Bag(Recording):
     ) -> Iterator[tuple[float, str, Any]]:
         """Yield time [s], type and content of the messages of the stated topic, or the only one."""
         with self._opened() as reader:
-            topics = self._topics(reader, kinds)
+            topics = _topics(reader, kinds)
             topic = topics[0] if stated is None and len(topics) == 1 else stated
             if topic not in topics:
                 found = ", ".join(map(describe, topics)) or "no topic"
@@ -282,9 +265,6 @@ class Bag(Recording):
             for connection, stamp, raw in reader.messages(connections=chosen):
                 message = reader.deserialize(raw, connection.msgtype)
                 yield _time(message, stamp), connection.msgtype, message
-
-    def _topics(self, reader: Any, kinds: tuple[str, ...]) -> list[str]:
-        return list(dict.fromkeys(c.topic for c in reader.connections if c.msgtype in kinds))
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
@@ -303,6 +283,11 @@ class Bag(Recording):
                 "(.bag) or 2 (its folder, .mcap); close its recording in order, or repair it "
                 "(rosbag reindex, ros2 bag reindex, mcap recover)."
             ) from error
+
+
+def _topics(reader: Any, kinds: tuple[str, ...]) -> list[str]:
+    """Return the topics of messages of some kinds."""
+    return list(dict.fromkeys(c.topic for c in reader.connections if c.msgtype in kinds))
 
 
 def _time(message: Any, recorded: int) -> float:
@@ -356,9 +341,19 @@ class Series:
     source: str  # source of the readings, for messages
     times: Array  # (n,) increasing times [s], by their own clock
     q: Array  # (n, n_motors) readings [m or rad], in the order of the actuated legs
-    taken: Mapping[str, str] = field(default_factory=dict)  # interpretation of each heading
     unit: str = "m"  # unit in the table and its origin, in words
     notes: tuple[str, ...] = ()
+
+    def in_order(self) -> Series:
+        """Return the readings in the order of their times; of equal times the first is kept."""
+        times, first = np.unique(self.times, return_index=True)
+        if len(times) < 3:
+            raise DatasetError(
+                f"{self.source}: the readings could not be used: found {len(times)} different "
+                "times, needed the readings of the whole recording, some each second; record them "
+                "again."
+            )
+        return replace(self, times=times, q=self.q[first])
 
 
 def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Series:
@@ -370,12 +365,19 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
             "seconds or as dates; add it or call it so, or use legcal init for photographs of "
             f"single poses. {' '.join(sheet.notes)}".rstrip()
         )
-    readings = sheet.readings(lengths=lengths)
-    times = _seconds(sheet.table.text("time"), path)
-    in_words = f"{readings.unit}, {readings.unit_from}"
-    return _in_order(
-        Series(str(path), times, readings.q, sheet.taken, in_words, (*sheet.notes, *readings.notes))
-    )
+    readings, texts = sheet.readings(lengths=lengths), sheet.table.text("time")
+    times = [seconds_in(text) for text in texts]
+    are_numbers = is_number(texts[0])
+    for text, time in zip(texts, times, strict=True):
+        if time is None or is_number(text) is not are_numbers:
+            raise DatasetError(
+                f"{path}, column time: the time could not be read: found {describe(text)}, needed "
+                "seconds, Unix times or dates such as 2026-11-23T10:15:00.125, one form in all "
+                "rows; correct it."
+            )
+    in_words, notes = f"{readings.unit}, {readings.unit_from}", (*sheet.notes, *readings.notes)
+    series = Series(str(path), np.array(times, dtype=float), readings.q, in_words, notes)
+    return series.in_order()
 
 
 def series_of_joints(
@@ -399,47 +401,7 @@ def series_of_joints(
             f"{source}: the readings could not be used: found one that is no finite number, needed "
             "positions in metres; record them again."
         )
-    return _in_order(Series(source, np.array([times[k] for k in complete], dtype=float), q))
-
-
-def _in_order(series: Series) -> Series:
-    """Return a series in the order of its times; of equal times the first is kept."""
-    times, first = np.unique(series.times, return_index=True)
-    if len(times) < 3:
-        raise DatasetError(
-            f"{series.source}: the readings could not be used: found {len(times)} different times, "
-            "needed the readings of the whole recording, some each second; record them again."
-        )
-    return Series(series.source, times, series.q[first], series.taken, series.unit, series.notes)
-
-
-def _seconds(texts: Sequence[str], path: Path) -> Array:
-    """Return times [s] of numbers (Unix times in s, ms, us or ns, or seconds) or of dates."""
-    others = [text for text in texts if not is_number(text)]
-    if 2 * len(others) < len(texts):
-        if others:
-            raise _no_time(others[0], path)
-        numbers = np.array([float(text) for text in texts])
-        size = float(np.median(np.abs(numbers)))
-        seconds = unix_seconds(size)
-        if seconds is None:
-            raise _no_time(texts[0], path)
-        return numbers * (seconds / size if size else 1.0)
-    stamps = []
-    for text in texts:
-        try:
-            moment = datetime.fromisoformat(text.strip())
-        except ValueError:
-            raise _no_time(text, path) from None
-        stamps.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
-    return np.array(stamps)
-
-
-def _no_time(text: str, path: Path) -> DatasetError:
-    return DatasetError(
-        f"{path}, column time: the time could not be read: found {describe(text)}, needed seconds, "
-        "Unix times or dates such as 2026-11-23T10:15:00.125, one form in all rows; correct it."
-    )
+    return Series(source, np.array([times[k] for k in complete], dtype=float), q).in_order()
 
 
 AGREE = 4.0  # largest difference of two frames at rest, means of squares of 8 px [grey levels]

@@ -102,11 +102,6 @@ class View:
     unit: str  # of the readings, in words
     block: RecordingBlock
 
-    @property
-    def used(self) -> list[int]:
-        """Indices of the used frames."""
-        return [still.frame for still in self.block.stills if still.frame is not None]
-
 
 @dataclass(frozen=True, eq=False)
 class Import:
@@ -144,42 +139,17 @@ class Import:
 
 
 def plan_import(
-    sources: Sequence[Path],
+    sources: Sequence[Path],  # a video, bag or folder of images with times for each camera position
     model: str | Path,
     destination: str | Path,
     *,
-    readings: Sequence[Path] = (),
+    readings: Sequence[Path] = (),  # one table for all recordings, one for each, or none for bags
     cameras: Sequence[str] = (),
     lengths: bool = False,
-    offset: float | None = None,
+    offset: float | None = None,  # clock of the camera minus clock of the readings [s]
     progress: Report = no_progress,
 ) -> Import:
-    """Select the frames of recordings in which the machine is at rest, with their readings.
-
-    Parameters
-    ----------
-    sources : sequence of path
-        A video, a ROS bag or a folder of images with times for each camera position; for a bag with
-        several cameras append the topic of one, ``run.mcap:/left/image_raw``.
-    model : path or str
-        The nominal model, as for :func:`legcal.load_mechanism`.
-    destination : path
-        The folder of the dataset.
-    readings : sequence of path
-        Tables of readings with a column of times: one for all recordings, or one for each; none
-        for bags with joint states.
-    cameras : sequence of str
-        Camera files: one for all views, or ``VIEW=FILE`` for each.
-    lengths : bool
-        Whether tables hold total lengths of legs instead of readings.
-    offset : float, optional
-        Clock of the camera minus clock of the readings [s]; determined from motion by default.
-
-    Raises
-    ------
-    DatasetError, ModelError, UsageError
-        If a file cannot be read, nothing moves or rests, or the clocks cannot be compared.
-    """
+    """Select the frames of recordings in which the machine is at rest, with their readings."""
     machine = load_mechanism(model)
     destination = Path(destination)
     check_path(destination, DATASET_FOLDER)
@@ -266,16 +236,17 @@ def _view(
     if len(times) < 3:
         raise DatasetError(f"{start} found {len(times)} frames, needed those of a recording.")
     frames_move = moving(changes)
-    moves = moving(reading_speeds(series.times, series.q))
-    for signal, motion in (("frames", frames_move), ("readings", moves)):
-        if motion is None:
-            raise DatasetError(
-                f"{start} found {signal} that change at one rate all the time, needed a machine "
-                "that rests at each pose and moves between; for photographs of single poses use "
-                f"legcal init. ({series.source if signal == 'readings' else recording.path})"
-            )
-    assert frames_move is not None
-    assert moves is not None
+    speeds = np.abs(np.diff(series.q, axis=0)).max(axis=1) / np.diff(series.times)
+    moves = moving(speeds)
+    if frames_move is None or moves is None:
+        signal, source = (
+            ("readings", series.source) if moves is None else ("frames", recording.path)
+        )
+        raise DatasetError(
+            f"{start} found {signal} that change at one rate all the time, needed a machine that "
+            "rests at each pose and moves between; for photographs of single poses use legcal "
+            f"init. ({source})"
+        )
     if given is not None:
         apart = Offset(given, 0.0, None)
     else:
@@ -317,7 +288,7 @@ def _view(
         offset_sigma_s=apart.sigma,
         agreement=apart.agreement,
         stills=stills,
-        notes=[*recording.notes(), *series.notes],
+        notes=[*recording.notes, *series.notes],
     )
     return View(name, recording, q, scatter, series.unit, block)
 
@@ -351,16 +322,7 @@ def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, 
 def import_recordings(
     plan: Import, *, force: bool = False, progress: Report = no_progress
 ) -> list[Path]:
-    """Write the dataset of an import, complete or not at all; return its files but the images.
-
-    Raises
-    ------
-    DatasetError
-        If the frames do not match the camera files.
-    UsageError
-        If files are in the way and *force* is not given.
-    """
-    check_path(plan.destination, DATASET_FOLDER)
+    """Write the dataset of an import, complete or not at all; return its files but the images."""
     motors = [plan.machine.legs[j] for j in plan.machine.motors]
     joints = [f"{leg.prismatic} [{leg.reading_unit}]" for leg in motors]
     with (
@@ -370,7 +332,7 @@ def import_recordings(
         rows: list[tuple[object, ...]] = []
         for view in plan.views:
             (folder / _SHOTS / view.name).mkdir(parents=True)
-            used = view.used
+            used = [still.frame for still in view.block.stills if still.frame is not None]
             for k, frame in enumerate(view.recording.frames(only=frozenset(used))):
                 name = f"{view.name}/{view.name}_{k + 1:03d}.png"
                 done, content = cv2.imencode(".png", frame.image)
@@ -432,11 +394,6 @@ def moving(speeds: Array) -> BoolArray | None:
     return fast if np.median(logs[fast]) - rest > MIN_CONTRAST * scatter else None
 
 
-def reading_speeds(times: Array, q: Array) -> Array:
-    """Return the speeds (n - 1,) [m/s] of readings (n, n_motors) between times (n,)."""
-    return np.asarray(np.abs(np.diff(q, axis=0)).max(axis=1) / np.diff(times))
-
-
 def clock_offset(
     frame_times: Array,  # (n + 1,) by their own clock [s]
     frames_move: BoolArray,  # (n,) whether there is motion between neighbouring times
@@ -444,13 +401,7 @@ def clock_offset(
     moves: BoolArray,  # (m,)
     most: float | None = None,  # largest offset [s] if both were recorded by one clock
 ) -> Offset:
-    """Return the offset with the best agreement of motion in frames and in readings.
-
-    Raises
-    ------
-    NoOffset
-        If motion does not agree, or agrees equally well with another offset.
-    """
+    """Return the offset with the best agreement of motion in frames and in readings."""
     span = max(np.ptp(frame_times), np.ptp(times))
     step = max(float(np.median(np.diff(frame_times))), span / _MOST_SAMPLES)
     frame_samples, start_of_frames = _on_grid(frame_times, frames_move, step)

@@ -28,7 +28,6 @@ from legcal.calibration.summary import (
     sentences,
     tables,
 )
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import few
 from legcal.machine.leg import ParameterId
@@ -64,7 +63,7 @@ def summary(
         steps = next_steps(calibration, str(output), command)
         first = next(one for one in steps if one.command)
         following = [f"Next: {first.what[0].lower()}{first.what[1:]}"]
-        following.append(printable(f"  {first.command}"))
+        following.append(f"  {first.command}")
     if not verbose:
         platform = None if result.platform is None else platform_table(result.platform)
         changes = _largest_changes(result) if calibration.verdict.trustworthy else None

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.special import ndtri
 
-from legcal.calibration.evaluation import Evaluation, evaluate
+from legcal.calibration.evaluation import evaluate
 from legcal.calibration.joint_fit.platform import PlatformMap, platform_map
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
@@ -211,19 +211,26 @@ def _maps(workspace: PlatformMap) -> list[Block]:
 
 
 def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Block]:
-    """Return the errors of the nominal and the calibrated model.
-
-    Raises
-    ------
-    ModelError
-        If the truth is not a model of the same machine.
-    DidNotConverge
-        If the models reach no readings together.
-    """
+    """Return the errors of the nominal and the calibrated model."""
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
     sigma = {row.name: row.sigma for row in calibration.result.parameters}
-    blocks: list[Block] = [Text([_at_the_platform(before, after), _ORIGIN])]
+    at_platform = (
+        "The motors do not determine the pose of the platform: parameters are compared alone."
+    )
+    if len(after.displacement):
+        by_nominal, by_calibrated = (
+            f"{1e3 * evaluation.displacement.mean():.3f} mm and "
+            f"{np.degrees(evaluation.rotation.mean()):.4f} deg by the"
+            for evaluation in (before, after)
+        )
+        at_platform = (
+            f"At the same readings the platform is off by {by_nominal} nominal model, and by "
+            f"{by_calibrated} calibrated model (means over {len(after.displacement)} poses of the "
+            "workspace, eq 20)."
+        )
+    origin = "The truth was given for this page alone: the result was computed without it."
+    blocks: list[Block] = [Text([at_platform, origin])]
     for unit_of_chart in ("m", "rad"):
         # Coordinates that the frame makes zero are not parameters.
         indices = [
@@ -247,31 +254,12 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
             Bars("calibrated", after_errors),
             Bars("its sigma as predicted", [scale * (sigma[name] or 0.0) for name in names]),
         )
-        blocks.append(Drawing(chart.markup(), _CAPTION))
-    return blocks
-
-
-_ORIGIN = "The truth was given for this page alone: the result was computed without it."
-_CAPTION = (
-    "As Fig. 4 of the paper, of this calibration alone: coordinates are those in R_b and R_e."
-)
-
-
-def _at_the_platform(before: Evaluation, after: Evaluation) -> str:
-    """Return the errors of eq (20) as a sentence."""
-    if not len(after.displacement):
-        return (
-            "The motors do not determine the pose of the platform: parameters are compared alone."
+        caption = (
+            "As Fig. 4 of the paper, of this calibration alone: coordinates are those in R_b and "
+            "R_e."
         )
-    errors = [
-        f"{1e3 * evaluation.displacement.mean():.3f} mm and "
-        f"{np.degrees(evaluation.rotation.mean()):.4f} deg by the {name} model"
-        for name, evaluation in (("nominal", before), ("calibrated", after))
-    ]
-    return (
-        f"At the same readings the platform is off by {errors[0]}, and by {errors[1]} (means over "
-        f"{len(after.displacement)} poses of the workspace, eq 20)."
-    )
+        blocks.append(Drawing(chart.markup(), caption))
+    return blocks
 
 
 # Parameters

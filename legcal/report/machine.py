@@ -12,7 +12,6 @@ import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.machine.model import Machine
@@ -64,6 +63,7 @@ def inspect_table(description: dict[str, Any]) -> Report:
         f": {'spatial' if description['spatial'] else 'planar'}, {len(legs)} legs, "
         f"mobility {mobility}, {motors} motors ({verdict})",
     )
+    radii_mm = [[1e3 * cylinder["radius"] for cylinder in leg["cylinders"]] for leg in legs]
     A, B = (_points([leg[end] for leg in legs]) for end in ("A", "B"))
     rows = [
         (
@@ -72,9 +72,9 @@ def inspect_table(description: dict[str, Any]) -> Report:
             A_text,
             B_text,
             _length(leg),
-            _radii(leg) or "none",
+            ", ".join(dict.fromkeys(f"{round(radius, 2):g}" for radius in radii)) or "none",
         )
-        for leg, A_text, B_text in zip(legs, A, B, strict=True)
+        for leg, A_text, B_text, radii in zip(legs, A, B, radii_mm, strict=True)
     ]
     kinds = max(4, *(0 if leg["actuated"] else len(leg["kind"]) for leg in legs))
     columns = ("leg", "type", ">A in base [mm]", ">B in platform [mm]", ">length [mm]", ">R [mm]")
@@ -129,12 +129,6 @@ def inspect_table(description: dict[str, Any]) -> Report:
     )
 
 
-def _travel(limits: Sequence[float], turns: bool) -> str:
-    """Return the limits of a joint in millimetres or degrees."""
-    scale, unit = SHOWN_IN["rad" if turns else "m"]
-    return f"{scale * limits[0]:z.2f} to {scale * limits[1]:z.2f} {unit}"
-
-
 def _motors(description: dict[str, Any]) -> Table:
     """Return the motors that move joints of rods, with axis and travel."""
     rows = []
@@ -142,6 +136,7 @@ def _motors(description: dict[str, Any]) -> Table:
         rods = [leg for leg in description["legs"] if leg.get("actuator") == joint]
         turns = motor["kind"] == "revolute"
         scale, unit = SHOWN_IN["rad" if turns else "m"]
+        low, high = (scale * limit for limit in rods[0]["travel"])
         rows.append(
             (
                 joint,
@@ -149,7 +144,7 @@ def _motors(description: dict[str, Any]) -> Table:
                 f"axis {_direction(motor['axis'])}"
                 if turns
                 else f"along {_direction(motor['direction'])}",
-                _travel(rods[0]["travel"], turns),
+                f"{low:z.2f} to {high:z.2f} {unit}",
                 f"{scale * rods[0]['q_home']:z.2f} {unit}",
             )
         )
@@ -176,12 +171,6 @@ def _points(points: Sequence[Sequence[float]]) -> list[str]:
     words = [[f"{1e3 * x:z.2f}" for x in point] for point in points]
     width = [max(len(row[k]) for row in words) for k in range(3)]
     return [" ".join(map(str.rjust, row, width)) for row in words]
-
-
-def _radii(leg: dict[str, Any]) -> str:
-    """Return the different radii of a leg in millimetres."""
-    rounded = [round(1e3 * cylinder["radius"], 2) for cylinder in leg["cylinders"]]
-    return ", ".join(dict.fromkeys(f"{radius:g}" for radius in rounded))
 
 
 def _bodies(legs: Sequence[dict[str, Any]]) -> list[str]:
@@ -223,7 +212,7 @@ def understood(columns: Mapping[str, str], noun: str, unit: str) -> list[str]:
     """Return lines on how the headings of a table and the unit of its readings were read."""
     renamed = [f"{text} is {name}" for text, name in columns.items() if text != name]
     return [
-        printable(f"Columns: {', '.join(renamed)}.") if renamed else "",
+        f"Columns: {', '.join(renamed)}." if renamed else "",
         f"Unit of the {noun}: {unit}." if unit else "",
     ]
 
@@ -237,7 +226,7 @@ def poses_table(poses: ToolPoses) -> Report:
         )
     ]
     return report(
-        heading(printable(poses.source), f": {len(poses)} tool poses"),
+        heading(poses.source, f": {len(poses)} tool poses"),
         understood(poses.columns, "readings", poses.unit),
         table(">row", ">x [mm]", ">y [mm]", ">z [mm]", "orientation", rows=rows),
     )
@@ -439,11 +428,15 @@ _MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 def identify_table(found: Identifiability) -> Report:
     """Return an identifiability report as text, 80 columns wide."""
+    remedies = [
+        (r.remedy, f"{r.full_rank}/{found.full.of}", "enough" if r.enough else "helps")
+        for r in found.remedies
+    ]
     return report(
         _heading(found),
         [conditions_table(found.conditions, found.legs), Text(_LEGEND, style="dim")],
         _weak(found.full) if found.full.weak else None,
-        _remedies(found) if found.remedies else None,
+        table("remedy", ">rank", "", rows=remedies) if remedies else None,
         _verdict(found),
     )
 
@@ -509,19 +502,6 @@ def _hidden(weak: WeakDirection) -> tuple[str, str]:
 def _two_digits(value: float) -> str:
     """Return a number with two significant digits, without exponent if it is large."""
     return f"{float(f'{value:.2g}'):.12g}"
-
-
-def _remedies(found: Identifiability) -> Table:
-    n_parameters = found.full.of
-    rows = [
-        (
-            r.remedy,
-            f"{r.full_rank}/{n_parameters}",
-            "enough" if r.enough else "helps",
-        )
-        for r in found.remedies
-    ]
-    return table("remedy", ">rank", "", rows=rows)
 
 
 def _verdict(found: Identifiability) -> list[Part]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.types import Array
 from legcal.machine.model import readings_at
@@ -16,7 +15,7 @@ from legcal.machine.picture import Mark, draw_machine
 from legcal.pages.document import Block, Drawing, Items, Picture, Row, data_url, page_html
 from legcal.pages.svg import Canvas
 from legcal.planning.places import LaidBoard
-from legcal.planning.session import Plan, poses_to_take, settings_in_words, views_in_words
+from legcal.planning.session import Plan, poses_to_take, settings_in_words
 from legcal.report.machine import scale_option
 from legcal.report.render import Report, heading, report, table, text_page
 from legcal.report.scene import pyramid
@@ -54,10 +53,12 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         )
         for i in worst
     ]
-    growth = [(f"{n:.0f}", _scaled_in_words(plan, value)) for n, value in _selected_growth(plan)]
-    distances = [
-        (name, *(f"{1e3 * x:.0f}" for x in row)) for name, row in camera_distances(plan).items()
-    ]
+    growth = _growth(plan)
+    A, distances = _measured_joints(plan), []
+    for view in plan.views:
+        centre = view.T_base_camera.translation
+        lengths = [*np.linalg.norm(A - centre, axis=1), centre[2] - A[:, 2].mean()]
+        distances.append((view.name, *(f"{1e3 * x:.0f}" for x in lengths)))
     legs = ", ".join(names)
     option = (
         scale_option(plan.machine, board=plan.board is not None)
@@ -65,15 +66,21 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
         else f" --only {plan.only}"
     )
     return report(
-        [heading(printable(plan.machine.name), f": {views_in_words(plan.views)}"), plan.sentence],
+        [
+            heading(
+                plan.machine.name,
+                f": {plan.n_images} photographs from {len(views)} place{'s' * (len(views) != 1)}",
+            ),
+            plan.sentence,
+        ],
         table(
-            "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {printable(legs)}",
-            rows=[tuple(map(printable, row)) for row in views],
+            "view", ">images", ">x [m]", ">y [m]", ">z [m]", f"images of {legs}",
+            rows=views,
         ),
         table(
             "view", *(f">distance to A{j + 1} [mm]" for j in plan.machine.frame_legs),
             ">height above the base joints [mm]",
-            rows=[tuple(map(printable, row)) for row in distances],
+            rows=distances,
             title="Distances to measure, from the middle of the lens to joints of the base"
             + plan.machine.at_zero,
         ),
@@ -82,15 +89,13 @@ def plan_table(plan: Plan, output: Path | None) -> Report:
             ">images", ">expected", rows=growth,
             title="Expected error vs. number of images",
         ),
-        list(map(printable, plan.notes)),
+        plan.notes,
         [] if output is None else [
-            printable(f"written: {output}"),
-            *([printable(f"afterwards, {_to_be_added(plan)}")] if plan.given else []),
+            f"written: {output}",
+            *([f"afterwards, {_to_be_added(plan)}"] if plan.given else []),
             "photograph it, and calibrate:",
-            printable(f"  legcal shoot {shlex.quote(str(output))} --watch FOLDER"),
-            printable(
-                f"  legcal calibrate {shlex.quote(str(plan.given or output))} -o OUT{option}"
-            ),
+            f"  legcal shoot {shlex.quote(str(output))} --watch FOLDER",
+            f"  legcal calibrate {shlex.quote(str(plan.given or output))} -o OUT{option}",
         ],
     )  # fmt: skip
 
@@ -103,42 +108,21 @@ def _to_be_added(plan: Plan) -> str:
     )
 
 
-def _selected_growth(plan: Plan) -> list[tuple[float, float]]:
-    """Return the criterion at selected numbers of images."""
-    n = plan.n_images
-    chosen = {
-        max(n // 3, 1),
-        max(2 * n // 3, 1),
-        n,
-        *(k for k in plan.growth[:, 0] if n < k <= 4 * n),
-    }
-    return [(k, value) for k, value in plan.growth.tolist() if k in chosen]
-
-
-def _scaled_in_words(plan: Plan, value: float) -> str:
-    """Return the expected error at another value of the criterion, in words."""
-    ratio = value / plan.value
-    if plan.error is None:
-        return f"{ratio:.2f} relative to the plan"
-    return f"{1e3 * ratio * plan.error.mean_displacement:.3f} mm"
+def _growth(plan: Plan) -> list[tuple[str, str]]:
+    """Return the expected error at selected numbers of images."""
+    n, rows = plan.n_images, list[tuple[str, str]]()
+    for k, value in plan.growth.tolist():
+        if k in (max(n // 3, 1), max(2 * n // 3, 1), n) or n < k <= 4 * n:
+            ratio, words = value / plan.value, "{:.2f} relative to the plan"
+            if plan.error is not None:
+                ratio, words = 1e3 * ratio * plan.error.mean_displacement, "{:.3f} mm"
+            rows.append((f"{k:.0f}", words.format(ratio)))
+    return rows
 
 
 def _measured_joints(plan: Plan) -> Array:
     """Return the joints to which distances are measured, motors at zero, (3, 3) [m]."""
     return np.asarray(plan.machine.A_base[list(plan.machine.frame_legs)])
-
-
-def camera_distances(plan: Plan) -> dict[str, list[float]]:
-    """Return the distances of the lens of each view from joints of the base, and its height [m]."""
-    A = _measured_joints(plan)
-    distances = {}
-    for view in plan.views:
-        centre = view.T_base_camera.translation
-        distances[view.name] = [
-            *np.linalg.norm(A - centre, axis=1).tolist(),
-            float(centre[2] - A[:, 2].mean()),
-        ]
-    return distances
 
 
 def checklist(plan: Plan) -> list[str]:
@@ -219,8 +203,8 @@ def plan_files(plan: Plan, previews: Mapping[str, bytes], command: str) -> dict[
     if plan.has_ways:
         settings.insert(2, 3)
     poses = table(
-        *(f"{'>' * (i >= first_motor)}{printable(header[i])}" for i in settings),
-        rows=[[printable(row[i]) for i in settings] for row in rows],
+        *(f"{'>' * (i >= first_motor)}{header[i]}" for i in settings),
+        rows=[[row[i] for i in settings] for row in rows],
         title="Poses to take, in this order",
     )
     blocks: list[Block] = [

@@ -6,19 +6,16 @@ import platform as system
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from legcal.errors import escaped
+from legcal.errors import escaped, printable
 from legcal.pages.document import (
     Block,
     Cell,
     Facts,
-    Items,
     Number,
     Page,
     Section,
@@ -30,7 +27,7 @@ from legcal.pages.document import Text as Paragraphs
 from legcal.version import __version__
 
 Part = str | Text | Table
-_ITEM, COMMAND = "- ", "  legcal "
+_COMMAND = "  legcal "
 _NAME = 8  # characters of names in a first column that do not break
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
 
@@ -88,11 +85,11 @@ def table(
 
 def heading(name: str, rest: str) -> Text:
     """Return the heading of a report, the name in bold."""
-    return Text.assemble((escaped(name), "bold"), escaped(rest))
+    return Text.assemble((printable(name), "bold"), printable(rest))
 
 
 def safe_text(text: str | Text) -> Text:
-    """Return text with control characters and markup escaped for the terminal.
+    """Return text without control characters and markup; what is styled is not cut.
 
     Commands to copy stay on one line.
     """
@@ -100,7 +97,7 @@ def safe_text(text: str | Text) -> Text:
         if text.plain != (plain := escaped(text.plain)):
             return Text(plain, style=text.style, overflow=text.overflow)
         return text
-    return Text(escaped(text), overflow="ignore" if text.startswith(COMMAND) else None)
+    return Text(printable(text), overflow="ignore" if text.startswith(_COMMAND) else None)
 
 
 def _number(word: str) -> Cell:
@@ -161,20 +158,16 @@ def record_section(command: str, when: str, more: Mapping[str, str]) -> Section:
     return Section("record", "Reproducibility", [Facts(facts)])
 
 
-def _blocks(report: Report, omitted: str) -> list[Any]:
+def _blocks(report: Report, omitted: str) -> list[Block]:
     """Return the parts of a report as blocks, without an omitted line."""
-    blocks: list[Any] = []
+    blocks: list[Block] = []
     for part in (part for group in report.groups for part in group):
         if isinstance(part, Table):
             blocks.append(part)
             continue
         lines = [line for line in part.plain.splitlines() if line.strip() and line != omitted]
-        for is_item, group in groupby(lines, lambda line: line.startswith(_ITEM)):
-            kind, texts = (
-                (Items if is_item else Paragraphs),
-                [line_of_group.removeprefix(_ITEM) for line_of_group in group],
-            )
-            if blocks and type(blocks[-1]) is kind:
-                texts = [*(blocks.pop().items if is_item else blocks.pop().paragraphs), *texts]
-            blocks.append(kind(texts))
+        if blocks and isinstance(before := blocks[-1], Paragraphs):
+            lines = [*before.paragraphs, *lines]
+            blocks.pop()
+        blocks.append(Paragraphs(lines))
     return blocks

@@ -42,55 +42,26 @@ class PlacedModel(NamedTuple):
     moving: Array  # (k, m, 2, 3) carriages, arms, and bars between the joints of one motor
 
 
-class Mode(NamedTuple):
-    """Two models that are shown together; a machine alone stands for both."""
-
-    name: str
-    legend: tuple[str, str]
-    before: PlacedModel
-    after: PlacedModel
-
-
 class MachineScene:
     """A machine with the models that it is compared with.
 
-    Parameters
-    ----------
-    machine : Machine
-        The machine, whose frames R_b and R_e both models have.
-    legs : sequence of Leg
-        The legs that are shown, in R_b and R_e.
-    nominal : sequence of Leg, optional
-        The legs of the nominal model.
-    result : Result, optional
-        The document of the calibration: the source of directions and ellipsoids.
-    parameters : Parametrization, optional
-        The parameters of the calibration, by default those of the machine.
-
-    Attributes
-    ----------
-    size : float
-        Size of the machine at home [m].
-    rims : dict
-        Joints, or motors of the base, in order around base and platform, the first twice.
-    directions : list of (str, (p,) array)
-        Names and steps of the parameters along weak and held directions.
-    ellipsoids : dict
-        Half axes of one sigma at the joints, (n, 3, 3) [m], by side.
+    *legs* are shown, in R_b and R_e of the machine, beside *nominal* ones; the *result* of a
+    calibration is the source of directions and ellipsoids.
     """
 
     def __init__(
         self,
         machine: Machine,
         legs: Sequence[Leg],
-        nominal: Sequence[Leg] | None = None,
-        result: Result | None = None,
-        parameters: Parametrization | None = None,
+        nominal: Sequence[Leg] | None,
+        result: Result | None,
+        parameters: Parametrization | None = None,  # of the calibration, else of the machine
     ) -> None:
         self.machine, self.legs, self.nominal = machine, legs, nominal
         A, B = machine.A_base, machine.home.apply(machine.B_platform)
-        self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())
+        self.size = float(np.ptp(np.concatenate([A, B]), axis=0).max())  # at home [m]
         anchors = motor_lines(machine.legs, A[None]).anchors
+        # Joints, or motors of the base, in order around base and platform, the first twice
         self.rims = {"base": around(corners_of_base(A, anchors)), "platform": around(B)}
         self._parameters = parameters or parametrization_of(machine, twists=True)
         length = float(np.mean(np.linalg.norm(B - A, axis=1)))
@@ -121,9 +92,9 @@ class MachineScene:
         lines = motor_lines(legs, (A - frame.translation) @ turn)
         return PlacedModel(A, B, *(points @ turn.T + frame.translation for points in lines))
 
-    def alone(self, shown: PlacedModel) -> list[Mode]:
-        """Return the machine beside no other model."""
-        return [Mode(self.machine.name, ("", "machine"), shown, shown)]
+    def alone(self, shown: PlacedModel) -> list[dict[str, Any]]:
+        """Return the machine beside no other model: it stands for both."""
+        return [self._mode(self.machine.name, ("", "machine"), shown, shown)]
 
     def modes(
         self,
@@ -132,7 +103,7 @@ class MachineScene:
         near: Sequence[RigidTransform],
         *,
         by_readings: bool,
-    ) -> list[Mode]:
+    ) -> list[dict[str, Any]]:
         """Return the machine, *shown* at readings, beside the models of the same readings.
 
         These are the nominal model, and the legs after a step along each of the directions.
@@ -140,21 +111,40 @@ class MachineScene:
         if self.nominal is None:
             return self.alone(shown)
         nominal = self.placed(self.nominal, q, near, by_readings=by_readings)
-        modes = [Mode("change by the calibration", ("nominal", "calibrated"), nominal, shown)]
+        modes = [self._mode("change by the calibration", ("nominal", "calibrated"), nominal, shown)]
         for words, step in self.directions:
             legs = moved_legs(self.legs, self._parameters.place, step)
             moved = self.placed(legs, q, near, by_readings=by_readings)
-            modes.append(Mode(words, ("calibrated", "moved along the direction"), shown, moved))
+            legend = "calibrated", "moved along the direction"
+            modes.append(self._mode(words, legend, shown, moved))
         return modes
 
-    def content(self, modes: Sequence[Mode], near: Sequence[RigidTransform]) -> dict[str, Any]:
+    def _mode(
+        self, name: str, legend: tuple[str, str], before: PlacedModel, after: PlacedModel
+    ) -> dict[str, Any]:
+        """Return two models that are shown together, and the first index of ``FACTORS``."""
+        moved = max(
+            float(np.abs(after.A - before.A).max()), float(np.abs(after.B - before.B).max())
+        )
+        wanted = _SHOWN * self.size / max(moved, 1e-12)
+        step = max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
+        return {
+            "name": printable(name),
+            "legend": legend,
+            "step": step if legend[0] else 0,
+            "models": [_model(before), _model(after)],
+        }
+
+    def content(
+        self, modes: Sequence[dict[str, Any]], near: Sequence[RigidTransform]
+    ) -> dict[str, Any]:
         """Return the content of ``scene.js`` at poses T_Rb_Re: the modes that can be chosen.
 
         Their difference is exaggerated, unless the machine is alone.
         """
         factor = _enlargement(self.ellipsoids, _RING * self.size)
         to_link = self.machine.T_platform_Re.inv()
-        factors = FACTORS if modes[0].legend[0] else (1,)
+        factors = FACTORS if modes[0]["legend"][0] else (1,)
         turns = [
             product(self.machine.T_base_Rb, T, to_link).rotation.as_matrix().round(6) for T in near
         ]
@@ -163,15 +153,7 @@ class MachineScene:
             "unit": "m",
             "flat": not self.machine.spatial,
             "factors": factors,
-            "modes": [
-                {
-                    "name": printable(mode.name),
-                    "legend": mode.legend,
-                    "step": self._first_step(mode) if len(factors) > 1 else 0,
-                    "models": [_model(mode.before), _model(mode.after)],
-                }
-                for mode in modes
-            ],
+            "modes": modes,
             "names": [printable(name) for name in self.machine.leg_names],
             "rims": self.rims,
             "rings": {
@@ -188,15 +170,6 @@ class MachineScene:
             {"name": printable(name), "points": pyramid(camera, T, depth).round(4).tolist()}
             for name, camera, T in views
         ]
-
-    def _first_step(self, mode: Mode) -> int:
-        """Return the default index of ``FACTORS`` for the difference between two models."""
-        before, after = mode.before, mode.after
-        moved = max(
-            float(np.abs(after.A - before.A).max()), float(np.abs(after.B - before.B).max())
-        )
-        wanted = _SHOWN * self.size / max(moved, 1e-12)
-        return max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
 
 
 def _steps(result: Result, parameters: Parametrization, length: float) -> list[tuple[str, Array]]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from legcal.errors import printable
 from legcal.files.quantity import SHOWN_IN
 from legcal.machine.model import Machine
 from legcal.pages.document import Table
@@ -37,7 +36,8 @@ _LARGE = 10.0  # smallest value with fewer digits, in the unit of its column
 
 def matching_table(new: NewDataset) -> Report:
     """Return the interpretation of a folder and a table: columns, units, matched photographs."""
-    pairs = list(zip(new.matching.pairs, new.views, strict=True))
+    table_of, pairs = new.sheet.table, new.pairs
+    images, times = table_of.text("image"), table_of.text("time")
     shown = [
         (joint, *SHOWN_IN[leg.reading_unit])
         for leg in (new.machine.legs[j] for j in new.machine.motors)
@@ -46,27 +46,27 @@ def matching_table(new: NewDataset) -> Report:
     rows = [
         (
             str(k + 1),
-            new.rows[k].image or new.rows[k].time,
+            images[k] or times[k],
             photograph.name,
-            view,
+            photograph.view,
             *(f"{size * new.readings_of(k)[joint]:z.3f}" for joint, size, _ in shown),
         )
-        for (k, photograph), view in pairs[:_MOST]
+        for k, photograph in pairs[:_MOST]
     ]
     if len(pairs) > _MOST:
         rows.append(("...", "", f"{len(pairs) - _MOST} more", "", *("" for _ in shown)))
-    counts = {view: new.views.count(view) for view in new.cameras}
+    counts = Counter(photograph.view for _, photograph in pairs)
     noun = "whole lengths of legs" if new.readings.are_lengths else "readings"
     unit_in_table = new.readings.unit and f"{new.readings.unit}, {new.readings.unit_from}"
     return report(
         heading(
-            printable(str(new.destination)),
+            str(new.destination),
             f": {len(pairs)} photographs, {len(counts)} view{'s' * (len(counts) != 1)}, "
             f"{len(new.readings.joints)} encoders",
         ),
         [
-            *understood(new.columns, noun, unit_in_table),
-            f"Photographs are matched {new.matching.how}.",
+            *understood(new.sheet.taken, noun, unit_in_table),
+            f"Photographs are matched {new.matched}.",
         ],
         table(
             ">row",
@@ -74,17 +74,15 @@ def matching_table(new: NewDataset) -> Report:
             "photograph",
             "view",
             *(f">{joint} [{unit}]" for joint, _, unit in shown),
-            rows=[tuple(map(printable, row)) for row in rows],
+            rows=rows,
         ),
         [
             *(
-                printable(
-                    f"View {view}: {counts[view]} photograph{'s' * (counts[view] != 1)}, camera "
-                    f"file {camera}."
-                )
+                f"View {view}: {counts[view]} photograph{'s' * (counts[view] != 1)}, camera file "
+                f"{camera}."
                 for view, camera in new.cameras.items()
             ),
-            *(Text(printable(f"note: {note}")) for note in new.notes),
+            *(f"note: {note}" for note in new.notes),
         ],
     )
 
@@ -95,16 +93,16 @@ def written_lines(destination: Path, written: Sequence[Path], machine: Machine) 
     folder, length = shlex.quote(str(destination)), scale_option(machine, board=False)
     return report(
         [
-            Text(printable(f"Written to {destination}: {names}."), overflow="ignore"),
+            Text(f"Written to {destination}: {names}.", overflow="ignore"),
             "Calibrate it:",
-            printable(f"  legcal calibrate {folder} -o OUT{length}"),
+            f"  legcal calibrate {folder} -o OUT{length}",
         ]
     )
 
 
 def import_table(recording_import: Import) -> Report:
     """Return the used frames of recordings, and the reasons for leaving out others."""
-    blocks: list[Text | Table | list[str] | list[Text]] = []
+    blocks: list[Text | Table | list[str]] = []
     for view in recording_import.views:
         block = view.block
         stills, unused = block.stills, Counter(s.why_not for s in block.stills if s.why_not)
@@ -120,16 +118,16 @@ def import_table(recording_import: Import) -> Report:
         reasons = [f"{n} {why_not}" for why_not, n in unused.items()]
         blocks += [
             heading(
-                printable(view.name),
+                view.name,
                 f": {block.used} of {len(stills)} rests in {block.frames} frames are used",
             ),
             [
-                printable(f"Clock of {block.recording} less that of {block.readings}: {offset}."),
+                f"Clock of {block.recording} less that of {block.readings}: {offset}.",
                 f"Unit of the readings: {view.unit}.",
                 f"Not used: {', '.join(reasons)}." if reasons else "",
             ],
             table(">rest from [s]", ">for [s]", "used", rows=rows),
-            [Text(printable(f"note: {note}")) for note in block.notes],
+            [f"note: {note}" for note in block.notes],
         ]  # fmt: skip
     sigma = recording_import.encoder_sigma
     scatter_in_words = (
@@ -145,12 +143,10 @@ def examination_table(examination: Examination, output: Path | None = None) -> R
     from legcal.calibration.detection import DETECTION_PAGE, tables_of  # not needed to simulate
 
     return report(
-        heading(printable(examination.mechanism), f": {printable(examination.dataset)}"),
+        heading(examination.mechanism, f": {examination.dataset}"),
         *map(_with_dashes, tables_of(examination)),
         [
-            Text.assemble(
-                (f"{finding.severity}: ", _STYLES[finding.severity]), printable(finding.what)
-            )
+            Text.assemble((f"{finding.severity}: ", _STYLES[finding.severity]), finding.what)
             for finding in examination.findings
         ],
         [examination.sentence, "" if output is None else f"Look at {output / DETECTION_PAGE}."],
@@ -160,7 +156,7 @@ def examination_table(examination: Examination, output: Path | None = None) -> R
 def _with_dashes(table: Table) -> Table:
     """Return a table whose empty cells have dashes."""
     texts = [[cell if isinstance(cell, str) else cell.text for cell in row] for row in table.rows]
-    return replace(table, rows=[[printable(text) or "-" for text in row] for row in texts])
+    return replace(table, rows=[[text or "-" for text in row] for row in texts])
 
 
 def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Report:
@@ -186,7 +182,7 @@ def simulation_table(document: dict[str, Any], *, to_measure: str = "") -> Repor
         table("view", ">images", *(f">{leg}" for leg in legs), rows=rows),
         [
             "Images of each view that show 40 % of a leg or more in one piece.",
-            _left_out(left_out) if left_out else "",
+            f"{left_out} image{'s' * (left_out > 1)} without legs are left out." * bool(left_out),
             _hidden(views.values(), n_images),
             f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
             "travel.",
@@ -227,14 +223,6 @@ def _hidden(views: Iterable[dict[str, Any]], n_images: int) -> str:
     )
 
 
-def _left_out(n: int) -> str:
-    return (
-        "1 image shows no leg and is left out."
-        if n == 1
-        else f"{n} images show no leg and are left out."
-    )
-
-
 def study_table(document: Mapping[str, Any]) -> Report:
     """Return the document of ``study paper`` as text, with the printed figures."""
     printed = document["as_printed"]
@@ -256,7 +244,7 @@ def study_table(document: Mapping[str, Any]) -> Report:
     rows.append((" before", *_printed_cells(printed["initial"])))
     rows.append((" after", *_printed_cells(printed["calibrated"])))
     notes = [*failures, printed["note"], *document["readings"]]
-    return report(table(*_COLUMNS, rows=rows), [Text(f"- {note}", style="dim") for note in notes])
+    return report(table(*_COLUMNS, rows=rows), [Text(note, style="dim") for note in notes])
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from legcal.data.reading_units import sigma_too_large
 from legcal.errors import UsageError
 from legcal.files.folder import (
     OutputKind,
-    check_empty,
+    check_destination,
     output_path,
     result_folder,
 )
@@ -142,7 +142,7 @@ def simulate(
             f"The dataset could not be simulated: found {workers} workers, needed 1 or more; "
             "correct it."
         )
-    check_empty(destination, SIMULATED)
+    check_destination(destination, SIMULATED, replaces=False)
     nominal = model if isinstance(model, Machine) else load_mechanism(model)
     for leg in (nominal.legs[j] for j in nominal.motors):
         if too_large := sigma_too_large(settings.reading_errors(leg).sigma, leg):

@@ -21,12 +21,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import PLAN_NAME, load_dataset
-from legcal.data.measurements import Measurements, View, reading_columns, readings_in
-from legcal.data.reading_units import default_units
+from legcal.data.measurements import Measurements, View
+from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
 from legcal.files.schema import validate
-from legcal.files.table import read_table
+from legcal.files.table import Column
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.closing import singularities, singularity
 from legcal.machine.configurations import (
@@ -427,15 +427,9 @@ def given_poses(machine: Machine, path: Path) -> Configurations:
             f"and {len(machine.motors)} motors, needed one whose readings tell its pose; let "
             "poses be drawn."
         )
-    table = read_table(
-        path,
-        "file of poses",
-        "row",
-        reading_columns(default_units(machine.legs)),
-        needed="one row for each pose; write the readings of the motors",
-    )
-    readings, _ = readings_in(table, machine.legs)  # (n_poses, n_motors) [m]
-    table.check()
+    sheet = ReadingsSheet(path, machine, "pose", others=[Column("name", "text", required=False)])
+    table = sheet.table
+    readings = sheet.readings(in_si=set(machine.motor_names) <= sheet.taken.keys()).q
     feasibility, reached = Feasibility(machine), list[Array]()
     obstacles = [_outside_travel(machine, row) for row in readings]
     inside = [k for k, obstacle in enumerate(obstacles) if obstacle is None]

@@ -28,8 +28,8 @@ from legcal.data.landmarks import (
     joints_at_readings,
     read_landmarks,
 )
-from legcal.errors import DatasetError
-from legcal.files.folder import write_atomically
+from legcal.errors import LegcalError
+from legcal.files.folder import out_of_resources, write_atomically
 from legcal.viewer.server import HTML, LOCAL, Address, PageServer
 
 
@@ -60,7 +60,7 @@ class ClickServer(PageServer):
             if path == "/clicks" and image.isdecimal() and int(image) < n_images:
                 return self.placed(text, int(image))
             return self.save(text) if path == "/save" else None
-        except DatasetError as error:
+        except LegcalError as error:
             return {"problems": list(error.problems), "notes": [], "legs": [], "joints": {}}
 
     def read(self, table: bytes) -> Landmarks:
@@ -103,13 +103,6 @@ class ClickServer(PageServer):
         dataset = self.detection.dataset
         text = format_landmarks(self.read(table), dataset.measurements, dataset.machine.leg_names)
         path = dataset.folder / LANDMARKS_NAME
-        try:
+        with out_of_resources(path, "the clicks", "download them"):
             write_atomically(path, text.encode())
-        except OSError as error:
-            return {
-                "problems": [
-                    f"{path}: the clicks could not be saved: found '{error.strerror}', needed a "
-                    "folder that can be written to; download them."
-                ]
-            }
         return {"problems": [], "saved": str(path)}

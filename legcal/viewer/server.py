@@ -34,13 +34,7 @@ class Address:
 
 
 def check_address(address: Address) -> None:
-    """Refuse a host or a port that cannot be served.
-
-    Raises
-    ------
-    UsageError
-        If the host is unknown or another machine, or the port is in use or not allowed.
-    """
+    """Refuse a host or a port that cannot be served."""
     host, port = address.host, address.port
     try:
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -112,11 +106,6 @@ class PageServer:
         """Return the answer to a posted text; None for other paths."""
         raise NotImplementedError
 
-    def is_for(self, host: str) -> bool:
-        """Return whether a request names this host, or one of its names if others may connect."""
-        names = (f"{name}:{self.address.port}" for name in (LOCAL, "localhost"))
-        return self._host != LOCAL or host in names
-
 
 class _Server(http.server.ThreadingHTTPServer):
     """A server that ignores browsers that disconnect early."""
@@ -168,7 +157,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self._send("application/json", json.dumps(answer).encode())
 
     def _is_for_here(self) -> bool:
-        return self.page.is_for(self.headers.get("Host", ""))
+        """Return whether a request names this machine; any name will do if others may connect."""
+        here = self.page.address
+        names = (f"{name}:{here.port}" for name in (LOCAL, "localhost"))
+        return here.host != LOCAL or self.headers.get("Host", "") in names
 
     def _send(self, kind: str, content: bytes) -> None:
         self.send_response(200)

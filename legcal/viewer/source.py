@@ -27,21 +27,9 @@ _MARKERS = (DATASET_YAML, "result.json", "calibrated.yaml", "robot.yaml")
 
 
 def open_source(given: str | Path, dataset: str | Path | None = None) -> Subject:
-    """Return what is at a path, or with the name of a shipped model.
+    """Return the dataset, result or mechanism at a path, or with the name of a shipped model.
 
-    Parameters
-    ----------
-    given : str or Path
-        A dataset folder, a result folder, or a mechanism.
-    dataset : str or Path, optional
-        The dataset of a result or a model, which do not name it themselves.
-
-    Raises
-    ------
-    UsageError
-        If it does not exist, is a folder of another kind, or two datasets are given.
-    DatasetError, ModelError, OutOfClass
-        If its files are not valid.
+    A result and a model do not name their *dataset*, which can be given beside them.
     """
     path = Path(given)
     if not os.path.exists(path) and str(given) not in shipped_names():
@@ -97,26 +85,14 @@ def _session(machine: Machine, given: str | Path, result: EarlierResult | None) 
 
 
 class Photographs:
-    """The session of a subject, if it has one.
-
-    Attributes
-    ----------
-    cameras : list of (str, Camera, RigidTransform)
-        Name, camera and T_base_camera of the views with a pose, calibrated or stated.
-    names : tuple of str
-        Names of the images, by row.
-    poses : tuple of str
-        Names of the poses of the session, from images.
-    q : (n_poses, n_legs) array
-        Readings at these poses [m].
-    """
+    """The session of a subject, if it has one."""
 
     def __init__(self, source: Subject) -> None:
         self._dataset = source.dataset
+        # Name, camera and T_base_camera of the views with a pose, calibrated or stated
         self.cameras: list[tuple[str, Camera, RigidTransform]] = []
-        self.names: tuple[str, ...] = ()
-        self.poses: tuple[str, ...] = ()
-        self.q = np.zeros((0, source.machine.n_legs))
+        self.names: tuple[str, ...] = ()  # of the images, by row
+        self.q = np.zeros((0, source.machine.n_legs))  # readings at the poses of the session [m]
         if source.dataset is None:
             return
         from legcal.data.measurements import row_names
@@ -129,7 +105,6 @@ class Photographs:
             if T is not None:
                 self.cameras.append((view.name, view.camera, T))
         self.names = row_names(measurements)
-        self.poses = tuple(self.names[row] for row in measurements.first_rows.tolist())
         self.q = measurements.q_of_poses
 
     def at(self, pose: int) -> list[dict[str, Any]]:

@@ -55,21 +55,11 @@ class Posture:
 
 
 class Motion:
-    """A machine in motion, from home.
-
-    Attributes
-    ----------
-    machine : Machine
-        The machine.
-    columns : (m,) array of int
-        Independent coordinates of the platform, as indices of x, y, z, roll, pitch, yaw.
-    posture : Posture
-        The current posture.
-    """
+    """A machine in motion, from home."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
-        self.columns = independent_coordinates(machine)
+        self.columns = independent_coordinates(machine)  # (m,) indices of COORDINATES
         self._follower = Follower(machine) if machine.is_determined else None
         self.posture = self.home()
 
@@ -236,13 +226,7 @@ class _Slider(NamedTuple):
 
 
 class ViewServer(PageServer):
-    """A machine in the browser, until it is closed.
-
-    Attributes
-    ----------
-    motion : Motion
-        The machine and its posture.
-    """
+    """A machine in the browser, until it is closed."""
 
     def __init__(self, source: Subject, address: Address) -> None:
         super().__init__(address)
@@ -256,7 +240,7 @@ class ViewServer(PageServer):
         self._photographs = Photographs(source)
         self._pose = 0  # of the session
         self._moving = Lock()  # requests come in threads
-        if self._photographs.poses:
+        if len(self._photographs.q):
             self.motion.show(self._photographs.q[0])
         self._controls = self._sliders()
         self._page = page_html(self._document()).encode()
@@ -296,7 +280,7 @@ class ViewServer(PageServer):
     def _sliders(self) -> dict[str, _Slider]:
         """Return the sliders by name: the pose of the session, readings, coordinates."""
         motion, machine, sliders = self.motion, self.source.machine, dict[str, _Slider]()
-        if n := len(self._photographs.poses):
+        if n := len(self._photographs.q):
             ends = np.array([1.0, n])
             sliders["pose"] = _Slider("pose", "", ends, lambda: self._pose + 1.0, self._show_pose)
         if machine.is_determined:
@@ -304,32 +288,24 @@ class ViewServer(PageServer):
             for j in machine.motors:
                 leg = machine.legs[j]
                 label = machine.leg_names[j] if leg.actuator is None else leg.actuator.joint
+                reading = partial(lambda j: float(motion.posture.q[j]), j)
                 sliders[f"q{j}"] = _Slider(
-                    label,
-                    leg.reading_unit,
-                    ranges[j],
-                    partial(self._reading, j),
-                    partial(motion.read, j),
+                    label, leg.reading_unit, ranges[j], reading, partial(motion.read, j)
                 )
         for k, ends in enumerate(motion.ranges_of_coordinates()):
             which = int(motion.columns[k])
+            coordinate = partial(lambda k: float(motion.coordinates[k]), k)
             sliders[f"x{k}"] = _Slider(
                 COORDINATES[which],
                 "m" if which < 3 else "rad",
                 ends,
-                partial(self._coordinate, k),
+                coordinate,
                 partial(motion.place, k),
             )
         return sliders
 
-    def _reading(self, leg: int) -> float:
-        return float(self.motion.posture.q[leg])
-
-    def _coordinate(self, k: int) -> float:
-        return float(self.motion.coordinates[k])
-
     def _show_pose(self, value: float) -> None:
-        self._pose = int(np.clip(round(value) - 1, 0, len(self._photographs.poses) - 1))
+        self._pose = int(np.clip(round(value) - 1, 0, len(self._photographs.q) - 1))
         self.motion.show(self._photographs.q[self._pose])
 
     # What is shown

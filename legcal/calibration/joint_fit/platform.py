@@ -52,6 +52,15 @@ class PlatformError:
         """Mean over the poses [rad]."""
         return float(self.rotation.mean())
 
+    def fields(self, prefix: str = "") -> dict[str, float]:
+        """Return means and maxima as documents name them."""
+        return {
+            f"{prefix}dX_m": self.mean_displacement,
+            f"{prefix}dE_rad": self.mean_rotation,
+            f"{prefix}dX_max_m": self.max_displacement,
+            f"{prefix}dE_max_rad": self.max_rotation,
+        }
+
     @property
     def rms(self) -> tuple[float, float]:
         """Root mean squares over the poses: displacement [m], rotation [rad]."""

@@ -16,7 +16,6 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from decimal import Decimal
 from itertools import combinations
 from pathlib import Path
 
@@ -27,23 +26,10 @@ from legcal.brief import brief
 from legcal.calibration.joint_fit.platform import platform_by_parameters
 from legcal.calibration.location.frames import PosePairs
 from legcal.calibration.result_folder import RESULT_NAME, load_result
-from legcal.data.measurements import reading_columns, readings_in
-from legcal.data.reading_units import default_units
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import Code, DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
-from legcal.files.quantity import ANGLE, LENGTH
-from legcal.files.schema import content_of
-from legcal.files.table import (
-    Column,
-    Lines,
-    Table,
-    concepts,
-    header_problem,
-    in_unit,
-    read_table,
-    split_heading,
-)
+from legcal.files.table import Column, Table, header_problem
 from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.files import RESULT_YAML
@@ -109,27 +95,11 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     Raises DatasetError with one sentence for each problem, naming row and column.
     """
     joints = machine.motor_names
-    sheet = read = None
-    columns: dict[str, str] = {}  # meaning of the other headings
-    text = content_of(path, "table of tool poses").decode("utf-8-sig", errors="replace")
-    header = next((line for line in text.splitlines() if line.strip()), "")
-    if not any(re.search(rf"\b{re.escape(joint)}\b", header) for joint in joints):
-        sheet = ReadingsSheet(path, machine, "pose")
-        read = sheet.readings()
-    table = read_table(
-        path,
-        "table of tool poses",
-        "row",
-        [*reading_columns(default_units(machine.legs)), *_COLUMNS],
-        needed="a row for each pose; measure some",
-        unknown=lambda name: _about_angles(path, name),
-        reshape=(
-            None
-            if sheet is None or read is None
-            else lambda lines: _tool_columns(lines, sheet.taken, read.q, joints, columns)
-        ),
+    sheet = ReadingsSheet(
+        path, machine, "pose", others=_COLUMNS, unknown=lambda name: _about_angles(path, name)
     )
-    readings, notes = readings_in(table, machine.legs)
+    table, readings = sheet.table, sheet.readings(in_si=set(joints) <= sheet.taken.keys())
+    notes = readings.notes
     position = table.numbers(_POSITION)
     rotation, oriented, worst = _orientations(table)
     numbers = table.numbers(
@@ -144,7 +114,7 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     )  # one measurement would count as two
     table.check()
     q = np.full((len(table), machine.n_legs), math.nan)
-    q[:, list(machine.motors)] = readings
+    q[:, list(machine.motors)] = readings.q
     if worst > _NORM_TOLERANCE:
         notes = (
             *notes,
@@ -159,35 +129,9 @@ def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
         numbers=np.arange(1, len(table) + 1),
         notes=notes,
         source=str(path),
-        columns={} if sheet is None else {**sheet.taken, **columns},
-        unit="m and rad" if read is None else f"{read.unit}, {read.unit_from}",
+        columns=sheet.taken,
+        unit=f"{readings.unit}, {readings.unit_from}",
     )
-
-
-def _tool_columns(
-    lines: Lines,
-    taken: Mapping[str, str],  # meaning of each heading that the sheet of readings uses
-    q: Array,  # (n_rows, n_motors) [m or rad]
-    joints: Sequence[str],
-    columns: dict[str, str],
-) -> Lines:
-    """Return lines under our names in metres and radians, with readings; fill *columns*."""
-    (number, header), below = lines[0], lines[1:]
-    known = {split_heading(column.name)[0]: column.name for column in _COLUMNS}
-    names, factors = dict[int, str](), dict[int, Decimal]()
-    for i, text in enumerate(header):
-        key, unit = split_heading(text, (*LENGTH, *ANGLE))
-        found = set(concepts(text)) - {"tool", "joint", "pose"}
-        axis = found.pop() if len(found) == 1 else ""
-        name = axis if axis in _POSITION else known.get(key, "")
-        if name or taken.get(text) not in (*joints, "view", "image", "pose", "time"):
-            names[i] = name or text.lower()
-            factors[i] = Decimal(repr({**LENGTH, **ANGLE}.get(unit, 1.0)))
-            columns[text] = names[i]
-    rows: Lines = []
-    for (line, cells), of_row in zip(below, q.tolist(), strict=True):
-        rows.append((line, [*map(str, of_row), *(in_unit(cells[i], factors[i]) for i in names)]))
-    return [(number, [*joints, *names.values()]), *rows]
 
 
 def _about_angles(path: Path, name: str) -> Problem | None:
