@@ -58,7 +58,7 @@ from legcal.machine.leg import (
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
-from legcal.machine.rods import reading_of_rod, rod_mode
+from legcal.machine.rods import both_readings, rod_mode
 from legcal.machine.shapes import (
     at_visible_heights,
     occluders_of,
@@ -390,7 +390,7 @@ def _readings_at_home(
         if leg.actuator is None:
             continue
         joint = leg.actuator.joint
-        readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        readings = both_readings(leg, B[j])
         size, unit = SHOWN_IN[leg.reading_unit]
         choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
