@@ -19,7 +19,8 @@ from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
+from legcal.machine.chain import Connection
+from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot
 
 CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
 PERPENDICULAR = 1e-3  # largest angular error of perpendicular and parallel axes [rad]
@@ -35,7 +36,7 @@ def joint_tolerance(joints: Iterable[Sequence[Array] | Array]) -> float:
 
 
 def classify_leg(
-    steps: Sequence[Step],
+    steps: Sequence[Connection],
     platform_origin: Array,
     path: Path,
     within: float,
@@ -55,14 +56,13 @@ def classify_leg(
     """
     poses, axes = [np.eye(4)], list[Axis]()
     for step in steps:
-        T_near, T_far = (step.connection.T_body_joint[side] for side in (step.near, step.far))
+        T_near, T_far = step.T_body_joint
         T = matrix_product(poses[-1], T_near)
-        turns = step.connection.type != "sphere"
-        direction = T[:3, :3] @ step.axis if turns else None
+        direction = None if step.axis is None else T[:3, :3] @ step.axis
         axes.append(Axis(step.name, T[:3, 3], direction))
         poses.append(matrix_product(T, matrix_inverse(T_far)))
-    sliders = [i for i, s in enumerate(steps) if s.connection.type == "prismatic"]
-    leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
+    sliders = [i for i, s in enumerate(steps) if s.type == "prismatic"]
+    leg = next((s.joint for s in steps if s.joint), "") or ""
     hangs = is_actuator(steps[0], motors) and len(steps) > 2
     try:
         carrier = None if sliders else _carrier(axes, poses[-1], platform_origin, leg, within)
@@ -73,7 +73,7 @@ def classify_leg(
             slider, (n_lower, ends) = None, _rod(axes[1:], leg, within, axes[0].name)
             chain = LegChain(tuple(steps), tuple(poses), n_lower + 1, slider, *ends, steps[0])
             axis = axes[0]
-            is_turning = chain.steps[0].connection.type == "revolute"
+            is_turning = chain.steps[0].type == "revolute"
             if is_turning and axis.distance(chain.A) < within:
                 raise OutOfClass(
                     f"the leg of motor '{axis.name}' is not supported",
@@ -102,7 +102,7 @@ def classify_leg(
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
             n_lower, slider = sliders[0], steps[sliders[0]]
-            towards = -1.0 if slider.near else 1.0
+            towards = 1.0 if slider.is_forward else -1.0
             ends = _telescope(axes, n_lower, towards, origin, leg, within)
         else:
             slider, (n_lower, ends) = None, _rod(axes, leg, within)
@@ -111,14 +111,14 @@ def classify_leg(
     return LegChain(tuple(steps), tuple(poses), n_lower, slider, *ends)
 
 
-def is_actuator(step: Step, motors: Sequence[str]) -> bool:
+def is_actuator(step: Connection, motors: Sequence[str]) -> bool:
     """Return whether a joint on the base is a motor that may carry joints at A."""
-    return step.connection.joint in motors and step.connection.type in ("prismatic", "revolute")
+    return step.joint in motors and step.type in ("prismatic", "revolute")
 
 
-def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> None:
+def _check_rod_alone(steps: Sequence[Connection], motors: Sequence[str], leg: str) -> None:
     """Check that an actuator carries nothing but a rod."""
-    onward = [step.connection for step in steps[1:]]
+    onward = steps[1:]
     second = next((c.joint for c in onward if c.joint in motors), None)
     if second is not None:
         raise OutOfClass(
@@ -146,13 +146,13 @@ def actuator_of(
     if step is None:
         return None
     inverse = matrix_inverse(T_body_base)
-    point, axis = step.line(step.near)
-    sign = 1.0 if step.near == 0 else -1.0  # a joint moves its child
+    point, axis = step.line(0)
+    sign = 1.0 if step.is_forward else -1.0  # a joint moves its child
     A, at = matrix_applied(inverse, chain.A), matrix_applied(inverse, point)
     direction = sign * (inverse[:3, :3] @ axis)
-    turns = step.connection.type == "revolute"
+    turns = step.type == "revolute"
     return Actuator(
-        joint=str(step.connection.joint),
+        joint=str(step.joint),
         kind=ActuatorKind.REVOLUTE if turns else ActuatorKind.PRISMATIC,
         axis=direction,
         point=at + ((A - at) @ direction) * direction if turns else at,

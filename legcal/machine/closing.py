@@ -134,7 +134,7 @@ def worst_closure(machine: Machine, residual: Array) -> str:
     worst = (0.0, "the platform pose")
     for closure in machine.chain.closures:
         gap = float(np.abs(residual[row : row + closure.rows]).max())
-        worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
+        worst = max(worst, (gap, str(closure)))
         row += closure.rows
     return f"{worst[1]} stay {worst[0]:.3g} m apart"
 

@@ -167,26 +167,6 @@ def cylinder_of_arm(arm: Arm) -> Cylinder:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """A connection of a leg, passed from base to platform."""
-
-    connection: Connection
-    near: int  # index of the body towards the base
-    far: int  # index of the body towards the platform
-    axis: Array  # (3,) unit axis in the joint frame
-
-    @property
-    def name(self) -> str:
-        """The joint, in words."""
-        return self.connection.joint or "the 3d closure"
-
-    def line(self, side: int) -> tuple[Array, Array]:
-        """Return a point [m] and the direction of the axis in the body of one side."""
-        matrix = self.connection.T_body_joint[side]
-        return matrix[:3, 3], matrix[:3, :3] @ self.axis
-
-
-@dataclass(frozen=True, eq=False)
 class Axis:
     """The axis of a revolute, or the centre of a sphere (no direction)."""
 
@@ -237,17 +217,17 @@ class Pivot:
 class LegChain:
     """The joints of one leg, and its geometry with all of them at zero, in the base body."""
 
-    steps: tuple[Step, ...]  # from base to platform
+    steps: tuple[Connection, ...]  # passed from base to platform
     poses: tuple[Array, ...]  # (4, 4) of the bodies from base to platform
     n_lower: int  # number of joints below the slider, or the rod, with its actuator
-    slider: Step | None  # None for a leg of constant length
+    slider: Connection | None  # None for a leg of constant length
     base: Pivot
     platform: Pivot
     A: Array  # (3,) [m]
     B: Array  # (3,) [m]
     u: Array  # (3,) direction of the slider towards the platform; else from A to B
     idle_spins: int  # freedoms that only spin the leg about itself
-    actuator: Step | None = None  # the first step, if it is a motor that carries the rod
+    actuator: Connection | None = None  # the first step, if it is a motor that carries the rod
 
     @property
     def B_platform(self) -> Array:
@@ -257,7 +237,7 @@ class LegChain:
     @property
     def bodies(self) -> tuple[str, ...]:
         """The bodies of the leg, without base and platform."""
-        return tuple(step.connection.bodies[step.far] for step in self.steps[:-1])
+        return tuple(step.bodies[1] for step in self.steps[:-1])
 
     @property
     def is_joint(self) -> bool:
@@ -273,7 +253,7 @@ class LegChain:
     def motor(self) -> str | None:
         """The joint of the slider, or of the motor that carries the rod; None for other rods."""
         moving = self.slider or self.actuator
-        return None if moving is None else moving.connection.joint
+        return None if moving is None else moving.joint
 
     @property
     def reach(self) -> float:

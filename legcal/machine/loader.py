@@ -72,7 +72,6 @@ from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
-    VIRTUAL,
     Normals,
     any_joint,
     check_virtual_joint,
@@ -84,7 +83,7 @@ from legcal.machine.topology import (
     propose_block,
     propose_frame,
 )
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import VIRTUAL, Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
@@ -145,7 +144,7 @@ def _load(source: Source) -> Machine:
         _check_length(away, words, MAX_ORIGIN, urdf.path)
     _check_names(file, urdf, source.path)
     closures = sorted(  # in a fixed order, since sums depend on it
-        source.closures, key=lambda closure: (closure.frame_1, closure.frame_2, closure.kind)
+        source.closures, key=lambda closure: (closure.frames, closure.kind)
     )
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
     if file.name_mot:
@@ -460,7 +459,7 @@ def _legs_in_order(
 
 
 def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
-    if any(step.connection.joint == joint for step in chain.steps):
+    if any(step.joint == joint for step in chain.steps):
         return True
     entry = urdf.joints[joint]
     return not entry.moves and bodies.body_of[entry.child] in chain.bodies
@@ -803,7 +802,7 @@ def _check_across(machine: Machine) -> None:
         if gap > within or tilt > PERPENDICULAR:
             problems.add(
                 "the loops could not be closed",
-                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
+                f"{closure} {1e3 * gap:.3g} mm and "
                 f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move",
                 f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg",
                 "correct the origins and axes along this leg",

@@ -35,9 +35,9 @@ from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_of, m
 from legcal.geometry.rotations import nearest_rotation, rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator, Arm, Line
-from legcal.machine.chain import Bodies
+from legcal.machine.chain import Bodies, Connection
 from legcal.machine.classification import joint_tolerance
-from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain, Step
+from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
 from legcal.machine.meshes import first_hits, mesh_file, mesh_of_file, ray_caster, read_mesh
 from legcal.machine.spanning_tree import origin_xml, visual_xml
 from legcal.machine.urdf import Urdf, number_list, origins_of
@@ -178,14 +178,12 @@ def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
     """Return the side (A or B) of each body on the axis of the leg, with u from A to B."""
     halves: dict[str, Half] = {}
 
-    def turns(body: int, side: Literal["base", "platform"], point: Array, step: Step) -> bool:
+    def turns(body: int, side: Literal["base", "platform"], point: Array, step: Connection) -> bool:
         """Take a body, and return whether the joint behind it is a revolute about the leg."""
         at, u = chain.line_in(body, point)
         halves[chain.bodies[body - 1]] = side, at, leg.sign * u
-        axis = step.line(step.far if side == "base" else step.near)[1]
-        return step.connection.type == "revolute" and bool(
-            np.linalg.norm(cross(axis, u)) < PARALLEL
-        )
+        axis = step.line(int(side == "base"))[1]
+        return step.type == "revolute" and bool(np.linalg.norm(cross(axis, u)) < PARALLEL)
 
     for k in reversed(range(min(chain.n_lower, len(chain.bodies)))):
         if not turns(k + 1, "base", chain.A, chain.steps[k]):
@@ -194,7 +192,7 @@ def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
         return halves
     if leg.is_fixed_to_platform:
         last, (B, u) = chain.steps[-1], chain.line_in(-1, chain.B)
-        halves[last.connection.bodies[last.far]] = "platform", B, leg.sign * u
+        halves[last.bodies[1]] = "platform", B, leg.sign * u
     for k in range(chain.n_upper, len(chain.steps)):
         if not turns(k, "platform", chain.B, chain.steps[k]):
             break
@@ -934,9 +932,9 @@ def _roll(
 def _turns_leg(chain: LegChain, i: int) -> bool:
     """Return whether a joint of a leg is a revolute about it, or a sphere."""
     step = chain.steps[i]
-    if step.connection.type != "revolute":
-        return step.connection.type == "sphere"
-    axis = chain.poses[i][:3, :3] @ step.line(step.near)[1]
+    if step.type != "revolute":
+        return step.type == "sphere"
+    axis = chain.poses[i][:3, :3] @ step.line(0)[1]
     return bool(np.linalg.norm(cross(axis, chain.u)) < ALONG)
 
 

@@ -54,7 +54,7 @@ class Source:
     def closures(self) -> list[Closure]:
         """The closures in the order of the file."""
         pairs = zip(self.file.closed_loop, self.file.type, strict=True)
-        return [Closure(kind, *ends) for ends, kind in pairs]
+        return [Closure(kind, (ends[0], ends[1])) for ends, kind in pairs]
 
 
 FULL_TURN = 2.0 * pi

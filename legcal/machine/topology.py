@@ -31,13 +31,12 @@ from legcal.machine.classification import (
     undirected,
 )
 from legcal.machine.files import LegcalBlock
-from legcal.machine.leg import Axis, LegChain, Step
+from legcal.machine.leg import Axis, LegChain
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.spanning_tree import Source, connected
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import VIRTUAL, Urdf
 
 Normals = tuple[Array, Array]
-VIRTUAL = ("floating", "planar")
 TIE = 1e-6  # difference of equally large triangles, relative to the largest
 
 
@@ -80,18 +79,18 @@ def _joints_on(bodies: Bodies, body: str) -> list[Array]:
 
 def _paths(
     bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str], within: float
-) -> list[list[Step]]:
+) -> list[list[Connection]]:
     """Return the joints of every leg from base to platform."""
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
         _refuse_unsupported(connection, urdf, base, platform)
         for body in connection.bodies:
             at.setdefault(body, []).append(connection)
-    begun: list[tuple[str, list[Step], Connection]] = []
+    begun: list[tuple[str, list[Connection], Connection]] = []
     used = set[int]()
     for first in at.get(base, []):
-        step = _step(first, first.bodies.index(base), urdf)
-        body = first.bodies[step.far]
+        step = first.from_body(base)
+        body = step.bodies[1]
         if body not in (base, platform) and is_actuator(step, motors) and len(at[body]) > 2:
             used.add(id(first))
             begun += [(body, [step], onward) for onward in at[body] if onward is not first]
@@ -101,16 +100,14 @@ def _paths(
     for body, steps, connection in begun:
         while True:
             used.add(id(connection))
-            near = connection.bodies.index(body)
-            steps.append(_step(connection, near, urdf))
-            body = connection.bodies[1 - near]
+            steps.append(connection.from_body(body))
+            body = steps[-1].bodies[1]
             if body == platform:
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
                     "this is not a platform on legs",
-                    f"a leg of more than {MAX_JOINTS_OF_LEG} joints from "
-                    f"{_name(steps[0].connection)}",
+                    f"a leg of more than {MAX_JOINTS_OF_LEG} joints from {_name(steps[0])}",
                     "joint, slider, joint",
                     "give the mechanism alone",
                     urdf.path,
@@ -174,7 +171,7 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
 
 def _joined_bodies(bodies: Bodies, urdf: Urdf, root: str) -> list[str]:
     """Return the bodies other than the root on which several chains end, in the file's order."""
-    ends = [body for c in _without_virtual(bodies, urdf) for body in c.bodies]
+    ends = [body for c in bodies.connections if not c.is_virtual for body in c.bodies]
     order = dict.fromkeys(bodies.body_of[link] for link in urdf.links)
     return [body for body in order if body != root and ends.count(body) > 2]
 
@@ -199,7 +196,7 @@ def _block_on(
     """Return the default block ``legcal`` with a body as the base."""
     virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
     bodies = rigid_bodies(urdf, closures, None)
-    real = replace(bodies, connections=_without_virtual(bodies, urdf))
+    real = replace(bodies, connections=tuple(c for c in bodies.connections if not c.is_virtual))
     carried = [bodies.body_of[j.child] for j in virtual]
     root = bodies.body_of[urdf.root]
     base_link = ends[0] or urdf.root
@@ -239,7 +236,7 @@ def _block_on(
 
 def _is_used(urdf: Urdf, closures: Sequence[Closure], link: str) -> bool:
     """Return whether a moving joint or a closure is on a link itself."""
-    ends = {urdf.link_of(frame) for c in closures for frame in (c.frame_1, c.frame_2)}
+    ends = {urdf.link_of(frame) for c in closures for frame in c.frames}
     return link in ends or any(
         j.moves and link in (j.parent, j.child) for j in urdf.joints.values()
     )
@@ -290,13 +287,13 @@ def distinct_joint(chain: LegChain) -> str:
     """Return a joint that identifies a single leg: on an actuator not the motor."""
     if chain.actuator is None:
         return any_joint(chain)
-    named = [s.connection.joint for s in chain.steps[1:] if s.connection.joint]
+    named = [s.joint for s in chain.steps[1:] if s.joint]
     return named[0] if named else any_joint(chain)
 
 
 def any_joint(chain: LegChain) -> str:
     """Return a joint that identifies a leg: its slider, or its first joint."""
-    named = [s.connection.joint for s in chain.steps if s.connection.joint]
+    named = [s.joint for s in chain.steps if s.joint]
     return chain.motor or (named[0] if named else "")
 
 
@@ -340,7 +337,7 @@ def normals_of_closures(
     floats = virtual is not None and virtual.type == "floating"
     normals: list[Array | None] = []
     for closure in closures:
-        link = urdf.link_of(closure.frame_1)
+        link = urdf.link_of(closure.frames[0])
         root, normal = (block.base, in_link_frames[0])
         if floats and virtual in urdf.joints_above(link):
             root, normal = (block.platform, in_link_frames[1])
@@ -406,21 +403,12 @@ def check_virtual_joint(
     raise OutOfClass(start, *problem, path)
 
 
-def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
-    """Return a connection passed from one of its bodies to the other."""
-    axis = urdf.joints[connection.joint].axis if connection.joint else np.zeros(3)
-    return Step(connection, near, 1 - near, axis)
-
-
 def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform: str) -> None:
     """Refuse joints that are not part of any leg."""
-    if connection.joint is not None and urdf.joints[connection.joint].type in (
-        "floating",
-        "planar",
-    ):
+    if connection.is_virtual:
         raise OutOfClass(
             "this mechanism is not supported",
-            f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
+            f"the {connection.type} joint '{connection.joint}' inside it",
             "at most the virtual one that carries the platform",
             "name that one in legcal.platform_joint",
             urdf.path,
@@ -444,7 +432,7 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
 
 
 def _several_bodies(
-    bodies: Bodies, urdf: Urdf, steps: Sequence[Step], body: str, ends: tuple[str, str]
+    bodies: Bodies, urdf: Urdf, steps: Sequence[Connection], body: str, ends: tuple[str, str]
 ) -> Problem | None:
     """Return the problem of a body in a loop inside a leg, or in a platform of several bodies.
 
@@ -464,8 +452,7 @@ def _several_bodies(
     if len(on_base) == 1:
         return Problem(
             "this machine is not supported",
-            f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
-            f"closed at link '{body}'",
+            f"a loop inside the leg that starts with {_name(steps[0])}, closed at link '{body}'",
             "chains without loops that end on the platform itself",
             "if these are the rods of a parallelogram on an arm or a carriage, close "
             "each on the platform as a leg of its own, otherwise this machine cannot "
@@ -488,7 +475,7 @@ def _several_bodies(
 
 def _not_a_chain(
     urdf: Urdf,
-    steps: list[Step],
+    steps: list[Connection],
     body: str,
     base: str,
     n_onward: int,
@@ -497,7 +484,7 @@ def _not_a_chain(
 ) -> Problem:
     """Return the problem of a leg, given by its first joints, that is not a chain."""
     needed, remedy = "one unbranched chain from base to platform for each leg", ""
-    first, last = steps[0].connection, steps[-1].connection
+    first, last = steps[0], steps[-1]
     driven = last.joint in motors or (first.joint in motors and _is_an_arm(steps, within))
     if body != base and n_onward > 1 and len(steps) > 1 and driven:
         return Problem(
@@ -534,16 +521,14 @@ def _not_a_chain(
     )
 
 
-def _is_an_arm(steps: list[Step], within: float) -> bool:
+def _is_an_arm(steps: list[Connection], within: float) -> bool:
     """Return whether joints form an arm whose end moves: one revolute, or several apart."""
-    if any(step.connection.type != "revolute" for step in steps):
+    if any(step.type != "revolute" for step in steps):
         return False
     if len(steps) == 1:
         return True
     for lower, upper in pairwise(steps):
-        near, far = nearest(
-            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
-        )
+        near, far = nearest(Axis(lower.name, *lower.line(1)), Axis(upper.name, *upper.line(0)))
         if near is None or far is None or float(np.linalg.norm(far - near)) > within:
             return True
     return False
@@ -564,13 +549,6 @@ def _normals(chain: LegChain) -> Normals | None:
     if v is None or (w is not None and not parallel(v, w)):
         return None
     return v, chain.poses[-1][:3, :3].T @ v
-
-
-def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
-    """Return the connections that are joints of legs."""
-    return tuple(
-        c for c in bodies.connections if c.joint is None or urdf.joints[c.joint].type not in VIRTUAL
-    )
 
 
 def _platform_body(
@@ -639,7 +617,7 @@ def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: st
         if joint.parent in uses:
             uses[joint.parent] += 1
     for closure in closures:
-        for frame in (closure.frame_1, closure.frame_2):
+        for frame in closure.frames:
             if urdf.link_of(frame) in uses:
                 uses[urdf.link_of(frame)] += 1
     return max(links, key=lambda link: uses[link])

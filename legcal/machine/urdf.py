@@ -295,6 +295,7 @@ MJCF = replace(_DRAWING, closures="<equality>", root="<worldbody>")
 
 UrdfJointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar")
+VIRTUAL = ("floating", "planar")  # joints that only say where the platform is
 LOOP_TAGS = ("loop_joint", "constraint")
 
 
