@@ -27,7 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
-from legcal.machine.chain import ClosedChain, rigid_bodies
+from legcal.machine.chain import ClosedChain, Closure, rigid_bodies
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,
@@ -50,7 +50,6 @@ from legcal.machine.spanning_tree import (
 )
 from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
-    BLOCK,
     LOOP_TAGS,
     NO_BLOCK,
     URDF_LOOPS,
@@ -74,19 +73,18 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
     source = _read_xml(path) if is_xml(path) else read_yaml_source(path)
     _check_stated(source, base, platform)
     names = {*source.urdf.links, *source.urdf.joints}
-    pairs = source.file.closed_loop
-    if not all(a in names and b in names and a != b for a, b in pairs):
+    if not all(len(names & {*closure.frames}) == 2 for closure in source.closures):
         return source  # refused later, with the location of the name
     source = with_held_joints(source)
-    if source.file.legcal is not None:
+    if source.block is not None:
         check_one_mechanism(source)
-        is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
+        is_drawn = source.block.home is None and is_drawn_closed(source)
         return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
     if base is not None or platform is not None:
         source = with_held_joints(_of_stated(source))
     check_one_mechanism(source)
-    if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
+    if source.urdf.wording is URDF_LOOPS and not source.motors:
         source = _with_arms_as_motors(source)
     return completed(source)
 
@@ -95,7 +93,7 @@ def _check_stated(source: Source, base: str | None, platform: str | None) -> Non
     """Refuse links stated for a file that names others itself, or has no such link."""
     problems = Problems(source.path)
     for option, link in (("--base", base), ("--platform", platform)):
-        if link is not None and source.file.legcal is not None:
+        if link is not None and source.block is not None:
             problems.add(
                 f"{option} could not be used",
                 "a file with a block legcal, which names base and platform",
@@ -111,19 +109,11 @@ def _check_stated(source: Source, base: str | None, platform: str | None) -> Non
 
 def _of_stated(source: Source) -> Source:
     """Return a file with the loops of that mechanism alone whose platform or base is stated."""
-    loops, kinds = source.file.closed_loop, source.file.type
-    groups = moving_groups(source.urdf, loops)
+    groups = moving_groups(source.urdf, source.closures)
     stated = {source.base, source.platform}
     mine = {link for links, _ in groups if stated & {*links} for link in links}
-    kept = [
-        i
-        for i, pair in enumerate(loops)
-        if any(source.urdf.link_of(frame) in mine for frame in pair)
-    ]
-    if not kept:
-        return source
-    update = {"closed_loop": [loops[i] for i in kept], "type": [kinds[i] for i in kept]}
-    return replace(source, file=source.file.model_copy(update=update))
+    kept = tuple(c for c in source.closures if mine & {*map(source.urdf.link_of, c.frames)})
+    return replace(source, closures=kept or source.closures)
 
 
 def _with_arms_as_motors(source: Source) -> Source:
@@ -138,17 +128,13 @@ def _with_arms_as_motors(source: Source) -> Source:
         turning = motors_on(bodies, bodies.body_of[block.base])
         chains = find_chains(bodies, urdf, block.base, block.platform, turning)
         moving = {chain.motor for chain in chains}
-        motors = [name for name in turning if name in moving]
+        motors = tuple(name for name in turning if name in moving)
         note = (
             f"The file names no motors: the {len(motors)} joints on the base that move rods "
             f"({', '.join(motors)}) were taken as motors; name the motors in <transmission> "
             "elements if some are not."
         )
-        return replace(
-            source,
-            file=source.file.model_copy(update={"name_mot": motors}),
-            notes=(*source.notes, note),
-        )
+        return replace(source, motors=motors, notes=(*source.notes, note))
     return source
 
 
@@ -194,21 +180,14 @@ def read_yaml_source(path: Path) -> Source:
     urdf = read_urdf(
         find_urdf(path, None if block is None else block.urdf), travel_needed=block is not None
     )
+    if block is None:
+        urdf = replace(urdf, wording=NO_BLOCK)
+    source = Source(path, urdf, file.closures, tuple(file.name_mot), block)
     check_stand_ins(file, urdf, path)
     if not file.joint_name:
-        return Source(path, file, urdf if block else replace(urdf, wording=NO_BLOCK))
-    return _converted(path, file, urdf)
-
-
-def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
-    """Return a mechanism after replacing the stand-in joints of its URDF."""
-    robot, block = urdf.robot(), file.legcal
+        return source
+    robot = urdf.robot()
     frames = replace_stand_ins(robot, file, urdf)
-    changes = {
-        "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
-        "joint_name": [],
-        "joint_type": [],
-    }
     on_replaced = [joint for joint in (block.legs.values() if block else ()) if joint in frames]
     if on_replaced:
         raise ModelError(
@@ -218,9 +197,13 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
             "name its prismatic joint",
             path,
         )
-    completed = urdf.edited(robot, travel_needed=block is not None)
-    completed = replace(completed, wording=BLOCK if block else NO_BLOCK)
-    return Source(path, file.model_copy(update=changes), completed)
+    closures = tuple(
+        Closure(closure.kind, (frames.get(first, first), frames.get(second, second)))
+        for closure in file.closures
+        for first, second in [closure.frames]
+    )
+    urdf = urdf.edited(robot, travel_needed=block is not None)
+    return replace(source, urdf=urdf, closures=closures)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -292,10 +275,10 @@ def with_held_joints(source: Source) -> Source:
 
     A chain with a motor and a passive joint that ends in the air is refused: a leg left open.
     """
-    urdf, motors = source.urdf, source.file.name_mot
-    held = open_joints(urdf, source.file.closed_loop)
-    if source.file.legcal is not None:
-        held.pop(source.file.legcal.platform_joint or "", None)
+    urdf, motors = source.urdf, source.motors
+    held = open_joints(urdf, source.closures)
+    if source.block is not None:
+        held.pop(source.block.platform_joint or "", None)
     if not held:
         return source
     _refuse_open_leg(urdf, held, motors, source)
@@ -310,10 +293,9 @@ def with_held_joints(source: Source) -> Source:
         element.set("type", "fixed")
         T = joint.T_parent_origin * _motion(joint, source.values.get(joint.name, 0.0))
         element.append(etree.fromstring(origin_xml(T)))
-    file = source.file.model_copy(update={"name_mot": [m for m in motors if m not in held]})
     return replace(
         source,
-        file=file,
+        motors=tuple(motor for motor in motors if motor not in held),
         # The travel of sliders was asked for, or not, when the file was read.
         urdf=urdf.edited(robot),
         notes=(*source.notes, _note(list(held))),
@@ -321,12 +303,13 @@ def with_held_joints(source: Source) -> Source:
     )
 
 
-def open_joints(urdf: Urdf, closures: Iterable[Sequence[str]]) -> dict[str, UrdfJoint]:
+def open_joints(urdf: Urdf, closures: Iterable[Closure]) -> dict[str, UrdfJoint]:
     """Return the joints that can move and are in no loop, by name."""
     in_loops = set[str]()
-    for pair in closures:
+    for closure in closures:
         first, second = (
-            {joint.name for joint in urdf.joints_above(urdf.link_of(frame))} for frame in pair
+            {joint.name for joint in urdf.joints_above(urdf.link_of(frame))}
+            for frame in closure.frames
         )
         in_loops |= first ^ second
     return {
@@ -412,7 +395,7 @@ def completed(source: Source) -> Source:
         return source
     drawn = {
         name: float(configuration[chain.q_index(name)])
-        for name in source.file.name_mot
+        for name in source.motors
         if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
     }
     is_open = not sliders and off > _OPEN * size
@@ -424,12 +407,12 @@ def _at_drawn_motors(
 ) -> Array:
     """Return a closed configuration with the motors where the file draws them, if there is one."""
     moved = [source.urdf.joints[name].type in ("prismatic", "revolute")
-             for name in source.file.name_mot if name in source.urdf.joints]  # fmt: skip
-    if len(moved) < len(source.file.name_mot) or not all(moved):
+             for name in source.motors if name in source.urdf.joints]  # fmt: skip
+    if len(moved) < len(source.motors) or not all(moved):
         return closed
-    values = [chain.q_index(name) for name in source.file.name_mot]
+    values = [chain.q_index(name) for name in source.motors]
     rates = np.zeros((len(values), chain.nv))
-    rates[range(len(values)), [chain.v_index(name) for name in source.file.name_mot]] = 1.0
+    rates[range(len(values)), [chain.v_index(name) for name in source.motors]] = 1.0
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
@@ -448,11 +431,11 @@ def _levelled(chain: ClosedChain, configuration: Array, source: Source, unit: Ar
     """
     urdf = source.urdf
     try:
-        block = propose_block(source, source.file.name_mot)
+        block = propose_block(source, source.motors)
     except OutOfClass:
         return configuration  # refused later
     bodies = rigid_bodies(urdf, source.closures, block.platform_joint)
-    motors = source.file.name_mot
+    motors = source.motors
     chains = find_chains(bodies, urdf, block.base, block.platform, motors)
     A, B = (
         np.array(points) @ bodies.T_body_link[link][:3, :3]

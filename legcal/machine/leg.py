@@ -30,6 +30,7 @@ TRAVEL_MARGIN = 0.05  # tolerance of the travel, relative to it
 SIGMA_READING, SIGMA_LENGTH = 5e-6, 1.25e-4
 MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # plausible leg lengths [m]; others hint at a wrong unit
 MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # plausible radii, relative to the leg length
+PERPENDICULAR = 1e-3  # largest angular error of perpendicular and parallel axes [rad]
 MAX_LEGS = 32  # computing time grows with the cube of the number of legs
 
 
@@ -190,6 +191,26 @@ class Axis:
     def foot(self, point: Array) -> Array:
         """Return the point of the axis nearest to a point [m]."""
         return self.point + ((point - self.point) @ self.along) * self.along
+
+    def nearest(self, other: Axis) -> tuple[Array, Array] | None:
+        """Return the nearest points of two axes [m], None if they are parallel."""
+        normal = cross(self.along, other.along)
+        square = float(normal @ normal)
+        if square < PERPENDICULAR**2:
+            return None
+        between = other.point - self.point
+        here = float(cross(between, other.along) @ normal) / square
+        there = float(cross(between, self.along) @ normal) / square
+        return self.point + here * self.along, other.point + there * other.along
+
+    def gap(self, other: Axis) -> float:
+        """Return the distance of axes or spheres [m], infinite for parallel axes."""
+        if self.direction is None:
+            return other.distance(self.point)
+        if other.direction is None:
+            return self.distance(other.point)
+        ends = self.nearest(other)
+        return math.inf if ends is None else float(np.linalg.norm(ends[1] - ends[0]))
 
 
 @dataclass(frozen=True, eq=False)

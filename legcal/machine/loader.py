@@ -40,7 +40,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
-from legcal.machine.files import LegcalBlock, MechanismFile
+from legcal.machine.files import LegcalBlock
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.inspection import mechanism_notes, proposal_notes
@@ -130,27 +130,25 @@ def load_mechanism(
     """
     source = read_source(model, base, platform)
     if without:
-        left = [name for name in source.file.name_mot if name not in without]
-        source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
+        source = replace(source, motors=tuple(m for m in source.motors if m not in without))
     return _load(replace(source, leg_radius=leg_radius))
 
 
 def _load(source: Source) -> Machine:
-    file, urdf = source.file, source.urdf
+    urdf = source.urdf
     # Beyond, rounding would hide the relative position of joints.
     for joint in urdf.joints.values():
         words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
         _check_length(away, words, MAX_ORIGIN, urdf.path)
-    _check_names(file, urdf, source.path)
-    closures = sorted(  # in a fixed order, since sums depend on it
-        source.closures, key=lambda closure: (closure.frames, closure.kind)
-    )
+    _check_names(source)
+    # In a fixed order, since sums depend on it.
+    closures = sorted(source.closures, key=lambda closure: (closure.frames, closure.kind))
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
-    if file.name_mot:
+    if source.motors:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
     try:
-        block = file.legcal or propose_block(source, file.name_mot)
+        block = source.block or propose_block(source, source.motors)
         if block.home is None and source.poses is not None:
             T = source.poses[block.base].inv() * source.poses[block.platform]
             drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
@@ -188,7 +186,7 @@ def _load(source: Source) -> Machine:
             q = _readings_at_home(machine, block.home_readings or {}, source.drawn)
             machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
-    if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
+    if source.block is not None and source.block.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
     try:
         pose, configuration = closed_home(machine, given)
@@ -208,23 +206,23 @@ def _load(source: Source) -> Machine:
     _check_equations(machine, configurations)
     _check_dependence(machine)
     _check_ties(machine)
-    proposed = proposal_notes(file.legcal, machine)
+    proposed = proposal_notes(source.block, machine)
     notes = mechanism_notes(machine, home_is_given=block.home is not None)
     return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
 
 
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
     """Return the mechanism, with its chain still open."""
-    file, urdf, yaml_path = source.file, source.urdf, source.path
+    urdf, yaml_path = source.urdf, source.path
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = _legs_in_order(
-        find_chains(bodies, urdf, block.base, block.platform, file.name_mot),
+        find_chains(bodies, urdf, block.base, block.platform, source.motors),
         bodies,
         urdf,
         block,
         yaml_path,
     )
-    _check_motors(file, chains, urdf, yaml_path)
+    _check_motors(source.motors, chains, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     _check_legs(chains, spatial=normals is None, path=yaml_path)
@@ -243,7 +241,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
             leg_chain,
             ends,
             travel=_travel(leg_chain, urdf),
-            actuated=leg_chain.motor in file.name_mot,
+            actuated=leg_chain.motor in source.motors,
             spatial=normals is None,
             home=home,
             actuator=actuators.get(leg_chain.motor),
@@ -465,15 +463,15 @@ def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
     return not entry.moves and bodies.body_of[entry.child] in chain.bodies
 
 
-def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    block = file.legcal
+def _check_names(source: Source) -> None:
+    block, urdf = source.block, source.urdf
     links, joints = set(urdf.links), set(urdf.joints)
     named: list[tuple[str, str, str, set[str]]] = [
-        *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(file.name_mot)),
+        *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(source.motors)),
         *(
             (f"closed_loop.{i}.{k}", frame, "frame (link or joint)", links | joints)
-            for i, pair in enumerate(file.closed_loop)
-            for k, frame in enumerate(pair)
+            for i, closure in enumerate(source.closures)
+            for k, frame in enumerate(closure.frames)
         ),
     ]
     if block is not None:
@@ -484,7 +482,7 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         ]
         if block.platform_joint is not None:
             named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
-    problems = Problems(path)
+    problems = Problems(source.path)
     for place, name, kind, candidates in named:
         if name not in candidates:
             problems.add(
@@ -492,11 +490,12 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
                 f"the {kind} '{name}', which is not in {urdf.path.name}",
                 remedy=closest(name, sorted(candidates)),
             )
-    for i, (frame_1, frame_2) in enumerate(file.closed_loop):
-        if frame_1 == frame_2:
+    for i, closure in enumerate(source.closures):
+        first, second = closure.frames
+        if first == second:
             place = f"closed_loop.{i} could not be used"
-            problems.add(place, f"'{frame_1}' twice", "two frames", "correct one of them")
-    _check_neighbours(file, urdf, problems)
+            problems.add(place, f"'{first}' twice", "two frames", "correct one of them")
+    _check_neighbours(source, problems)
     if block is not None and block.base == block.platform:
         problems.add(
             "legcal.platform could not be used",
@@ -507,14 +506,14 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     problems.raise_if_any()
 
 
-def _check_neighbours(file: MechanismFile, urdf: Urdf, problems: Problems) -> None:
+def _check_neighbours(source: Source, problems: Problems) -> None:
     """Note closures that name the frame of a neighbour instead of their own.
 
     Legs that meet in a point may share a frame: then no similar frame beside it is unused.
     """
-    places: dict[str, list[int]] = {}
-    for i, pair in enumerate(file.closed_loop):
-        for frame in set(pair):
+    urdf, places = source.urdf, dict[str, list[int]]()
+    for i, closure in enumerate(source.closures):
+        for frame in set(closure.frames):
             places.setdefault(frame, []).append(i)
     above = urdf.above
     parents = {joint.parent for joint in urdf.joints.values()}
@@ -605,11 +604,13 @@ def _plane_of_arms(kind: str, path: Path) -> OutOfClass:
     )
 
 
-def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
+def _check_motors(
+    motors: Sequence[str], chains: Sequence[LegChain], urdf: Urdf, path: Path
+) -> None:
     """Check that every motor is the slider of a leg, or carries rods."""
     moving = {chain.motor for chain in chains}
     problems = Problems(path)
-    for motor in file.name_mot:
+    for motor in motors:
         joint = urdf.joints[motor]
         lower, upper = joint.limits or (0.0, 0.0)
         if motor not in moving and joint.type == "prismatic":

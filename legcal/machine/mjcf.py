@@ -8,7 +8,7 @@ of a body, constraint or geom type is refused, since it may be misspelt.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -22,12 +22,12 @@ from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
-from legcal.machine.files import MechanismFile
+from legcal.machine.chain import Closure
 from legcal.machine.spanning_tree import (
     EYE,
     FULL_TURN,
+    LinkFrame,
     Loop,
-    LoopKind,
     Source,
     UrdfBuilder,
     close_loops,
@@ -51,7 +51,6 @@ _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
 Attributes = Mapping[str, str]
 Defaults = dict[str, dict[str, str]]  # attributes of each element
-LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
 class BodyElement(NamedTuple):
@@ -89,14 +88,19 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
             "add them",
             path,
         )
-    frames, kinds = close_loops(loops, reader.tree, path)
+    closures = close_loops(loops, reader.tree, path)
     name = root.get("model", "").strip() or path.stem
     urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
-    urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)
+    urdf, dropped = _without_loose_bodies(urdf, closures, reader.tree, name)
     notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
-    values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
-    file = MechanismFile(closed_loop=frames, type=kinds, name_mot=motors)
-    return Source(path, file, replace(urdf, wording=MJCF), notes * bool(dropped), values)
+    return Source(
+        path,
+        replace(urdf, wording=MJCF),
+        closures,
+        motors,
+        notes=notes * bool(dropped),
+        values={joint: x for joint, x in reader.references.items() if joint in urdf.joints},
+    )
 
 
 class MjcfReader:
@@ -392,14 +396,13 @@ class MjcfReader:
             ends = self._joined_sites(element) if by_site else self._joined_bodies(element)
             if ends is None or len(self.problems) > n_before:
                 continue
-            (link_1, T_1), (link_2, T_2) = ends
-            if link_1 == link_2:
-                self.problems.at(element, f"joins the body '{link_1}' to itself", "name two bodies")
+            if ends[0][0] == ends[1][0]:
+                found = f"joins the body '{ends[0][0]}' to itself"
+                self.problems.at(element, found, "name two bodies")
                 continue
             scale = self._numbers(element, attributes, "torquescale", (1,))
             is_point = element.tag == "connect" or (scale is not None and scale[0] == 0.0)
-            kind: LoopKind = "point" if is_point else "weld"
-            yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
+            yield Loop(name, "3d" if is_point else "6d", ends)
 
     def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
         sites = []
@@ -440,7 +443,7 @@ class MjcfReader:
             T_body1 = T_body1_body2 * T_body2
         return (names[0], T_body1), (names[1], T_body2)
 
-    def motors(self) -> list[str]:
+    def motors(self) -> tuple[str, ...]:
         """Return the joints with an encoder: driven joints, and measured slides."""
         motors: dict[str, None] = {}
         named = (*self.root.iterfind("actuator/*"), *self.root.iterfind("sensor/jointpos"))
@@ -471,7 +474,7 @@ class MjcfReader:
                 )
             elif kind == "slide" or element.tag != "jointpos":
                 motors[name] = None
-        return list(motors)
+        return tuple(motors)
 
     def _unknown(
         self, element: etree._Element, reference: str, name: str, candidates: Mapping[str, object]
@@ -639,13 +642,13 @@ def _span_space(axes: list[Array]) -> bool:
 
 
 def _without_loose_bodies(
-    urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
+    urdf: Urdf, closures: Sequence[Closure], tree: UrdfBuilder, name: str
 ) -> tuple[Urdf, list[str]]:
     """Return the tree without free bodies outside all closures, and the names of these."""
     moved = {j.child for j in urdf.joints.values() if j.moves and j.type != "floating"}
     loose = {
         link
-        for links, closed in moving_groups(urdf, frames)
+        for links, closed in moving_groups(urdf, closures)
         if not closed and moved.isdisjoint(links)
         for link in links
     }

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from html import escape
 from math import pi
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -21,8 +21,8 @@ from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.chain import Closure
-from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
+from legcal.machine.chain import Closure, ClosureKind
+from legcal.machine.files import MAX_LOOPS, LegcalBlock
 from legcal.machine.urdf import (
     LOOP_TAGS,
     URDF_LOOPS,
@@ -39,8 +39,10 @@ class Source:
     """A mechanism as read from one of the formats."""
 
     path: Path  # file with the loops, for messages
-    file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
+    closures: tuple[Closure, ...]  # in the order of the file
+    motors: tuple[str, ...]  # joints that have an encoder
+    block: LegcalBlock | None = None
     notes: tuple[str, ...] = ()  # notes on the conversion, one sentence each
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
@@ -49,12 +51,6 @@ class Source:
     base: str | None = None  # stated links of a file without a block
     platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
-
-    @property
-    def closures(self) -> list[Closure]:
-        """The closures in the order of the file."""
-        pairs = zip(self.file.closed_loop, self.file.type, strict=True)
-        return [Closure(kind, (ends[0], ends[1])) for ends, kind in pairs]
 
 
 FULL_TURN = 2.0 * pi
@@ -199,9 +195,9 @@ def _quoted(text: str) -> str:
 
 def check_one_mechanism(source: Source) -> None:
     """Check that a file holds one mechanism: all loops share a body other than the ground."""
-    groups = moving_groups(source.urdf, source.file.closed_loop)
+    groups = moving_groups(source.urdf, source.closures)
     closed = [links for links, is_closed in groups if is_closed]
-    block = source.file.legcal  # a platform on the ground is refused later
+    block = source.block  # a platform on the ground is refused later
     if len(closed) > 1 and (block is None or any(block.platform in links for links in closed)):
         names = ", ".join(f"'{links[0]}'" for links in closed[:4])
         raise OutOfClass(
@@ -213,7 +209,7 @@ def check_one_mechanism(source: Source) -> None:
         )
 
 
-def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[list[str], bool]]:
+def moving_groups(urdf: Urdf, closures: Iterable[Closure]) -> list[tuple[list[str], bool]]:
     """Return the groups of connected links, without those on the ground, and whether loops close.
 
     The links of each are in the order of the file.
@@ -221,7 +217,7 @@ def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[l
     fixed = [(j.parent, j.child) for j in urdf.joints.values() if not j.moves]
     on_ground = connected(urdf.links, fixed)[urdf.root]
     pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
-    ends = [(urdf.link_of(first), urdf.link_of(second)) for first, second in closures]
+    ends = [tuple(map(urdf.link_of, closure.frames)) for closure in closures]
     moving = [pair for pair in (*pairs, *ends) if on_ground.isdisjoint(pair)]
     groups = connected(urdf.links, [*fixed, *moving])
     closed = {link for pair in ends for link in pair}
@@ -243,23 +239,19 @@ def connected(names: Iterable[str], pairs: Iterable[Sequence[str]]) -> dict[str,
     return groups
 
 
-LoopKind = Literal["point", "weld"]
+LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
-@dataclass(frozen=True, eq=False)
-class Loop:
+class Loop(NamedTuple):
     """A joint between two links that closes a loop of the tree."""
 
     name: str  # prefix of new links and joints
-    kind: LoopKind  # coincidence of both frames
-    links: tuple[str, str]  # the two links
-    T_link_frame: tuple[RigidTransform, RigidTransform]  # frame of the joint in either link
+    kind: ClosureKind
+    frames: tuple[LinkFrame, LinkFrame]  # of the joint in either link
 
 
-def close_loops(
-    loops: Sequence[Loop], text: UrdfBuilder, path: Path
-) -> tuple[list[list[str]], list[ClosureKind]]:
-    """Add the frames of all loops to a tree; return their pairs and kinds for the mechanism."""
+def close_loops(loops: Sequence[Loop], text: UrdfBuilder, path: Path) -> tuple[Closure, ...]:
+    """Add the frames of all loops to a tree, and return their closures."""
     if len(loops) > MAX_LOOPS:
         raise ModelError(
             "the loops could not be closed",
@@ -268,29 +260,25 @@ def close_loops(
             "give one mechanism",
             path,
         )
-    pairs, kinds = list[list[str]](), list[ClosureKind]()
+    closures = []
     for loop in loops:
         ends = []
-        for number, (link, T_link_frame) in enumerate(
-            zip(loop.links, loop.T_link_frame, strict=True), start=1
-        ):
-            frame = text.unused(f"{loop.name}_{number}")
-            text.link(frame)
-            text.joint(text.unused(f"{frame}_frame"), "fixed", link, frame, T_link_frame)
-            ends.append(frame)
-        pairs.append(ends)
-        kinds.append("3d" if loop.kind == "point" else "6d")
-    return pairs, kinds
+        for number, (link, T_link_frame) in enumerate(loop.frames, start=1):
+            ends.append(text.unused(f"{loop.name}_{number}"))
+            text.link(ends[-1])
+            text.joint(text.unused(f"{ends[-1]}_frame"), "fixed", link, ends[-1], T_link_frame)
+        closures.append(Closure(loop.kind, (ends[0], ends[1])))
+    return tuple(closures)
 
 
 _CLOSING = re.compile(r"closing_(.+)_([12])")
-KINDS: dict[str, LoopKind] = {
-    **dict.fromkeys(("spherical", "ball", "point"), "point"),
-    **dict.fromkeys(("fixed", "weld"), "weld"),
+KINDS: dict[str, ClosureKind] = {
+    **dict.fromkeys(("spherical", "ball", "point"), "3d"),
+    **dict.fromkeys(("fixed", "weld"), "6d"),
 }
 
 
-def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
+def closing_frames(robot: etree._Element, path: Path) -> tuple[Closure, ...]:
     """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot."""
     ends: dict[str, dict[str, str]] = {}
     for element in robot.findall("link"):
@@ -308,7 +296,7 @@ def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
                 f"remove '{link}'",
                 path,
             )
-    return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
+    return tuple(Closure("3d", (numbers["1"], numbers["2"])) for numbers in ends.values())
 
 
 def read_loop_source(path: Path, content: bytes) -> Source:
@@ -327,23 +315,18 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     for element in elements:
         robot.remove(element)
     text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
-    pairs, kinds = close_loops(loops, text, path)
+    closures = close_loops(loops, text, path)
     for line in filter(None, text.body().split("\n")):
         robot.append(etree.fromstring(line))
         robot[-1].tail = "\n"
     named = closing_frames(robot, path)
     if named:
-        kinds.extend("3d" for _ in named)
         notes.append(
             f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
             "joints."
         )
-    file = MechanismFile(
-        closed_loop=[*pairs, *named],
-        type=kinds,
-        name_mot=motors,
-    )
-    return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))
+    urdf = replace(bare, wording=URDF_LOOPS).edited(robot)
+    return Source(path, urdf, (*closures, *named), tuple(motors), notes=tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
@@ -365,14 +348,13 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems
         ends = _ends(element, urdf, problems)
         if len(problems) > n_before or ends is None:
             continue
-        (link_1, T_1), (link_2, T_2) = ends
-        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2)))
+        loops.append(Loop(name, KINDS[kind], ends))
     return loops
 
 
 def _ends(
     element: etree._Element, urdf: Urdf, problems: XmlProblems
-) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
+) -> tuple[LinkFrame, LinkFrame] | None:
     """Return the links of a loop and its frame in each, or None after noting problems."""
     sides = [part for part in element if part.tag in ("link1", "link2")]
     origins: list[etree._Element | None] = [

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.errors import OutOfClass, Problem
+from legcal.errors import OutOfClass
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
@@ -25,7 +25,6 @@ from legcal.machine.classification import (
     classify_leg,
     is_actuator,
     joint_tolerance,
-    nearest,
     off_square,
     parallel,
     undirected,
@@ -37,6 +36,7 @@ from legcal.machine.spanning_tree import Source, connected
 from legcal.machine.urdf import VIRTUAL, Urdf
 
 Normals = tuple[Array, Array]
+NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 TIE = 1e-6  # difference of equally large triangles, relative to the largest
 
 
@@ -114,12 +114,7 @@ def _paths(
                 )
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
-                problem = None
-                if len(onward) > 1 and not _is_an_arm(steps, within):
-                    problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
-                raise OutOfClass(
-                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors, within)
-                )
+                raise _no_chain(bodies, urdf, steps, body, (base, platform), motors, within)
             connection = onward[0]
         paths.append(steps)
     stray = [c for c in bodies.connections if id(c) not in used]
@@ -406,132 +401,96 @@ def check_virtual_joint(
 def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform: str) -> None:
     """Refuse joints that are not part of any leg."""
     if connection.is_virtual:
-        raise OutOfClass(
-            "this mechanism is not supported",
+        problem = (
             f"the {connection.type} joint '{connection.joint}' inside it",
             "at most the virtual one that carries the platform",
             "name that one in legcal.platform_joint",
-            urdf.path,
         )
-    if connection.bodies[0] == connection.bodies[1]:
-        raise OutOfClass(
-            "this mechanism is not supported",
+    elif connection.bodies[0] == connection.bodies[1]:
+        problem = (
             f"{_name(connection)} between two links that are rigidly connected",
             "a joint that can move",
             "remove it",
-            urdf.path,
         )
-    if set(connection.bodies) == {base, platform} and connection.type == "prismatic":
-        raise OutOfClass(
-            "this mechanism is not supported",
+    elif set(connection.bodies) == {base, platform} and connection.type == "prismatic":
+        problem = (
             f"{_name(connection)} directly between base and platform",
             "legs",
             "name it in legcal.platform_joint if it is the virtual joint that carries the platform",
-            urdf.path,
         )
+    else:
+        return
+    raise OutOfClass("this mechanism is not supported", *problem, urdf.path)
 
 
-def _several_bodies(
-    bodies: Bodies, urdf: Urdf, steps: Sequence[Connection], body: str, ends: tuple[str, str]
-) -> Problem | None:
-    """Return the problem of a body in a loop inside a leg, or in a platform of several bodies.
-
-    From the body, without passing base or platform, a loop inside a leg leads to the base by one
-    joint, a part of the platform by the joints of several legs.
-    """
-    base, platform = ends
-    names = [name for c in bodies.connections for name in c.bodies]
-    inside = [c.bodies for c in bodies.connections if {*c.bodies}.isdisjoint(ends)]
-    group = connected(names, inside)[body]
-    on_base, on_platform = (
-        [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
-        for end in (base, platform)
-    )
-    if len(on_platform) != 1:
-        return None
-    if len(on_base) == 1:
-        return Problem(
-            "this machine is not supported",
-            f"a loop inside the leg that starts with {_name(steps[0])}, closed at link '{body}'",
-            "chains without loops that end on the platform itself",
-            "if these are the rods of a parallelogram on an arm or a carriage, close "
-            "each on the platform as a leg of its own, otherwise this machine cannot "
-            "be calibrated with legcal",
-            str(urdf.path),
-        )
-    if len(on_base) > 1:
-        joint = on_platform[0]
-        return Problem(
-            "this machine is not supported",
-            "a platform of several bodies (as of an H4 or I4), because legs end on "
-            f"link '{body}', which {_name(joint)} connects to the platform",
-            "legs that end on one rigid platform",
-            f"make {_name(joint)} fixed if it does not move, otherwise this machine "
-            "cannot be calibrated with legcal",
-            str(urdf.path),
-        )
-    return None
-
-
-def _not_a_chain(
+def _no_chain(
+    bodies: Bodies,
     urdf: Urdf,
     steps: list[Connection],
     body: str,
-    base: str,
-    n_onward: int,
+    ends: tuple[str, str],
     motors: Sequence[str],
     within: float,
-) -> Problem:
-    """Return the problem of a leg, given by its first joints, that is not a chain."""
-    needed, remedy = "one unbranched chain from base to platform for each leg", ""
-    first, last = steps[0], steps[-1]
-    driven = last.joint in motors or (first.joint in motors and _is_an_arm(steps, within))
-    if body != base and n_onward > 1 and len(steps) > 1 and driven:
-        return Problem(
-            f"the leg that starts with {_name(first)} is not supported",
-            f"{n_onward} rods on link '{body}', which {_name(last)} connects to the moving link "
-            "before it",
-            "rods on the link that one motor on the base moves",
-            "make joints of this leg fixed that do not move; arms on arms cannot be calibrated "
-            "with legcal",
-            str(urdf.path),
-        )
-    if body == base:
-        course = "returns to the base"
+) -> OutOfClass:
+    """Return the refusal of a leg that is no chain, given by its joints to the *body* in question.
+
+    From a body without passing base or platform, a loop inside a leg leads to the base by one
+    joint, a part of a platform of several bodies by the joints of several legs.
+    """
+    first, last = _name(steps[0]), _name(steps[-1])
+    n_onward = sum(body in c.bodies for c in bodies.connections) - 1
+    needed = "one unbranched chain from base to platform for each leg"
+    remedy = f"check {urdf.wording.closures}, or {urdf.wording.correct_ends}"
+    inside = [c.bodies for c in bodies.connections if {*c.bodies}.isdisjoint(ends)]
+    group = connected([name for c in bodies.connections for name in c.bodies], inside)[body]
+    on_base, on_platform = (
+        [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
+        for end in ends
+    )
+    is_arm = _is_an_arm(steps, within)
+    driven = steps[-1].joint in motors or (steps[0].joint in motors and is_arm)
+    if body == ends[0]:
+        found = f"a chain that starts with {first} and returns to the base"
     elif n_onward == 0:
-        course = f"ends at link '{body}' without reaching the platform"
-    elif n_onward > 1 and _is_an_arm(steps, within):
-        course = (
-            f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        found = f"a chain from {first} that ends at link '{body}' without reaching the platform"
+    elif n_onward > 1 and not is_arm and len(on_platform) == len(on_base) == 1:
+        found = f"a loop inside the leg that starts with {first}, closed at link '{body}'"
+        remedy = (
+            "if these are the rods of a parallelogram on an arm or a carriage, close each on the "
+            f"platform as a leg of its own, otherwise {NOT_CALIBRATED}"
         )
+    elif n_onward > 1 and not is_arm and len(on_platform) == 1:
+        joint = _name(on_platform[0])
+        found = (
+            "a platform of several bodies (as of an H4 or I4), because legs end on link "
+            f"'{body}', which {joint} connects to the platform"
+        )
+        needed = "legs that end on one rigid platform"
+        remedy = f"make {joint} fixed if it does not move, otherwise {NOT_CALIBRATED}"
+    elif n_onward > 1 and len(steps) > 1 and driven:
+        found = f"{n_onward} rods on link '{body}', which {last} connects to the moving link before"
+        needed = "rods on the link that one motor on the base moves"
+        remedy = f"make joints of this leg fixed that do not move, otherwise {NOT_CALIBRATED}"
+    elif n_onward > 1 and is_arm:
+        found = f"{n_onward} rods on the moving link '{body}', so that the joints at A move"
         needed = (
             "joints whose centres are fixed in the base, or a motor in name_mot that moves this "
             "link itself"
         )
-        remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
+        remedy = f"name {first} in name_mot if a motor turns it, otherwise {remedy}"
     else:
-        course = f"shares link '{body}' with another leg or branches there"
-    return Problem(
-        "this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {course}",
-        "",
-        needed,
-        f"{remedy}check {urdf.wording.closures}, or {urdf.wording.correct_ends}",
-        str(urdf.path),
-    )
+        found = f"a chain from {first} that shares link '{body}' with another leg or branches there"
+    return OutOfClass("this is not a platform on separate legs", found, needed, remedy, urdf.path)
 
 
 def _is_an_arm(steps: list[Connection], within: float) -> bool:
     """Return whether joints form an arm whose end moves: one revolute, or several apart."""
     if any(step.type != "revolute" for step in steps):
         return False
-    if len(steps) == 1:
-        return True
-    for lower, upper in pairwise(steps):
-        near, far = nearest(Axis(lower.name, *lower.line(1)), Axis(upper.name, *upper.line(0)))
-        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
-            return True
-    return False
+    return len(steps) == 1 or any(
+        Axis(lower.name, *lower.line(1)).gap(Axis(upper.name, *upper.line(0))) > within
+        for lower, upper in pairwise(steps)
+    )
 
 
 def _name(connection: Connection) -> str:
@@ -604,7 +563,7 @@ def _platform_body(
         "one closed chain in which no link is a platform on legs, because on "
         "each side of any link more than a slider or a rod moves the joint at A",
         "legs of type joint, slider or rod, joint",
-        "this machine cannot be calibrated with legcal",
+        NOT_CALIBRATED,
         path,
     )
 
