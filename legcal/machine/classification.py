@@ -23,8 +23,8 @@ from legcal.machine.leg import PERPENDICULAR, Axis, JointType, Leg, LegChain, Le
 
 CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
 _CENTRES = (
-    "a joint whose centre is fixed in the base, at most one slider, and a joint whose centre is fixed "
-    "in the platform, or a motor that moves the joint at A and then a rod"
+    "a joint whose centre is fixed in the base, at most one slider, and a joint whose centre is "
+    "fixed in the platform, or a motor that moves the joint at A and then a rod"
 )
 
 
@@ -108,10 +108,10 @@ def _check_sliders(
     sliders = [step.name for step in steps if step.type == "prismatic"]
     found = None
     if hangs:
-        beyond = {step.name: "slider" for step in steps[1:] if step.type == "prismatic"}
-        beyond |= {step.name: "motor" for step in steps[1:] if step.joint in motors}
+        beyond = {step.name: "the slider" for step in steps[1:] if step.type == "prismatic"}
+        beyond |= {step.name: "a second motor" for step in steps[1:] if step.joint in motors}
         for name, kind in beyond.items():
-            found = f"the {kind} '{name}' beyond the motor '{leg}' on the base"
+            found = f"{kind} '{name}' beyond the motor '{leg}' on the base"
     elif len(sliders) > 1:
         found = f"{len(sliders)} sliders"
     elif steps[0].type == "prismatic":
@@ -291,9 +291,9 @@ def _centre(axes: Sequence[Axis], leg: str, within: float) -> Array:
     for axis in axes if sphere is not None else axes[1:]:
         miss = math.inf if centre is None else axis.distance(centre)
         if miss > within:
-            other = (
-                f"that of '{axes[0].name}'" if sphere is None else f"the centre of {sphere.name}"
-            )
+            other = f"that of '{axes[0].name}'"
+            if sphere is not None:
+                other = f"the centre of {sphere.name}"
             far = "parallel to" if centre is None else f"{1e3 * miss:.4g} mm from"
             raise OutOfClass(
                 f"leg '{leg}' could not be classified",

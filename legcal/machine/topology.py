@@ -472,7 +472,10 @@ def _no_chain(
         needed = "rods on the link that one motor on the base moves"
         remedy = f"make joints of this leg fixed that do not move, otherwise {NOT_CALIBRATED}"
     elif n_onward > 1 and is_arm:
-        found = f"{n_onward} rods on the moving link '{body}', so that the joints at A move"
+        found = (
+            f"a chain that starts with {first} and carries {n_onward} rods on the moving link "
+            f"'{body}', so that the joints at A move"
+        )
         needed = (
             "joints whose centres are fixed in the base, or a motor in name_mot that moves this "
             "link itself"
