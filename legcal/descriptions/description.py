@@ -23,9 +23,7 @@ from legcal.machine.equations import PoseEquations, posture_constraints
 from legcal.machine.leg import (
     LINKS,
     MAX_LENGTH,
-    MAX_RADIUS,
     MIN_LENGTH,
-    MIN_RADIUS,
     EquationKind,
     JointType,
     Leg,
@@ -207,7 +205,7 @@ ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if
 
 
 def wrong_sizes(described: Description) -> list[str]:
-    """Return the problems of radii, offsets and travels in themselves."""
+    """Return the problems of offsets and travels in themselves."""
     if all_revolute(described) and any(leg.actuator for leg in described.legs):
         return [
             f"{described.source}: this mechanism is not supported: found a planar machine whose "
@@ -249,13 +247,6 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     for leg, length in zip(described.legs, lengths, strict=True):
         if not MIN_LENGTH <= length <= MAX_LENGTH:
             return [_out_of_proportion(described, leg.name, float(length))]
-        for radius in (leg.tube, leg.rod):
-            if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
-                return [
-                    f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
-                    f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
-                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
-                ]
         if leg.kind is LegKind.CONSTANT or leg.travel is None:
             continue
         q0 = leg.offset or 0.0
@@ -446,14 +437,6 @@ def _base_frame(described: Description, count: int) -> tuple[str, ...]:
     """Return the legs that define frames: as given, or 1, 3, 5 of six, or the first possible."""
     legs = described.legs
     if described.base_frame is not None:
-        names = [leg.name for leg in legs]
-        named = [names.index(name) for name in described.base_frame]
-        if len(named) != count or _degenerate(described, named):
-            raise ModelError(
-                f"{described.source}: base_frame could not be used: found "
-                f"{', '.join(described.base_frame)}, needed {count} legs whose joints on base and "
-                "platform are not in one point or on one line; choose others, or leave it out."
-            )
         return described.base_frame
     combos = list(combinations(range(len(legs)), count))
     if len(legs) == 6 and count == 3:
@@ -563,10 +546,7 @@ def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> lis
 def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, float]:
     """Return the readings at home of motors that carry joints.
 
-    Raises
-    ------
-    ModelError
-        If home is outside a travel, or both readings of a rod are inside it.
+    Raises ModelError if home is outside a travel, or both readings of a rod are inside it.
     """
     legs = _legs_to_close(described)
     readings, problems = dict[str, float](), list[str]()

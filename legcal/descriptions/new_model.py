@@ -166,11 +166,8 @@ def _check_unit(given: Dimensions) -> None:
 def family_table(given: Dimensions) -> dict[str, Any]:
     """Return the table of a family, as in YAML, in the unit of the dimensions.
 
-    Raises
-    ------
-    UsageError
-        With one sentence for each dimension that is missing, impossible or belongs to another
-        family.
+    Raises UsageError with one sentence for each dimension that is missing, impossible or belongs to
+    another family.
     """
     _check_unit(given)
     name = str(given.family).lower()

@@ -419,10 +419,7 @@ def _is_csv(path: Path, content: str) -> bool:
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     """Return the machine of a table (as in YAML); messages name its source.
 
-    Raises
-    ------
-    ModelError
-        With one sentence for each entry that is impossible or contradicts others.
+    Raises ModelError with one sentence for each entry that is impossible or contradicts others.
     """
     file, problems = validate(TableFile, table, source, kind=ModelError), Problems(source)
     _check_entries(file, problems)

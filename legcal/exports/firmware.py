@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.descriptions.controllers import SIDES, STRUTS, Rig, read_delta, rig_in
 from legcal.descriptions.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
-from legcal.exports.correction import poses_at_readings, stacked
+from legcal.exports.correction import stacked
 from legcal.exports.subject import (
     Rendered,
     Subject,
@@ -32,8 +32,10 @@ from legcal.exports.subject import (
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
+from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses, workspace
-from legcal.machine.leg import LegKind
+from legcal.machine.kinematics import poses_at_readings
+from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
 from legcal.version import __version__
@@ -87,7 +89,9 @@ def firmware_files(name: str, subject: Subject, path: Path) -> Rendered:
     after, frame = _in_best_frame(errors, read_delta(path, f"{head}{lines}"))
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        there, reached = poses_at_readings(
+            subject.nominal, readings[:, list(subject.nominal.motors)], poses
+        )
         then = _mounted(subject.nominal, firmware)
         of_nominal = then.errors_at(readings[reached], there[reached])
         before, _ = _in_best_frame(errors, _nearest_delta(firmware, then, of_nominal))
@@ -219,11 +223,9 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
         B = home @ machine.B_platform[rods].mean(axis=0)
         rod = float(np.mean([machine.legs[j].q0 for j in rods]))
         rows.append(_Row.of(actuator, A @ frame, B @ frame, rod, frame))
-    places = np.array([row.across for row in rows])
-    angles = np.degrees(np.arctan2(places[:, 1], places[:, 0]))
+    angles = np.array([np.degrees(np.arctan2(*row.across[::-1])) for row in rows])
     if "angle" in firmware.nominal and ((angles[1] - angles[0]) % 360.0) > 180.0:
-        rows = [rows[0], rows[2], rows[1]]
-    angles = np.array([np.degrees(np.arctan2(row.across[1], row.across[0])) for row in rows])
+        rows, angles = [rows[0], rows[2], rows[1]], angles[[0, 2, 1]]
     nominal = np.array(firmware.nominal.get("angle", angles))
     off = (angles - nominal + 180.0) % 360.0 - 180.0
     off = off[0] + ((off - off[0] + 180.0) % 360.0 - 180.0)
@@ -522,7 +524,9 @@ def flypt_files(subject: Subject, path: Path) -> Rendered:
     after, _ = _in_best_frame(places.errors, written)
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        there, reached = poses_at_readings(
+            subject.nominal, readings[:, list(subject.nominal.motors)], poses
+        )
         of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
         before, _ = _in_best_frame(places.errors, of_nominal.nearest())
     remaining = _Remaining("FlyPT Mover", places.joints, after, before)
@@ -585,7 +589,10 @@ class _Places:
         origin = self._middle + frame[:3]
         near_R = R_base.T @ self.poses[:, :, :3] @ self._of_platform
         near = (self.joints.mean(axis=1) - origin) @ R_base
-        R, t = _forward(sides, sides.Middle + self.moves, near_R, near)
+        pairs = zip(sides.base, sides.platform, strict=True)
+        joints = JointType.UNIVERSAL, JointType.SPHERICAL
+        legs = [Leg(*joints, LegKind.ACTUATED, A, B, sides.Middle) for A, B in pairs]
+        R, t = solve_poses(legs, (0, 2, 4), near_R, near, self.moves, steps=_NEWTON)[:2]
         joints = sides.platform @ np.swapaxes(R, 1, 2) + t[:, None]
         return np.asarray(joints @ R_base.T + origin - self.joints)
 
@@ -600,17 +607,3 @@ def _sides(joints: Array, first: int) -> tuple[float, float]:
     sides = np.linalg.norm(np.roll(joints, -1, axis=0) - joints, axis=1)
     others, pairs = float(sides[1 - first :: 2].mean()), float(sides[first::2].mean())
     return (others, pairs) if first == 0 else (pairs, others)
-
-
-def _forward(rig: Rig, lengths: Array, R: Array, t: Array) -> tuple[Array, Array]:
-    """Return the poses of a rig at lengths (k, 6), near others, by Newton's method."""
-    for _ in range(_NEWTON):
-        arms = rig.platform @ np.swapaxes(R, 1, 2)
-        legs = arms + t[:, None] - rig.base
-        now = np.linalg.norm(legs, axis=2)
-        u = legs / now[..., None]
-        slope = np.concatenate([u, cross(arms, u)], axis=2)
-        step = np.linalg.solve(slope, (lengths - now)[..., None])[..., 0]
-        t = t + step[:, :3]
-        R = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ R
-    return R, t

@@ -53,10 +53,7 @@ class ClosedChain:
     all joints move in the plane, rounding of their axes opens it across. *gains* of joints, by
     name, divide their values in configurations, as encoders read them.
 
-    Raises
-    ------
-    ModelError
-        If Pinocchio cannot build the model.
+    Raises ModelError if Pinocchio cannot build the model.
     """
 
     def __init__(
@@ -97,6 +94,20 @@ class ClosedChain:
         # Last configurations evaluated in the work space of Pinocchio, as bytes.
         self._placed_at = self._linearized_at = b""
         self._linear = np.zeros(0), np.zeros((0, 0))  # last result of linearize
+
+    @classmethod
+    def of(
+        cls,
+        urdf: Urdf,
+        closures: Sequence[Closure],
+        normals: Sequence[Array | None] = (),
+        gains: Mapping[str, float] = MappingProxyType({}),
+    ) -> "ClosedChain":
+        """Return the closed chain of a URDF, which errors name."""
+        try:
+            return cls(urdf.text, closures, normals, gains)
+        except ModelError as error:
+            raise error.told(lambda problem: problem.in_file(urdf.path)) from error
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
         return ClosedChain, (self.text, self.closures, self.normals, self.gains)
@@ -357,10 +368,7 @@ class Bodies:
 def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | None) -> Bodies:
     """Return the bodies of a tree with closures, and the joints between them.
 
-    Raises
-    ------
-    ModelError
-        If a weld closes a loop of bodies that are rigid already.
+    Raises ModelError if a weld closes a loop of bodies that are rigid already.
     """
     body_of = {link: link for link in urdf.links}
     T_body_link = {link: np.eye(4) for link in urdf.links}

@@ -23,7 +23,8 @@ from legcal.machine.leg import PERPENDICULAR, Axis, JointType, Leg, LegChain, Le
 
 CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
 _CENTRES = (
-    "a joint whose centre is fixed in the base, at most one slider, and a joint whose centre is "
+    "a joint whose centre is fixed in the base, at most one slider and "
+    "one motor for each leg, and a joint whose centre is "
     "fixed in the platform, or a motor that moves the joint at A and then a rod"
 )
 
@@ -50,11 +51,8 @@ def classify_leg(
     is one of the *motors* and the others form a rod with a joint at each end, this motor carries
     the rod.
 
-    Raises
-    ------
-    OutOfClass
-        If the leg is not a joint, at most one slider, and a joint, with axes that the method
-        supports.
+    Raises OutOfClass if the leg is not a joint, at most one slider, and a joint, with axes that the
+    method supports.
     """
     poses, axes = [np.eye(4)], list[Axis]()
     for step in steps:

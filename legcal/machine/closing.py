@@ -74,10 +74,8 @@ def close_at(
     from seeded random angles. The pose must meet the constraints; unless it is *exact* the platform
     is free in the final solve and absorbs the errors of axes in the model.
 
-    Raises
-    ------
-    DidNotConverge
-        If a leg does not close; the message names its closure and the remaining distance.
+    Raises DidNotConverge if a leg does not close; the message names its closure and the remaining
+    distance.
     """
     chain, metre = machine.chain, leg_scale(machine, T_base_platform)
     most = POSE_TOLERANCE if exact else AXIS_TOLERANCE

@@ -391,10 +391,7 @@ def pose_sensitivity(
     motors the squares of the lengths are minimised, with exact constraints; if the constraints
     alone outnumber the freedoms (a 3-UPU that only translates), the squares of all equations.
 
-    Raises
-    ------
-    NotIdentifiable
-        If readings and legs do not determine a pose.
+    Raises NotIdentifiable if readings and legs do not determine a pose.
     """
     equations = pose_equations(legs, R, t, q=readings_of_rods(legs, R, t))
     columns = list(freedoms(frame_legs))

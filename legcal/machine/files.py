@@ -283,6 +283,9 @@ def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
     return entries
 
 
+_OPTIONAL = ("home_readings", "motors", "spline_teeth", "reach")  # left out where empty
+
+
 def mechanism_yaml(
     loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
 ) -> str:
@@ -294,7 +297,7 @@ def mechanism_yaml(
             "name_mot": motors,
             "joint_name": [],
             "joint_type": [],
-            "legcal": {"version": 1, **legcal},
+            "legcal": {"version": 1} | {k: x for k, x in legcal.items() if x or k not in _OPTIONAL},
         }
     )
 

@@ -367,7 +367,7 @@ def _note(names: Sequence[str]) -> str:
 
 def completed(source: Source) -> Source:
     """Return a mechanism without a block, completed with the closed poses and all travels."""
-    chain = _closed_chain(source)
+    chain = ClosedChain.of(source.urdf, source.closures)
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
@@ -529,17 +529,10 @@ def _solved(
 
 def is_drawn_closed(source: Source) -> bool:
     """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
-    chain = _closed_chain(source)
+    chain = ClosedChain.of(source.urdf, source.closures)
     poses = source.urdf.poses.values()
     size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
     return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
-
-
-def _closed_chain(source: Source) -> ClosedChain:
-    try:
-        return ClosedChain(source.urdf.text, source.closures)
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
 
 
 def _loop_error(chain: ClosedChain, configuration: Array) -> float:

@@ -51,11 +51,8 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
     It is the nearest pose that meets all constraints of legs and plane. Files state home with few
     digits; sliders absorb the rounding, but rods, revolute axes and universal joints do not.
 
-    Raises
-    ------
-    ModelError, DidNotConverge
-        If home is more than 1 % of a leg length away from any such pose; and as
-        :func:`home_at_mid_travel` and :func:`legcal.machine.closing.close_at`.
+    Raises ModelError or DidNotConverge if home is more than 1 % of a leg length away from any such
+    pose; and as :func:`home_at_mid_travel` and :func:`legcal.machine.closing.close_at`.
     """
     start = home_at_mid_travel(machine) if home is None else home
     projected, problem = project_pose(machine, start)
@@ -81,12 +78,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
     joints the one on the positive side of the base z. Lengths of legs without a motor follow,
     within their travel if possible.
 
-    Raises
-    ------
-    DidNotConverge
-        If there is no such pose.
-    ModelError
-        If rods on motors reach the platform on both sides of the base, so that home is ambiguous.
+    Raises DidNotConverge if there is no such pose. Raises ModelError if rods on motors reach the
+    platform on both sides of the base, so that home is ambiguous.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     if readings is not None:
@@ -128,7 +121,7 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
         (other,) = at_readings([(centre + t, Rotation.from_matrix(R).as_rotvec())])
         sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
         if len(sides) == 2 and np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
-            poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
+            poses = " and ".join(in_yaml(T, 4) for T in (home, other) if T is not None)
             wording = machine.urdf.wording
             raise ModelError(
                 "the assembly at home is ambiguous",
@@ -146,11 +139,11 @@ def _height(machine: Machine, T: RigidTransform, centre: Array) -> float:
     return float(np.mean(B_at(machine, T.as_matrix()[None])[0, :, 2]) - centre[2])
 
 
-def _in_yaml(T: RigidTransform) -> str:
+def in_yaml(T: RigidTransform, digits: int = 6) -> str:
     """Return a pose in the notation of models."""
-    xyz, quat = T.translation, T.rotation.as_quat()
-    numbers = [", ".join(f"{x + 0.0:.4g}" for x in part.round(6)) for part in (xyz, quat)]
-    return f"{{xyz: [{numbers[0]}], quat_xyzw: [{numbers[1]}]}}"
+    parts = T.translation, T.rotation.as_quat(canonical=True)
+    xyz, quat = (", ".join(f"{x + 0.0:.{digits}g}" for x in part.round(6)) for part in parts)
+    return f"xyz [{xyz}], quat_xyzw [{quat}]"
 
 
 def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:
@@ -258,11 +251,8 @@ def _unlikely(machine: Machine, T: RigidTransform) -> float:
 def check_home_travel(machine: Machine) -> None:
     """Check that a stated home is not far outside the travel of its motors.
 
-    Raises
-    ------
-    ModelError
-        If an actuated leg is outside its travel by more than the travel itself and by more than
-        1 % of its length, or a motor that carries rods by more than its travel.
+    Raises ModelError if an actuated leg is outside its travel by more than the travel itself and by
+    more than 1 % of its length, or a motor that carries rods by more than its travel.
     """
     far: dict[int, float] = {}
     q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)

@@ -72,7 +72,7 @@ from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
-    Normals,
+    NOT_CALIBRATED,
     any_joint,
     check_virtual_joint,
     distinct_joint,
@@ -88,8 +88,7 @@ from legcal.machine.urdf import VIRTUAL, Urdf
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
 _ROUNDING = 1e-9  # of home, which may lie on the floor [m]
-_METRES = "write all lengths in metres (are they millimetres?)"
-_NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
+_IN_SPACE = "a machine in space, or sliders along the legs", NOT_CALIBRATED
 _DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
     EquationKind.PLATFORM_AXIS: "its revolute axis at the platform {} deg from perpendicular to it",
@@ -138,9 +137,9 @@ def _load(source: Source) -> Machine:
     urdf = source.urdf
     # Beyond, rounding would hide the relative position of joints.
     for joint in urdf.joints.values():
-        words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
+        words = f"the origin of joint '{joint.name}' {{}} away from its parent link"
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        _check_length(away, words, MAX_ORIGIN, urdf.path)
+        _check_length(away, words, urdf.path, most=MAX_ORIGIN)
     _check_names(source)
     # In a fixed order, since sums depend on it.
     closures = sorted(source.closures, key=lambda closure: (closure.frames, closure.kind))
@@ -178,7 +177,8 @@ def _load(source: Source) -> Machine:
     if given is None:
         _check_spread(machine)  # before a search for home in kilometres
         if machine.actuators:
-            q = _stated_or_middle(machine, block.home_readings or {})
+            stated = block.home_readings or {}
+            q = [stated.get(leg.motor_label, 0.5 * sum(leg.travel)) for leg in machine.legs]
             given = home_at_mid_travel(machine, q)
             machine = _in_modes(machine, given, q)
     else:
@@ -232,7 +232,10 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     shown = [solid.cylinder for solid in solids if solid.cylinder is not None]
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
-    chain = _closed_chain(urdf, closures, in_plane, block, chains)
+    stated = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
+    gains = {str(c.motor): stated.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
+    across = normals_of_closures(in_plane, closures, block, urdf)
+    chain = ClosedChain.of(urdf, closures, across, gains)
     home = None if block.home is None else block.home.motion()
     actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
     legs = tuple(
@@ -281,25 +284,6 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     return machine
 
 
-def _closed_chain(
-    urdf: Urdf,
-    closures: Sequence[Closure],
-    in_plane: Normals | None,
-    block: LegcalBlock,
-    chains: Sequence[LegChain],
-) -> ClosedChain:
-    """Return the tree with its closures and the gains of actuators."""
-    stated_gains = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
-    gains = {
-        str(c.motor): stated_gains.get(str(c.motor), 1.0) for c in chains if c.actuator is not None
-    }
-    try:
-        normals = normals_of_closures(in_plane, closures, block, urdf)
-        return ClosedChain(urdf.text, closures, normals, gains)
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(urdf.path)) from error
-
-
 def _actuators(
     chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
 ) -> dict[str | None, Actuator | None]:
@@ -311,20 +295,21 @@ def _actuators(
         for chain in reversed(chains)  # its point is on the first leg
         if chain.actuator is not None
     }
-    problems = Problems(path)
-    motors = sorted(str(motor) for motor in stated)
+    problems, motors = Problems(path), sorted(str(motor) for motor in stated)
+    for key, named in (("motors", block.motors), ("home_readings", block.home_readings)):
+        for name in named or {}:
+            if name not in motors:
+                problems.add(
+                    f"legcal.{key}.{name} could not be used",
+                    "no motor of that name that carries rods",
+                    f"one of {', '.join(motors)}" if motors else "no entry",
+                    closest(name, motors) if motors else "remove it: sliders along legs carry none",
+                    name=f"legcal.{key}.{name}",
+                )
+    problems.raise_if_any()
     for name, entry in (block.motors or {}).items():
-        actuator, entry_name = stated.get(name), f"legcal.motors.{name}"
+        actuator, entry_name = stated[name], f"legcal.motors.{name}"
         refused = f"{entry_name} could not be used"
-        if actuator is None:
-            problems.add(
-                refused,
-                "no motor of that name that carries rods",
-                f"one of {', '.join(motors)}" if motors else "no entry",
-                closest(name, motors) if motors else "remove it: sliders along legs carry none",
-                name=entry_name,
-            )
-            continue
         try:
             pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=actuator.turns)
         except BadValue as bad:
@@ -351,26 +336,6 @@ def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[flo
     return replace(machine, legs=legs)
 
 
-def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
-    """Refuse readings at home of joints that are no actuators."""
-    joints, problems = sorted(a.joint for a in machine.actuators), Problems(machine.yaml_path)
-    for name in given:
-        if name not in joints:
-            problems.add(
-                f"legcal.home_readings.{name} could not be used",
-                "no actuator of that name",
-                f"one of {', '.join(joints)}",
-                closest(name, joints),
-            )
-    problems.raise_if_any()
-
-
-def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
-    """Return the readings of legs for a search for home: as *given*, else mid-travel."""
-    _check_home_readings(machine, given)
-    return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
-
-
 def _readings_at_home(
     machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
 ) -> list[float]:
@@ -380,7 +345,6 @@ def _readings_at_home(
     the file is taken; without one they are refused.
     """
     path = machine.yaml_path
-    _check_home_readings(machine, given)
     B = B_at(machine, machine.home.as_matrix()[None])[0]
     q = [0.0] * machine.n_legs
     for j, leg in enumerate(machine.legs):
@@ -540,43 +504,44 @@ def _check_neighbours(source: Source, problems: Problems) -> None:
 
 def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
     """Check the number of legs and, in a plane, that their type is supported."""
-    refused, n_d = "this mechanism is not supported", n_frame_legs(spatial=spatial)
-    if len(chains) < n_d:
-        raise OutOfClass(
-            refused,
-            f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {_where(spatial=spatial)}",
+    n, n_d = len(chains), n_frame_legs(spatial=spatial)
+    holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
+    fixed = [any_joint(chain) for chain in chains if chain.platform.type is JointType.FIXED]
+    on_motors = any(chain.actuator is not None for chain in chains)
+    for is_so, *problem in (
+        (
+            n < n_d,
+            f"{n} {'leg' if n == 1 else 'legs'} {_where(spatial=spatial)}",
             f"at least {n_d}, whose joints define the frames of base and platform",
-            _NOT_CALIBRATED,
-            path,
-        )
-    if len(chains) > MAX_LEGS:
-        raise OutOfClass(
-            refused,
-            f"{len(chains)} legs",
+            NOT_CALIBRATED,
+        ),
+        (
+            n > MAX_LEGS,
+            f"{n} legs",
             f"at most {MAX_LEGS}, since the work grows with their cube",
             "leave out passive legs",
-            path,
-        )
-    holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
-    if len(holding) > 1:
-        raise OutOfClass(
-            refused,
+        ),
+        (
+            len(holding) > 1,
             f"{len(holding)} joints directly between base and platform ({', '.join(holding)})",
             "one at most, which holds the platform",
             "check that each leg has its links between these joints",
-            path,
-        )
-    fixed = [chain for chain in chains if chain.platform.type is JointType.FIXED]
-    if fixed and not spatial:
-        raise OutOfClass(
-            f"the leg of joint '{any_joint(fixed[0])}' is not supported",
-            "it fixed to the platform of a planar mechanism",
+        ),
+        (
+            not spatial and fixed,
+            f"the leg of joint '{fixed[0] if fixed else ''}' fixed to the platform of a planar "
+            "mechanism",
             "a revolute joint there",
-            _NOT_CALIBRATED,
-            path,
-        )
-    if not spatial and any(chain.actuator is not None for chain in chains):
-        raise _plane_of_arms("whose joints at A move on carriages or arms", path)
+            NOT_CALIBRATED,
+        ),
+        (
+            not spatial and on_motors,
+            "a planar machine whose joints at A move on carriages or arms",
+            *_IN_SPACE,
+        ),
+    ):
+        if is_so:
+            raise OutOfClass("this mechanism is not supported", *map(str, problem), path)
 
 
 def _where(*, spatial: bool) -> str:
@@ -590,18 +555,8 @@ def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
         return
     axes = [urdf.poses[joint.child].rotation.apply(joint.axis) for joint in moving]
     if all(parallel(axes[0], axis) for axis in axes):
-        raise _plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path)
-
-
-def _plane_of_arms(kind: str, path: Path) -> OutOfClass:
-    """Return the refusal of a planar machine that has no sliders along its legs."""
-    return OutOfClass(
-        "this mechanism is not supported",
-        f"a planar machine {kind}",
-        "a machine in space, or sliders along the legs",
-        _NOT_CALIBRATED,
-        path,
-    )
+        found = f"a planar machine of arms: all its {len(axes)} axes are parallel"
+        raise OutOfClass("this mechanism is not supported", found, *_IN_SPACE, path)
 
 
 def _check_motors(
@@ -613,35 +568,30 @@ def _check_motors(
     for motor in motors:
         joint = urdf.joints[motor]
         lower, upper = joint.limits or (0.0, 0.0)
+        fault = None
         if motor not in moving and joint.type == "prismatic":
-            problems.add(
-                f"the motor '{motor}' is not supported",
-                "it on no leg",
-                "the slider of a leg",
-                "remove it from name_mot",
-            )
+            fault = "it on no leg", "the slider of a leg", "remove it from name_mot"
         elif motor not in moving:
-            problems.add(
-                f"the motor '{motor}' is not supported",
+            fault = (
                 f"a {joint.type} joint in name_mot that does not stand between the base and an "
                 "arm with rods",
                 "sliders of legs, or joints on the base that carry the joints of rods",
-                f"remove it from name_mot if it has no motor, otherwise {_NOT_CALIBRATED}",
+                f"remove it from name_mot if it has no motor, otherwise {NOT_CALIBRATED}",
             )
         elif joint.type == "continuous":
-            problems.add(
-                f"the motor '{motor}' could not be used",
+            fault = (
                 "a continuous joint",
                 "one with the limits of its readings",
                 "write its type as revolute, with <limit>",
             )
         elif joint.type == "revolute" and max(abs(lower), abs(upper)) > MAX_TURN:
-            problems.add(
-                f"the motor '{motor}' could not be used",
+            fault = (
                 f"the limits {lower:g} to {upper:g} rad",
                 "at most two turns either way",
                 "these look like degrees: write its limits, and its readings, in radian",
             )
+        if fault is not None:
+            problems.add(f"the motor '{motor}' could not be used", *fault)
     problems.raise_if_any(OutOfClass)
 
 
@@ -653,7 +603,7 @@ def _check_frames(machine: Machine) -> None:
     if len(chosen) != n_d:
         where = _where(spatial=machine.spatial)
         needed = f"{n_d} for a mechanism {where}"
-        problems.add(refused, f"{len(chosen)} legs", needed, f"name {n_d} legs")
+        problems.add(refused, ", ".join(chosen), needed, f"name {n_d} legs")
     problems.raise_if_any()
     for side in ("base", "platform"):
         try:
@@ -681,14 +631,16 @@ def _check_reach(machine: Machine) -> None:
     problems.raise_if_any()
 
 
-def _check_length(length: float, words: str, most: float, path: Path) -> None:
+def _check_length(
+    length: float, words: str, path: Path, least: float = 0.0, most: float = MAX_LENGTH
+) -> None:
     """Refuse a length [m] that is most likely in another unit, with *words* for it."""
-    if length > most:
+    if not least <= length <= most:
         raise ModelError(
             "the lengths could not be used",
-            words.format(f"{length:.4g}"),
-            f"at most {most:g} m",
-            _METRES,
+            words.format(f"{length:.4g} m"),
+            f"{least:g} to {most:g} m" if least else f"at most {most:g} m",
+            "write all lengths in metres (are they millimetres?)",
             path,
         )
 
@@ -697,7 +649,7 @@ def _check_spread(machine: Machine) -> None:
     """Check that the joints are within metres of each other, before the search for home."""
     for side, joints in (("base", machine.A_base), ("platform", machine.B_platform)):
         size = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf_path)
+        _check_length(size, f"the joints on the {side} {{}} apart", machine.urdf_path)
 
 
 def _check_unit(machine: Machine) -> None:
@@ -705,25 +657,13 @@ def _check_unit(machine: Machine) -> None:
     path = machine.urdf_path
     lengths = np.linalg.norm(vectors_A_to_B(machine, machine.home), axis=1)
     fixed = np.array([leg.is_fixed_to_platform for leg in machine.legs])
-    odd = np.flatnonzero(~fixed & ((lengths < MIN_LENGTH) | (lengths > MAX_LENGTH)))
-    if len(odd):
-        raise ModelError(
-            "the lengths could not be used",
-            f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
-            "1 mm to 20 m",
-            _METRES,
-            path,
-        )
+    for leg, length in zip(machine.legs, lengths.tolist(), strict=True):
+        if not leg.is_fixed_to_platform:
+            _check_length(length, f"leg '{leg.name}' {{}} long at home", path, MIN_LENGTH)
     for leg in machine.legs:
-        reach = leg.travel[1] - leg.travel[0]
-        if leg.is_motor and not leg.reads_angle and reach > MAX_LENGTH:
-            raise ModelError(
-                f"the travel of leg '{leg.name}' could not be used",
-                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
-                "at most 20 m",
-                "write the limits of its slider in metres (are they millimetres?)",
-                path,
-            )
+        if leg.is_motor and not leg.reads_angle:
+            reach = leg.travel[1] - leg.travel[0]
+            _check_length(reach, f"a travel of {{}} of leg '{leg.name}'", path)
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):
         seen = [(c.link, c.radius, f"along leg '{leg.name}'") for c in leg.cylinders]
         if leg.arm is not None:
@@ -769,7 +709,7 @@ def _check_ties(machine: Machine) -> None:
         if joints == {JointType.SPHERICAL}:
             remedy = (
                 "leave out redundant rods (between the same joints as another, a third one on a "
-                f"motor, those of a fourth arm), otherwise {_NOT_CALIBRATED}"
+                f"motor, those of a fourth arm), otherwise {NOT_CALIBRATED}"
             )
         raise OutOfClass(
             f"the mechanism '{machine.name}' is not supported",

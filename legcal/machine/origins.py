@@ -34,6 +34,13 @@ _ROUNDING = 1e-14  # rotation that counts as none [rad]
 def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
     """Return the new origin of each joint with a number of a leg, and whether it is rotated."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
+    return _moved_origins(handles, machine, legs_in_links(machine, legs))
+
+
+def _moved_origins(
+    handles: Handles, machine: Machine, legs: Sequence[Leg]
+) -> dict[str, tuple[RigidTransform, bool]]:
+    """Return the same for legs in the links of base and platform."""
     origins: dict[str, tuple[RigidTransform, bool]] = {}
     moved = set[str]()  # motors of rods that are done
 
@@ -48,7 +55,7 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
         seen = seen.inv() if handle.is_inverse else seen
         origins[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
-    for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
+    for leg, wanted in zip(machine.legs, legs, strict=True):
         chain = leg.urdf_chain
         at_base, at_platform = _ends(leg, wanted)
         grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
@@ -56,18 +63,17 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
             at_platform = _of_joint(leg, wanted, at_platform, grown[1])
         if chain.slider is not None:
             move(*_at_slider(handles, leg, chain, grown))
-        elif any(grown) and not chain.is_joint:
+        elif not chain.is_joint:
             move(*_in_rod(handles, leg, chain, grown))
         first, last = chain.steps[chain.actuator is not None], chain.steps[-1]
         base, platform = machine.base, machine.platform
         if chain.actuator is not None:
             carried = _carried(leg.actuator, wanted.actuator)
-            if carried.joint not in moved:
-                step, motion = chain.actuator, carried.motion
-                move(handles.of(step, 0, base, leg.name), motion, base)
-                moved.add(carried.joint)
+            if leg.motor_label not in moved:
+                move(handles.of(chain.actuator, 0, base, leg.name), carried, base)
+                moved.add(leg.motor_label)
             base = handles.link(chain.actuator, 1)
-            at_base = carried.onward(leg, wanted, handles.at_zero(chain, machine.base, base))
+            at_base = _onward(carried, leg, wanted, handles.at_zero(chain, machine.base, base))
         move(handles.of(first, 0, base, leg.name), at_base, base)
         move(handles.of(last, 1, platform, leg.name), at_platform, platform)
     return origins
@@ -82,7 +88,7 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
         if arm is None or other is None or chain.actuator is None:
             continue
         T_base_link = handles.at_zero(chain, machine.base, arm.link)
-        carried = _carried(leg.actuator, wanted.actuator).motion
+        carried = _carried(leg.actuator, wanted.actuator)
         before = arm.line.in_frame(T_base_link.inv().as_matrix())
         line = other.line.in_frame(carried.of(T_base_link).inv().as_matrix())
         along = (before.point - line.point) @ line.axis  # the position along the line is arbitrary
@@ -101,17 +107,13 @@ def with_separate_origins(
     Links are added as needed: between a joint and its child link, and for closure frames on links
     that carry other things. Our own layout needs none.
 
-    Raises
-    ------
-    OutOfClass
-        If a leg is welded several times between two of its joints.
+    Raises OutOfClass if a leg is welded several times between two of its joints.
     """
     changed = list(closures)
     while True:
         handles = Handles(urdf, changed, machine.platform_joint)
         try:
-            for leg in machine.legs:
-                _find_all(handles, leg, machine)
+            _moved_origins(handles, machine, machine.legs)
         except NoOriginError as missing:
             patch, names = UrdfPatch(urdf.content), {*urdf.links, *urdf.joints}
             if missing.joint is not None:
@@ -128,19 +130,6 @@ def with_separate_origins(
             urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
             return urdf, changed
-
-
-def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
-    """Check that all origins of a leg can be found."""
-    chain = leg.urdf_chain
-    first, last = chain.steps[0], chain.steps[-1]
-    handles.of(first, 0, machine.base, leg.name)
-    if chain.actuator is not None:
-        arm = handles.link(chain.actuator, 1)
-        handles.of(chain.steps[1], 0, arm, leg.name)
-    handles.of(last, 1, machine.platform, leg.name)
-    if chain.slider is None and not chain.is_joint:
-        _in_rod(handles, leg, chain, (0.0, 0.0))
 
 
 def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
@@ -287,31 +276,24 @@ class Motion:
         return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
 
 
-class _Carried(NamedTuple):
-    """The motion of the motor of a rod in the base link, with its link at reading zero."""
-
-    joint: str
-    motion: Motion
-
-    def onward(self, leg: Leg, wanted: Leg, T_base_arm: RigidTransform) -> Motion:
-        """Return the motion of the joint at A in the arm, after the motion of the motor."""
-        before = self.motion.of(RigidTransform.from_translation(leg.A))
-        axis = leg.base_axis
-        if axis is not None and self.motion.turn is not None:
-            axis = np.asarray(self.motion.turn.apply(axis))
-        A = np.asarray(before.translation)
-        onward = Motion(wanted.A - A, A, _turn(axis, wanted.base_axis))
-        return onward.seen_from(self.motion.of(T_base_arm).inv())
-
-
-def _carried(actuator: Actuator | None, wanted: Actuator | None) -> _Carried:
-    """Return the motion of a motor: its axis onto another, and its point if it turns."""
+def _carried(actuator: Actuator | None, wanted: Actuator | None) -> Motion:
+    """Return the motion of a motor in the base link: its axis, and its point if it turns."""
     if actuator is None or wanted is None:
         raise ValueError("a rod that hangs on a motor has its numbers")
     turn = _turn(actuator.axis, wanted.axis, directed=True)
     shift = wanted.point - actuator.point if actuator.turns else np.zeros(3)
     along = shift @ wanted.axis  # the position along the axis is arbitrary
-    return _Carried(actuator.joint, Motion(shift - along * wanted.axis, actuator.point, turn))
+    return Motion(shift - along * wanted.axis, actuator.point, turn)
+
+
+def _onward(carried: Motion, leg: Leg, wanted: Leg, T_base_arm: RigidTransform) -> Motion:
+    """Return the motion of the joint at A in the arm at reading zero, after that of its motor."""
+    A = np.asarray(carried.of(RigidTransform.from_translation(leg.A)).translation)
+    axis = leg.base_axis
+    if axis is not None and carried.turn is not None:
+        axis = np.asarray(carried.turn.apply(axis))
+    onward = Motion(wanted.A - A, A, _turn(axis, wanted.base_axis))
+    return onward.seen_from(carried.of(T_base_arm).inv())
 
 
 def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:

@@ -346,11 +346,8 @@ def check_virtual_joint(
 ) -> None:
     """Check the virtual joint, if any: it carries the platform from the base as the legs let it.
 
-    Raises
-    ------
-    OutOfClass
-        If it is neither floating nor planar, connects other bodies, or moves in another plane than
-        the legs.
+    Raises OutOfClass if it is neither floating nor planar, connects other bodies, or moves in
+    another plane than the legs.
     """
     if block.platform_joint is None:
         return
