@@ -362,9 +362,22 @@ def assemble(described: Description) -> Assembled:
     legs, problems = [], []
     for j, entry in enumerate(described.legs):
         q = 0.0 if entry.actuator is None else readings[entry.actuator.joint]
-        base_axis, platform_axis = axes = _axes(entry, tangents[j], T, q)
-        problems += wrong_axes(described, entry, u[j], axes)
-        q0, travel = _law(entry, float(lengths[j]))
+        base_axis = platform_axis = tangents[j]
+        if entry.base_axis is not None:
+            turn = (
+                np.eye(3) if entry.actuator is None else entry.actuator.rotations(np.array([q]))[0]
+            )
+            base_axis = np.asarray(turn @ entry.base_axis)
+        if entry.platform_axis is not None:
+            platform_axis = np.asarray(T.rotation.apply(entry.platform_axis))
+        problems += wrong_axes(described, entry, u[j], (base_axis, platform_axis))
+        length, travel = float(lengths[j]), entry.travel
+        q0 = length if entry.kind is LegKind.CONSTANT else 0.0
+        q0 = q0 if entry.offset is None else entry.offset
+        if entry.kind is LegKind.CONSTANT:
+            travel = (0.0, 0.0)
+        elif travel is None:
+            travel = (FREE_TRAVEL[0] * length - q0, FREE_TRAVEL[1] * length - q0)
         numbers = {"travel": travel, "base_axis": base_axis, "platform_axis": platform_axis}
         legs.append(AssembledLeg(**(vars(entry) | numbers), u=u[j], q0=q0, q_home=q))
     _refuse(problems)
@@ -410,27 +423,6 @@ def across_leg(u: Array, outward: Array) -> Array:
     )
     across = across - (across @ u) * u
     return np.asarray(across / np.linalg.norm(across))
-
-
-def _axes(entry: LegEntry, tangent: Array, T: RigidTransform, q: float) -> tuple[Array, Array]:
-    """Return the axes of a leg at base and platform at home, both in the base link."""
-    base = tangent
-    if entry.base_axis is not None:
-        turn = np.eye(3) if entry.actuator is None else entry.actuator.rotations(np.array([q]))[0]
-        base = np.asarray(turn @ entry.base_axis)
-    platform = tangent
-    if entry.platform_axis is not None:
-        platform = np.asarray(T.rotation.apply(entry.platform_axis))
-    return base, platform
-
-
-def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
-    """Return length at reading zero and travel of a leg [m]."""
-    if entry.kind is LegKind.CONSTANT:
-        return length if entry.offset is None else entry.offset, (0.0, 0.0)
-    q0 = 0.0 if entry.offset is None else entry.offset
-    free = (FREE_TRAVEL[0] * length - q0, FREE_TRAVEL[1] * length - q0)
-    return q0, free if entry.travel is None else entry.travel
 
 
 def _base_frame(described: Description, count: int) -> tuple[str, ...]:

@@ -590,8 +590,8 @@ class _Places:
         near_R = R_base.T @ self.poses[:, :, :3] @ self._of_platform
         near = (self.joints.mean(axis=1) - origin) @ R_base
         pairs = zip(sides.base, sides.platform, strict=True)
-        joints = JointType.UNIVERSAL, JointType.SPHERICAL
-        legs = [Leg(*joints, LegKind.ACTUATED, A, B, sides.Middle) for A, B in pairs]
+        ends = JointType.UNIVERSAL, JointType.SPHERICAL
+        legs = [Leg(*ends, LegKind.ACTUATED, A, B, sides.Middle) for A, B in pairs]
         R, t = solve_poses(legs, (0, 2, 4), near_R, near, self.moves, steps=_NEWTON)[:2]
         joints = sides.platform @ np.swapaxes(R, 1, 2) + t[:, None]
         return np.asarray(joints @ R_base.T + origin - self.joints)

@@ -178,9 +178,7 @@ class ClosedChain:
 
     def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
         """Return T_base_frame between two frames at a configuration."""
-        self._place(configuration)
-        M = self._placement(base).actInv(self._placement(frame))
-        return motion_of(M.rotation, M.translation)
+        return motion_of(*self.placement(configuration, base, frame))
 
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
         """Return residual (6,) [m, rad] and Jacobian (6, nv) of holding a frame at a pose.

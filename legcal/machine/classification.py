@@ -126,11 +126,11 @@ def _check_sliders(
 
 def actuator_of(
     chain: LegChain, T_body_base: Array, travel: tuple[float, float], link: str
-) -> Actuator | None:
+) -> Actuator:
     """Return the motor that carries the rod of a chain, in the base link (at T_body_base)."""
     step = chain.actuator
     if step is None:
-        return None
+        raise ValueError("a leg without a motor on the base has no actuator")
     inverse = matrix_inverse(T_body_base)
     point, axis = step.line(0)
     sign = 1.0 if step.is_forward else -1.0  # a joint moves its child
@@ -285,14 +285,15 @@ def _centre(axes: Sequence[Axis], leg: str, within: float) -> Array:
     """Return the point (3,) [m] in which axes meet, the centre of a sphere if there is one."""
     sphere = next((axis for axis in axes if axis.direction is None), None)
     meeting = None if sphere is not None else axes[0].nearest(axes[1])
-    centre = sphere.point if sphere is not None else None if meeting is None else meeting[0]
+    centre = (sphere or axes[0]).point if meeting is None else meeting[0]
+    is_parallel = sphere is None and meeting is None
     for axis in axes if sphere is not None else axes[1:]:
-        miss = math.inf if centre is None else axis.distance(centre)
+        miss = math.inf if is_parallel else axis.distance(centre)
         if miss > within:
             other = f"that of '{axes[0].name}'"
             if sphere is not None:
                 other = f"the centre of {sphere.name}"
-            far = "parallel to" if centre is None else f"{1e3 * miss:.4g} mm from"
+            far = "parallel to" if is_parallel else f"{1e3 * miss:.4g} mm from"
             raise OutOfClass(
                 f"leg '{leg}' could not be classified",
                 f"the axis of '{axis.name}' {far} {other}",

@@ -339,23 +339,26 @@ def least_squares_equations(
     )
 
 
-def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
-    """Return all equations of a machine, with its plane, at poses of its links (no by_local)."""
-    equations = pose_equations(machine.legs, R, t, by_local=False)
-    return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
+def machine_equations(
+    machine: Machine, poses: Array, readings: Array | None = None
+) -> PoseEquations:
+    """Return all equations of a machine, with its plane, at poses of its links (no by_local).
 
-
-def machine_equations_at(machine: Machine, R: Array, t: Array, readings: Array) -> PoseEquations:
-    """Return these equations as residuals at readings of the motors (k, n_motors) [m or rad]."""
-    motors = machine.sign * machine.at_readings(readings)
-    equations = equations_at_readings(machine.legs, R, t, motors)
+    Poses are (k, 3 or 4, 4). With readings of the motors (k, n_motors) [m or rad] the values are
+    residuals there.
+    """
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    if readings is None:
+        equations = pose_equations(machine.legs, R, t, by_local=False)
+    else:
+        motors = machine.sign * machine.at_readings(readings)
+        equations = equations_at_readings(machine.legs, R, t, motors)
     return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
 
 
 def equations_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
     """Return the equations of a machine at one pose."""
-    matrix = T_base_platform.as_matrix()[None]
-    return machine_equations(machine, matrix[:, :3, :3], matrix[:, :3, 3])
+    return machine_equations(machine, T_base_platform.as_matrix()[None])
 
 
 def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:

@@ -46,6 +46,7 @@ from legcal.machine.spanning_tree import (
     closing_frames,
     moving_groups,
     origin_xml,
+    parts_of,
     read_loop_source,
 )
 from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
@@ -282,6 +283,11 @@ def with_held_joints(source: Source) -> Source:
     if not held:
         return source
     _refuse_open_leg(urdf, held, motors, source)
+    shown = ", ".join(f"'{name}'" for name in list(held)[:_SHOWN])
+    shown += f" and {len(held) - _SHOWN} more" * (len(held) > _SHOWN)
+    note = f"the joints {shown} close no loop and are held as drawn."
+    if len(held) == 1:
+        note = f"the joint {shown} closes no loop and is held as drawn."
     robot = urdf.robot()
     for element in robot.findall("joint"):
         joint = held.get(element.get("name", ""))
@@ -292,13 +298,13 @@ def with_held_joints(source: Source) -> Source:
                 element.remove(part)
         element.set("type", "fixed")
         T = joint.T_parent_origin * _motion(joint, source.values.get(joint.name, 0.0))
-        element.append(etree.fromstring(origin_xml(T)))
+        element.append(etree.fromstring(origin_xml(*parts_of(T))))
     return replace(
         source,
         motors=tuple(motor for motor in motors if motor not in held),
         # The travel of sliders was asked for, or not, when the file was read.
         urdf=urdf.edited(robot),
-        notes=(*source.notes, _note(list(held))),
+        notes=(*source.notes, note),
         values={name: value for name, value in source.values.items() if name not in held},
     )
 
@@ -330,17 +336,8 @@ def _refuse_open_leg(
     urdf: Urdf, held: Mapping[str, UrdfJoint], motors: Sequence[str], source: Source
 ) -> None:
     """Refuse a chain with a motor and a passive joint that ends without closing a loop."""
-
-    def beyond(joint: UrdfJoint) -> list[UrdfJoint]:
-        """Return a joint and all joints that it carries."""
-        carried, pending = list[UrdfJoint](), [joint]
-        while pending:
-            carried.append(pending.pop())
-            pending += urdf.below[carried[-1].child]
-        return carried
-
     for joint in held.values():
-        branch = [j for j in beyond(joint) if j.moves]
+        branch = [j for j in urdf.joints_below(joint) if j.moves]
         if any(j.name not in held for j in branch):
             continue  # it carries the mechanism
         driven = [j.name for j in branch if j.name in motors]
@@ -355,14 +352,6 @@ def _refuse_open_leg(
                 f"'{passive[0]}' fixed if the chain is no leg",
                 source.path,
             )
-
-
-def _note(names: Sequence[str]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:_SHOWN])
-    more = f" and {len(names) - _SHOWN} more" * (len(names) > _SHOWN)
-    if len(names) == 1:
-        return f"the joint {shown} closes no loop and is held as drawn."
-    return f"the joints {shown}{more} close no loop and are held as drawn."
 
 
 def completed(source: Source) -> Source:

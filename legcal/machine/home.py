@@ -22,7 +22,6 @@ from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
     machine_equations,
-    machine_equations_at,
 )
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import B_at, Machine, platform_pose, readings_at
@@ -143,7 +142,7 @@ def in_yaml(T: RigidTransform, digits: int = 6) -> str:
     """Return a pose in the notation of models."""
     parts = T.translation, T.rotation.as_quat(canonical=True)
     xyz, quat = (", ".join(f"{x + 0.0:.{digits}g}" for x in part.round(6)) for part in parts)
-    return f"xyz [{xyz}], quat_xyzw [{quat}]"
+    return f"{{xyz: [{xyz}], quat_xyzw: [{quat}]}}"
 
 
 def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:
@@ -181,7 +180,7 @@ def _at_readings(
     unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
 
     def missed(poses: Array) -> PoseEquations:
-        return machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
+        return machine_equations(machine, poses, readings[None])
 
     def exact(poses: Array) -> tuple[Array, Array]:
         rows = missed(poses)
@@ -217,7 +216,7 @@ def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
     near = [project_pose(machine, motion_of(T[:, :3], T[:, 3]), _FAR) for T in poses]
     held = np.array([problem is None for _, problem in near])
     poses = np.array([T.as_matrix()[:3] for T, _ in near])
-    equations = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
+    equations = machine_equations(machine, poses[held])
     constraints = equations.by_pose[:, ~equations.measured]
     n = constraints.shape[1]
     if n == 0 or not held.any():

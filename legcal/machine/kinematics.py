@@ -32,7 +32,7 @@ from legcal.machine.closing import (
 from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
-    machine_equations_at,
+    machine_equations,
     violated_constraint,
 )
 from legcal.machine.model import (
@@ -506,7 +506,7 @@ def equations_of_readings(machine: Machine, readings: Array) -> Equations:
     n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        rows = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
+        rows = machine_equations(machine, poses, readings)
         if machine.is_redundant:
             return least_squares_equations(rows, n_dependent)
         return rows.values, rows.by_pose

@@ -22,7 +22,6 @@ from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.chain import Bodies, ClosedChain, Closure, rigid_bodies
 from legcal.machine.classification import (
-    PERPENDICULAR,
     actuator_of,
     joint_tolerance,
     leg_of,
@@ -50,6 +49,7 @@ from legcal.machine.leg import (
     MAX_RADIUS,
     MIN_LENGTH,
     MIN_RADIUS,
+    PERPENDICULAR,
     EquationKind,
     JointType,
     LegChain,
@@ -286,7 +286,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
 
 def _actuators(
     chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
-) -> dict[str | None, Actuator | None]:
+) -> dict[str | None, Actuator]:
     """Return the actuators by joint, with their numbers from the YAML."""
     stated = {
         chain.motor: actuator_of(
@@ -508,7 +508,7 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
     holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
     fixed = [any_joint(chain) for chain in chains if chain.platform.type is JointType.FIXED]
     on_motors = any(chain.actuator is not None for chain in chains)
-    for is_so, *problem in (
+    for is_so, found, needed, remedy in (
         (
             n < n_d,
             f"{n} {'leg' if n == 1 else 'legs'} {_where(spatial=spatial)}",
@@ -541,7 +541,7 @@ def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
         ),
     ):
         if is_so:
-            raise OutOfClass("this mechanism is not supported", *map(str, problem), path)
+            raise OutOfClass("this mechanism is not supported", found, needed, remedy, path)
 
 
 def _where(*, spatial: bool) -> str:
@@ -601,9 +601,9 @@ def _check_frames(machine: Machine) -> None:
     chosen = [machine.leg_names[j] for j in machine.frame_legs]
     refused, problems = "legcal.base_frame could not be used", Problems(machine.yaml_path)
     if len(chosen) != n_d:
-        where = _where(spatial=machine.spatial)
-        needed = f"{n_d} for a mechanism {where}"
-        problems.add(refused, ", ".join(chosen), needed, f"name {n_d} legs")
+        needed = f"{n_d} for a mechanism {_where(spatial=machine.spatial)}"
+        found = f"{len(chosen)} legs ({', '.join(chosen)})"
+        problems.add(refused, found, needed, f"name {n_d} legs")
     problems.raise_if_any()
     for side in ("base", "platform"):
         try:

@@ -34,9 +34,18 @@ from legcal.machine.spanning_tree import (
     mesh_xml,
     moving_groups,
     origin_xml,
+    parts_of,
     visual_xml,
 )
-from legcal.machine.urdf import MJCF, Urdf, XmlProblems, number_list, parse_urdf, parse_xml
+from legcal.machine.urdf import (
+    MJCF,
+    Urdf,
+    UrdfJointType,
+    XmlProblems,
+    number_list,
+    parse_urdf,
+    parse_xml,
+)
 
 WORLD = "world"
 MAX_PARTS = 5000
@@ -200,13 +209,17 @@ class MjcfReader:
         joints, bodies, visuals = self._contents(inside)
         at, T_at_body = part.body, T_parent_body
         if at == WORLD and self._is_free(joints):
-            self.tree.joint(self._unused(f"{name}_free"), "floating", at, name, T_at_body)
+            self.tree.joint(
+                self._unused(f"{name}_free"), "floating", (at, name), *parts_of(T_at_body)
+            )
             at, joints = name, []
         for i, joint in enumerate(joints):
             only, last = len(joints) == 1, i + 1 == len(joints)
             at, T_at_body = self._joint(joint, at, T_at_body, last=last, only=only)
         if at != name:
-            self.tree.joint(self._unused(f"{name}_fixed"), "fixed", at, name, T_at_body)
+            self.tree.joint(
+                self._unused(f"{name}_fixed"), "fixed", (at, name), *parts_of(T_at_body)
+            )
         self.tree.link(name, visuals)
         return bodies
 
@@ -241,7 +254,7 @@ class MjcfReader:
                     "frees a body that has other joints or is not on the world itself",
                     "a free joint stands alone in a body of <worldbody>",
                 )
-            self.tree.joint(name, "floating", at, part.body, T_at_body)
+            self.tree.joint(name, "floating", (at, part.body), *parts_of(T_at_body))
             return part.body, EYE
         if kind not in ("hinge", "slide", "ball"):
             self.problems.at(
@@ -292,8 +305,9 @@ class MjcfReader:
                 ends = self._radians(limits[0]), self._radians(limits[1])
             limits = ends
         self.references[name] = zero
-        urdf_type = "prismatic" if kind == "slide" else "revolute"
-        self.tree.joint(name, urdf_type, *links, T_at_joint * to_zero, axis, limits)
+        origin = parts_of(T_at_joint * to_zero)
+        urdf_type: UrdfJointType = "prismatic" if kind == "slide" else "revolute"
+        self.tree.joint(name, urdf_type, links, *origin, axis, limits)
 
     def _range(self, element: etree._Element, attributes: Attributes) -> tuple[float, float] | None:
         """Return the limits of a joint, or None."""
@@ -335,7 +349,7 @@ class MjcfReader:
                 "write size, or fromto and size",
             )
             return ""
-        return visual_xml(origin_xml(part.T_body_frame * T), float(size[0]), length)
+        return visual_xml(origin_xml(*parts_of(part.T_body_frame * T)), float(size[0]), length)
 
     def _mesh(self, part: BodyElement, attributes: Attributes) -> str:
         """Return the ``<visual>`` of a mesh that MuJoCo shows (groups 0 to 2), else nothing."""
@@ -353,7 +367,7 @@ class MjcfReader:
         )
         T = part.T_body_frame * self._pose(part.element, attributes) * T_file_mesh.inv()
         file = str(Path(self._mesh_folder) / stated.get("file", ""))
-        return mesh_xml(origin_xml(T), file, np.ones(3) if scale is None else scale)
+        return mesh_xml(origin_xml(*parts_of(T)), file, np.ones(3) if scale is None else scale)
 
     def _between(
         self, element: etree._Element, attributes: Attributes

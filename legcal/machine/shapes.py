@@ -39,7 +39,7 @@ from legcal.machine.chain import Bodies, Connection
 from legcal.machine.classification import joint_tolerance
 from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
 from legcal.machine.meshes import first_hits, mesh_file, mesh_of_file, ray_caster, read_mesh
-from legcal.machine.spanning_tree import origin_xml, visual_xml
+from legcal.machine.spanning_tree import origin_xml, parts_of, visual_xml
 from legcal.machine.urdf import Urdf, number_list, origins_of
 
 PARALLEL = 1e-6
@@ -254,7 +254,7 @@ def with_mesh_cylinders(
 
     With a *radius* [m] each leg without a cylinder of its own gets one of it.
     """
-    axes, parts_of = _axes(legs, bodies, base), _RoundParts(urdf.path, coaxial_tolerance(legs))
+    axes = _axes(legs, bodies, base)
     added: dict[str, list[str]] = {}
     parts: dict[tuple[str, str, float], list[str]] = {}  # legs by mesh, diameter, length
     for link in urdf.robot().findall("link"):
@@ -263,7 +263,7 @@ def with_mesh_cylinders(
             found = [
                 (part, visual)
                 for visual in link.findall("visual")
-                if (part := parts_of.about(visual, bodies.T_body_link[name], axis))
+                if (part := _round_part(urdf.path, visual, bodies.T_body_link[name], axis))
             ]
             if not found:
                 continue
@@ -348,49 +348,25 @@ def _drawn(bodies: Bodies, link: str, axis: Axis, radius: float) -> str:
     middle = axis.origin + 0.5 * (axis.start + axis.end) * axis.along
     turn = rotation_between(np.array([0.0, 0.0, 1.0]), axis.along).as_matrix()
     T = matrix_product(matrix_inverse(bodies.T_body_link[link]), matrix_of(turn, middle))
-    at = origin_xml(RigidTransform.from_matrix(T))
+    at = origin_xml(*parts_of(RigidTransform.from_matrix(T)))
     return visual_xml(at, float(radius), float(axis.end - axis.start))
 
 
-@dataclass(frozen=True, eq=False)
-class _RoundParts:
-    """The cylinders of mesh files; a mesh that occurs several times is cut once.
-
-    Axes that are the same in the frame of the file, up to *within* [m], have the same cylinder.
-    """
-
-    urdf_path: Path
-    within: float
-    # Both ends of an axis, the position of the first on it, and the cylinder, by mesh.
-    known: dict[int, list[tuple[Array, float, tuple[float, float, float] | None]]] = field(
-        default_factory=dict
-    )
-
-    def about(
-        self, visual: etree._Element, T_body_link: Array, axis: Axis
-    ) -> tuple[float, float, float] | None:
-        """Return radius, start and end [m] of the longest cylinder about an axis, or None."""
-        mesh = visual.find("geometry/mesh")
-        if mesh is None or mesh_file(self.urdf_path, mesh.get("filename", "")) is None:
-            return None
-        try:
-            corners, triangles = mesh_of_file(self.urdf_path, visual)
-        except ValueError:  # pictures state the reason
-            return None
-        T = matrix_inverse(matrix_product(T_body_link, origins_of([visual])[0]))
-        origin, along = matrix_applied(T, axis.origin), T[:3, :3] @ axis.along
-        turn = rotation_between(along, np.array([0.0, 0.0, 1.0])).as_matrix()
-        seen = (corners - origin) @ turn.T
-        low = max(axis.start, float(seen[:, 2].min()))
-        high = min(axis.end, float(seen[:, 2].max()))
-        ends = origin + np.array([[low], [high]]) * along
-        fits = self.known.setdefault(id(corners), [])
-        for there, start, part in fits:
-            if np.abs(ends - there).max() <= self.within:
-                shift = low - start
-                return None if part is None else (part[0], part[1] + shift, part[2] + shift)
-        fits.append((ends, low, cylinder_about_z(seen, triangles, low, high)))
-        return fits[-1][2]
+def _round_part(
+    urdf_path: Path, visual: etree._Element, T_body_link: Array, axis: Axis
+) -> tuple[float, float, float] | None:
+    """Return radius, start and end [m] of the longest cylinder of a mesh about an axis, or None."""
+    mesh = visual.find("geometry/mesh")
+    if mesh is None or mesh_file(urdf_path, mesh.get("filename", "")) is None:
+        return None
+    try:
+        corners, triangles = mesh_of_file(urdf_path, visual)
+    except ValueError:  # pictures state the reason
+        return None
+    T = matrix_inverse(matrix_product(T_body_link, origins_of([visual])[0]))
+    turn = rotation_between(T[:3, :3] @ axis.along, np.array([0.0, 0.0, 1.0])).as_matrix()
+    seen = (corners - matrix_applied(T, axis.origin)) @ turn.T
+    return cylinder_about_z(seen, triangles, axis.start, axis.end)
 
 
 def cylinder_about_z(

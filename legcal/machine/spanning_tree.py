@@ -27,6 +27,7 @@ from legcal.machine.urdf import (
     LOOP_TAGS,
     URDF_LOOPS,
     Urdf,
+    UrdfJointType,
     XmlProblems,
     checked_tree,
     number_list,
@@ -55,6 +56,7 @@ class Source:
 
 FULL_TURN = 2.0 * pi
 EYE = RigidTransform.identity()
+ZERO, UNTURNED = np.zeros(3), np.eye(3)
 
 
 @dataclass
@@ -81,35 +83,21 @@ class UrdfBuilder:
     def joint(
         self,
         name: str,
-        kind: str,
-        parent: str,
-        child: str,
-        T_parent_origin: RigidTransform = EYE,
+        kind: UrdfJointType,
+        links: tuple[str, str],  # parent and child
+        xyz: Array = ZERO,
+        rotation: Array = UNTURNED,
         axis: Array | None = None,
         limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
     ) -> None:
-        """Add a joint; ``axis`` and ``limits`` [rad or m] apply to moving joints."""
-        moving = "" if axis is None else axis_xml(axis) + limit_xml(limits)
-        xyz, rotation = np.asarray(T_parent_origin.translation), T_parent_origin.rotation
-        self.connect(name, kind, (parent, child), xyz, rotation.as_matrix(), moving)
-
-    def connect(
-        self,
-        name: str,
-        kind: str,
-        links: tuple[str, str],
-        xyz: Array | None = None,
-        rotation: Array | None = None,
-        moving: str = "",
-    ) -> None:
-        """Connect two links, with XML for axis and limits; frames coincide without numbers."""
+        """Add a joint; ``limits`` [rad or m] apply to one with an axis."""
         parent, child = (_quoted(link) for link in links)
-        at = origin_xml_at(
-            np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
-        )
+        moving = "" if axis is None else f'<axis xyz="{_numbers(axis)}"/>'
+        if axis is not None and kind in ("revolute", "prismatic"):
+            moving += _limit_xml(limits)
         self.joints[name] = (
             f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
-            f"<child link={child}/>{at}{moving}</joint>"
+            f"<child link={child}/>{origin_xml(xyz, rotation)}{moving}</joint>"
         )
 
     def turns(
@@ -128,7 +116,7 @@ class UrdfBuilder:
             if after != child:
                 self.link(after)
             joint = self.unused(f"{name}_{letter}", taken)
-            self.joint(joint, "revolute", parent, after, T_parent_origin, axis)
+            self.joint(joint, "revolute", (parent, after), *parts_of(T_parent_origin), axis)
             parent, T_parent_origin = after, EYE
 
     def body(self) -> str:
@@ -141,21 +129,14 @@ class UrdfBuilder:
         return f"{head}{self.body()}\n</robot>\n".encode()
 
 
-def origin_xml(T_parent_origin: RigidTransform) -> str:
-    """Return the ``<origin>`` of a rigid motion [m, rad]."""
-    return origin_xml_at(
-        np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix()
-    )
+def parts_of(T: RigidTransform) -> tuple[Array, Array]:
+    """Return translation (3,) [m] and rotation matrix of a motion."""
+    return np.asarray(T.translation), T.rotation.as_matrix()
 
 
-def origin_xml_at(xyz: Array, rotation: Array) -> str:
+def origin_xml(xyz: Array, rotation: Array) -> str:
     """Return the ``<origin>`` at a point [m] with a rotation matrix."""
     return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(roll_pitch_yaw(rotation))}"/>'
-
-
-def axis_xml(axis: Array) -> str:
-    """Return the ``<axis>`` of a joint."""
-    return f'<axis xyz="{_numbers(axis)}"/>'
 
 
 def visual_xml(at: str, radius: float, length: float) -> str:
@@ -175,7 +156,7 @@ def box_xml(at: str, sizes: Array) -> str:
     return f'<visual>{at}<geometry><box size="{_numbers(sizes)}"/></geometry></visual>'
 
 
-def limit_xml(limits: tuple[float, float] | None) -> str:
+def _limit_xml(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
     ends = ""
     if limits is not None:
@@ -266,7 +247,9 @@ def close_loops(loops: Sequence[Loop], text: UrdfBuilder, path: Path) -> tuple[C
         for number, (link, T_link_frame) in enumerate(loop.frames, start=1):
             ends.append(text.unused(f"{loop.name}_{number}"))
             text.link(ends[-1])
-            text.joint(text.unused(f"{ends[-1]}_frame"), "fixed", link, ends[-1], T_link_frame)
+            text.joint(
+                text.unused(f"{ends[-1]}_frame"), "fixed", (link, ends[-1]), *parts_of(T_link_frame)
+            )
         closures.append(Closure(loop.kind, (ends[0], ends[1])))
     return tuple(closures)
 

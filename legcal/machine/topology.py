@@ -134,18 +134,17 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
 
     Without *motors* all revolute joints on the base may be motors of arms.
     """
-    urdf, closures, path = source.urdf, source.closures, source.path
-    ends = source.base, source.platform
-    bodies = rigid_bodies(urdf, closures, None)
+    urdf, bodies = source.urdf, rigid_bodies(source.urdf, source.closures, None)
     root, problems = bodies.body_of[urdf.root], list[OutOfClass]()
     blocks = dict[str, LegcalBlock]()
     bases = [root, *_joined_bodies(bodies, urdf, root)]
-    if ends[0] is not None:
-        bases = [bodies.body_of[ends[0]]]
+    if source.base is not None:
+        bases = [bodies.body_of[source.base]]
     for base in bases:
-        on_base = motors_on(bodies, base) if motors is None else motors
         try:
-            blocks[base] = _block_on(base, urdf, closures, on_base, path, ends)
+            blocks[base] = _block_on(
+                base, source, motors_on(bodies, base) if motors is None else motors
+            )
         except OutOfClass as error:
             problems.append(error)
         if root in blocks:
@@ -157,7 +156,7 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
             f"legs between several pairs of links, with the base {pairs}",
             "one",
             urdf.wording.state_ends,
-            path,
+            source.path,
         )
     if not blocks:
         raise problems[0]
@@ -180,53 +179,43 @@ def motors_on(bodies: Bodies, base: str) -> list[str]:
     ]
 
 
-def _block_on(
-    base: str,
-    urdf: Urdf,
-    closures: Sequence[Closure],
-    motors: Sequence[str],
-    path: Path,
-    ends: tuple[str | None, str | None],
-) -> LegcalBlock:
+def _block_on(base: str, source: Source, motors: Sequence[str]) -> LegcalBlock:
     """Return the default block ``legcal`` with a body as the base."""
-    virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
+    urdf, closures = source.urdf, source.closures
     bodies = rigid_bodies(urdf, closures, None)
-    real = replace(bodies, connections=tuple(c for c in bodies.connections if not c.is_virtual))
-    carried = [bodies.body_of[j.child] for j in virtual]
-    root = bodies.body_of[urdf.root]
-    base_link = ends[0] or urdf.root
-    if ends[0] is None and (base != root or not _is_used(urdf, closures, urdf.root)):
+    root, base_link = bodies.body_of[urdf.root], source.base or urdf.root
+    if source.base is None and (base != root or not _is_used(urdf, closures, urdf.root)):
         base_link = _main_link(urdf, closures, bodies, base)
-    if ends[1] is None:
-        platform = _platform_body(real, base, base_link, carried, urdf, path, motors)
+    if source.platform is None:
+        platform = _platform_body(bodies, base, base_link, source, motors)
     else:
-        platform = bodies.body_of[ends[1]]
-    carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
-        base, platform}]  # fmt: skip
-    joint = carrier[0].name if carrier else None
-    link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
-    link = ends[1] or link
+        platform = bodies.body_of[source.platform]
+    carrier = next(
+        (c for c in bodies.connections if c.is_virtual and {*c.bodies} == {base, platform}), None
+    )
+    joint = None if carrier is None else carrier.joint
+    link = source.platform or (
+        _main_link(urdf, closures, bodies, platform) if joint is None else urdf.joints[joint].child
+    )
     bodies = rigid_bodies(urdf, closures, joint)
     chains = in_order(find_chains(bodies, urdf, base_link, link, motors), motors, urdf)
     needed = n_frame_legs(spatial=plane_of_motion(chains) is None)
-    if len(chains) < needed and base != root and ends[0] is None:
+    if len(chains) < needed and base != root and source.base is None:
         raise OutOfClass(
             "this is not a platform on legs",
             f"{len(chains)} legs on link '{base_link}'",
             f"at least {needed}",
             urdf.wording.state_ends,
-            path,
+            source.path,
         )
     joints = [distinct_joint(chain) for chain in chains]
-    names = _leg_names(joints)
-    block = LegcalBlock(
+    return LegcalBlock(
         version=1,
         base=base_link,
         platform=link,
         platform_joint=joint,
-        legs=dict(zip(names, joints, strict=True)),
+        legs=dict(zip(_leg_names(joints), joints, strict=True)),
     )
-    return block.model_copy(update={"base_frame": propose_frame(names, chains)})
 
 
 def _is_used(urdf: Urdf, closures: Sequence[Closure], link: str) -> bool:
@@ -511,16 +500,12 @@ def _normals(chain: LegChain) -> Normals | None:
 
 
 def _platform_body(
-    bodies: Bodies,
-    base: str,
-    base_link: str,
-    carried: Sequence[str],
-    urdf: Urdf,
-    path: Path,
-    motors: Sequence[str],
+    bodies: Bodies, base: str, base_link: str, source: Source, motors: Sequence[str]
 ) -> str:
     """Return the body where the legs end: every chain from the base to it is a supported leg."""
-    at: dict[str, list[str]] = {}
+    urdf, path, at = source.urdf, source.path, dict[str, list[str]]()
+    carried = {c.bodies[1] for c in bodies.connections if c.is_virtual}
+    bodies = replace(bodies, connections=tuple(c for c in bodies.connections if not c.is_virtual))
     for connection in bodies.connections:
         for here, there in (connection.bodies, connection.bodies[::-1]):
             at.setdefault(here, []).append(there)

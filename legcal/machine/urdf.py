@@ -371,6 +371,14 @@ class Urdf:
             link = joints[-1].parent
         return joints
 
+    def joints_below(self, joint: UrdfJoint) -> list[UrdfJoint]:
+        """Return a joint and all joints that it carries."""
+        carried, pending = list[UrdfJoint](), [joint]
+        while pending:
+            carried.append(pending.pop())
+            pending += self.below[carried[-1].child]
+        return carried
+
     def robot(self) -> etree._Element:
         """Return the ``<robot>`` element, which may be changed for :meth:`edited`."""
         return parse_robot(self.path, self.content)
