@@ -39,14 +39,8 @@ from legcal.version import __version__
 
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 TO_FILE = np.array([1e3] * 3 + [float(np.degrees(1.0))] * 3)
-DEFAULT_NODES = {
-    1: 21,
-    2: 21,
-    3: 11,
-    4: 7,
-    5: 5,
-    6: 4,
-}  # nodes per coordinate by number of freedoms, at most 4,096 in total
+# Nodes per coordinate by number of freedoms, at most 4,096 in total.
+DEFAULT_NODES = {1: 21, 2: 21, 3: 11, 4: 7, 5: 5, 6: 4}
 MAX_ROWS = 300_000
 TESTED = 1000  # largest number of cells in whose middle the table is tested
 SHRINKING, ATTEMPTS = 0.8, 20  # factor of the grid size until all nodes are in the travel, attempts

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -142,7 +142,7 @@ class _Mounted:
     def _columns(self) -> list[int]:
         legs = self.machine.legs
         return [
-            next(j for j, leg in enumerate(legs) if _joint(leg.actuator) == actuator.joint)
+            next(j for j, leg in enumerate(legs) if leg.motor_label == actuator.joint)
             for actuator in self.actuators
         ]
 
@@ -192,10 +192,6 @@ class _Mounted:
         return replace(self, start=raised, lift=lift)
 
 
-def _joint(actuator: Actuator | None) -> str | None:
-    return None if actuator is None else actuator.joint
-
-
 def _upwards(machine: Machine) -> Array:
     """Return the direction (3,) along the towers, or the axis of the arms, from the platform up."""
     axes = np.array([actuator.axis for actuator in machine.actuators])
@@ -218,7 +214,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
     home = machine.home.rotation.as_matrix()
     rows = []
     for actuator in dict.fromkeys(machine.actuators):
-        rods = [j for j, leg in enumerate(machine.legs) if _joint(leg.actuator) == actuator.joint]
+        rods = [j for j, leg in enumerate(machine.legs) if leg.motor_label == actuator.joint]
         A = machine.A_base[rods].mean(axis=0)
         B = home @ machine.B_platform[rods].mean(axis=0)
         rod = float(np.mean([machine.legs[j].q0 for j in rods]))
@@ -262,8 +258,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
     return mounted.over_bed()
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
+class _Row(NamedTuple):
     """A tower in the frame of a firmware [mm or deg]."""
 
     actuator: Actuator
@@ -278,23 +273,22 @@ class _Row:
     @classmethod
     def of(cls, actuator: Actuator, A: Array, B: Array, rod: float, frame: Array) -> _Row:
         """Return the tower of a motor with A at reading 0, both joints in the frame [m]."""
-        axis, point = actuator.axis @ frame, actuator.point @ frame
-        if not actuator.turns:
-            sign = 1.0 if axis[2] > 0.0 else -1.0
-            top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
-            at_top = A + actuator.gain * top * axis
-            height = _MM * (at_top[2] - B[2])
-            return cls(actuator, _MM * (at_top - B)[:2], _MM * rod, 0.0, 0.0, height, top, sign)
-        shaft = point + ((A - point) @ axis) * axis
-        across = (shaft - B)[:2]
-        outwards = np.array([*across, 0.0]) / np.linalg.norm(across)
-        arm = A - shaft
-        sign = 1.0 if cross(axis, outwards)[2] > 0.0 else -1.0
+        axis, point, upwards = actuator.axis @ frame, actuator.point @ frame, actuator.axis @ frame
+        shaft = A  # of a carriage there is none
+        if actuator.turns:
+            shaft = point + ((A - point) @ axis) * axis
+            upwards = cross(axis, (shaft - B) * [1.0, 1.0, 0.0])
+        sign = 1.0 if upwards[2] > 0.0 else -1.0
         top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
-        at_zero = float(np.arctan2(arm[2], arm @ outwards))
-        stop = float(np.degrees(at_zero + sign * actuator.gain * top))
-        length, height = float(np.linalg.norm(arm)), float(shaft[2] - B[2])
-        return cls(actuator, _MM * across, _MM * rod, _MM * length, _MM * height, stop, top, sign)
+        across, arm, height = (shaft - B)[:2], A - shaft, float(shaft[2] - B[2])
+        if actuator.turns:
+            at_zero = np.arctan2(arm[2], arm[:2] @ across / np.linalg.norm(across))
+            stop = float(np.degrees(at_zero + sign * actuator.gain * top))
+        else:
+            across = across + actuator.gain * top * axis[:2]
+            stop, height = _MM * (height + actuator.gain * top * float(axis[2])), 0.0
+        length = _MM * float(np.linalg.norm(arm))
+        return cls(actuator, _MM * across, _MM * rod, length, _MM * height, stop, top, sign)
 
 
 def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:

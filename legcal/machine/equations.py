@@ -16,7 +16,7 @@ the equations of all rods on an actuator determines its reading, the others are 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -190,14 +190,10 @@ def equations_at_readings(
     wanted = np.where(equations.measured, lengthening[:, equations.leg], 0.0)
     is_read = np.isfinite(wanted)
     hangs = np.array(on)[equations.leg] >= 0
-    return PoseEquations(
-        np.where(is_read, equations.values - np.where(hangs, 0.0, wanted), 0.0),
-        equations.by_pose * is_read[..., None],
-        equations.by_local,
-        equations.leg,
-        equations.kinds,
-        equations.measured,
-        equations.by_q,
+    return replace(
+        equations,
+        values=np.where(is_read, equations.values - np.where(hangs, 0.0, wanted), 0.0),
+        by_pose=equations.by_pose * is_read[..., None],
     )
 
 

@@ -26,7 +26,6 @@ from legcal.machine.equations import (
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import B_at, Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
-from legcal.machine.rods import actuator_index
 from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
 
@@ -253,26 +252,20 @@ def check_home_travel(machine: Machine) -> None:
     Raises ModelError if an actuated leg is outside its travel by more than the travel itself and by
     more than 1 % of its length, or a motor that carries rods by more than its travel.
     """
-    far: dict[int, float] = {}
-    q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)
+    far: dict[str, tuple[float, int]] = {}  # by motor, on which several rods may hang
+    q = readings_at(machine, machine.home)
     for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
-        if leg.actuator is not None:  # rods may share an actuator
-            is_far = actuators[j] not in {actuators[k] for k in far}
-        else:
-            allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
-            is_far = leg.kind is LegKind.ACTUATED and excess > allowed
-        if is_far:
-            far[j] = excess
+        allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j])) * (leg.actuator is None)
+        if leg.is_motor and excess > allowed:
+            far.setdefault(leg.motor_label, (excess, j))
     if not far:
         return
-    worst = max(far, key=lambda j: far[j])
+    _, worst = max(far.values(), key=lambda one: one[0])
     leg = machine.legs[worst]
-    others = ""
-    if len(far) > 1:
-        thing = "leg" if leg.actuator is None else "motor"
-        more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
-        others = f" ({len(far) - 1} more {more} as far off)"
+    thing = "leg" if leg.actuator is None else "motor"
+    more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
+    others = f" ({len(far) - 1} more {more} as far off)" * (len(far) > 1)
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
         "legcal.home could not be used",
@@ -301,7 +294,6 @@ def legs_outside(machine: Machine, share: float = 0.0) -> dict[int, float]:
     for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         excess = max(lower - float(q[j]), float(q[j]) - upper)
-        moves = leg.kind is not LegKind.CONSTANT or leg.actuator is not None
-        if moves and excess > share * (upper - lower):
+        if leg.has_value and excess > share * (upper - lower):
             excess_of[j] = excess
     return excess_of

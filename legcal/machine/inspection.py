@@ -328,16 +328,16 @@ def _motor_notes(machine: Machine) -> list[str]:
 
 def _spin_notes(machine: Machine) -> list[str]:
     """Return notes on idle spins: legs with an S joint at both ends, redundant revolutes."""
-    notes = []
+    notes, legs = [], machine.legs
     n_spinning = sum(
-        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
+        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in legs
     )
     if n_spinning:
-        legs, spin = "1 leg has", "spins about itself"
+        who = "1 leg has an S joint at both ends and spins about itself"
         if n_spinning > 1:
-            legs, spin = f"{n_spinning} legs have", "spin about themselves"
-        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
-    others = sum(leg.idle_spins for leg in machine.legs) - n_spinning
+            who = f"{n_spinning} legs have an S joint at both ends and spin about themselves"
+        notes.append(f"{who}; this is not counted as mobility.")
+    others = sum(leg.idle_spins for leg in legs) - n_spinning
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
         notes.append(

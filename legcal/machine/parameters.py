@@ -479,6 +479,14 @@ def sparse_basis(basis: Array) -> Array:
 
 
 _MAX_GROUPS = 4  # groups of joints named in one direction
+_OF_ACTUATOR = {
+    "direction": ("direction", "directions"),
+    "axis": ("axis", "axes"),
+    "axis_point": ("place of the axis", "places of the axes"),
+    "arm_axis": ("direction of the arm", "directions of the arms"),
+    "arm_point": ("place of the arm", "places of the arms"),
+    "gain": ("gain", "gains"),
+}
 _NOUN = {
     "base": ("base joint", "base joints"),
     "platform": ("platform joint", "platform joints"),
@@ -490,16 +498,9 @@ _NOUN = {
     "radius": ("radius of leg", "radii of legs"),
     "board": ("size of the board on", "sizes of the boards on"),
     "": ("camera", "cameras"),
+    **{kind: (f"{what} of", f"{several} of") for kind, (what, several) in _OF_ACTUATOR.items()},
 }
 _BOARDS = {"board.scale": "the base", "platform_board.scale": "the platform"}
-_NOUN_OF_ACTUATOR = {
-    "direction": ("direction of", "directions of"),
-    "axis": ("axis of", "axes of"),
-    "axis_point": ("place of the axis of", "places of the axes of"),
-    "arm_axis": ("direction of the arm of", "directions of the arms of"),
-    "arm_point": ("place of the arm of", "places of the arms of"),
-    "gain": ("gain of", "gains of"),
-}
 
 
 def list_in_words(words: Sequence[str]) -> str:
@@ -543,14 +544,14 @@ def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> 
     groups: dict[tuple[str, str], list[str]] = {}
     for (kind, owner), letters in coordinates.items():
         axes = list_in_words(sorted(letters))
-        if kind == "radius" or kind in _NOUN_OF_ACTUATOR:  # tube and rod, two angles
+        if kind == "radius" or kind in _OF_ACTUATOR:  # tube and rod, two angles
             axes = ""
         elif kind.endswith("_axis"):
             axes = f"angle{'s' * (len(letters) > 1)} {axes}"
         groups.setdefault((kind, axes), []).append(owner)
     phrases = []
     for (kind, axes), owners in groups.items():
-        noun = (_NOUN | _NOUN_OF_ACTUATOR)[kind][len(owners) > 1]
+        noun = _NOUN[kind][len(owners) > 1]
         labels = leg_labels(leg_names)
         legs = [labels[name] for name in leg_names if name in owners]
         ordered = [*legs, *(owner for owner in owners if owner not in leg_names)]
@@ -572,6 +573,6 @@ def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
     parameter = ParameterId.parse(name)
     if parameter.owner in leg_names and parameter.kind in _NOUN:
         return parameter.owner, parameter.kind, parameter.component
-    if parameter.kind in _NOUN_OF_ACTUATOR:
+    if parameter.kind in _OF_ACTUATOR:
         return parameter.owner, parameter.kind, ""
     return parameter.owner, "", parameter.kind

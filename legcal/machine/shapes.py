@@ -576,6 +576,12 @@ class Occluder:
         return np.unique(np.round(planes, 12), axis=0)
 
     @property
+    def is_flat(self) -> bool:
+        """Whether it has no volume."""
+        middle = self.corners.mean(axis=0)
+        return bool(np.linalg.svd(self.corners - middle, compute_uv=False)[-1] <= EMPTY)
+
+    @property
     def leg(self) -> int:
         """The leg that carries it, or -1."""
         return self.carrier.leg if isinstance(self.carrier, LegHalf) else -1
@@ -781,7 +787,7 @@ def occluders_of(
     """Return the occluders of a file: all visuals that are not measured and can be placed."""
     base, platform = ends
     places = _places(legs, bodies, base, platform, normals)
-    occluders = []
+    occluders = list[Occluder]()
     for solid in shown:
         body = bodies.body_of[solid.link]
         if body not in places:
@@ -795,8 +801,8 @@ def occluders_of(
             prismatic = prismatic_part(corners, solid.triangles)
             if prismatic is not None and _surrounds(whole, prismatic):
                 parts.append(Occluder(solid.link, carrier, prismatic))
-        occluders += [swept for swept in map(_swept, parts) if not _is_flat(swept)]
-    return tuple(occluders)
+        occluders += map(_swept, parts)
+    return tuple(occluder for occluder in occluders if not occluder.is_flat)
 
 
 def _surrounds(mesh: Occluder, prismatic: Array) -> bool:
@@ -804,12 +810,6 @@ def _surrounds(mesh: Occluder, prismatic: Array) -> bool:
     low, high = prismatic[:, 2].min(), prismatic[:, 2].max()
     closed = sum(max(0.0, min(b, high) - max(a, low)) for a, b in _enclosed(mesh, 0.0))
     return bool(closed > 0.5 * (high - low))
-
-
-def _is_flat(occluder: Occluder) -> bool:
-    corners = occluder.corners
-    extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
-    return bool(extent[-1] <= EMPTY)
 
 
 def _swept(occluder: Occluder) -> Occluder:
