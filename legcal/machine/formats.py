@@ -21,6 +21,7 @@ from typing import cast
 
 import numpy as np
 from lxml import etree
+from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
@@ -48,7 +49,7 @@ from legcal.machine.spanning_tree import (
     parts_of,
     read_loop_source,
 )
-from legcal.machine.topology import find_chains, motors_on, propose_block
+from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
     LOOP_TAGS,
     NO_BLOCK,
@@ -370,7 +371,9 @@ def completed(source: Source) -> Source:
         if joint.type == "prismatic" and joint.limits is None
     ]
     off = _loop_error(chain, start)
-    if not sliders and closed is not None and off > CLOSED:
+    if sliders and closed is not None and off > CLOSED:
+        configuration = closed = _levelled(chain, closed, source, unit)
+    elif closed is not None and off > CLOSED:
         configuration = closed = _at_drawn_motors(chain, closed, start, source, unit)
     poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
     size = float(np.ptp([pose.translation for pose in poses.values()], axis=0).max())
@@ -407,6 +410,51 @@ def _at_drawn_motors(
 
     there = _solved(chain, equations, closed, unit)
     return closed if there is None else there
+
+
+def _levelled(chain: ClosedChain, configuration: Array, source: Source, unit: Array) -> Array:
+    """Return a closed configuration with a level platform, or the given one if there is none.
+
+    A file without a closed drawing and without slider limits leaves the pose undetermined. Among
+    the level poses the one with sliders nearest to their drawn positions is taken.
+    """
+    urdf = source.urdf
+    try:
+        block = propose_block(source, source.motors)
+    except OutOfClass:
+        return configuration  # refused later
+    bodies = rigid_bodies(urdf, source.closures, block.platform_joint)
+    motors = source.motors
+    chains = find_chains(bodies, urdf, block.base, block.platform, motors)
+    A, B = (
+        np.array(points) @ bodies.T_body_link[link][:3, :3]
+        for link, points in (
+            (block.base, [leg.A for leg in chains]),
+            (block.platform, [leg.B_platform for leg in chains]),
+        )
+    )
+    level = RigidTransform.from_rotation(level_rotation(A, B))
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        turned, by_joints = chain.welded(block.base, block.platform, level)
+        rows = np.concatenate([residual, turned[3:]]), np.concatenate([jacobian, by_joints[3:]])
+        return rows[0][None], rows[1][None]
+
+    closed = _solved(chain, equations, configuration, unit)
+    if closed is None:
+        return configuration
+    sliders = [name for name, joint in urdf.joints.items() if joint.type == "prismatic"]
+    values = [chain.q_index(name) for name in sliders]
+    rates = [chain.v_index(name) for name in sliders]
+    for _ in range(STEPS):
+        free = null_space(equations(closed[None])[1][0], rcond=1e-9)
+        step = -free @ np.linalg.lstsq(free[rates], closed[values], rcond=1e-6)[0]
+        nearer = _solved(chain, equations, chain.integrate(closed, _shortened(step, unit)), unit)
+        if nearer is None or np.linalg.norm(nearer[values]) >= np.linalg.norm(closed[values]):
+            break
+        closed = nearer
+    return closed
 
 
 def closed_near(
