@@ -23,7 +23,9 @@ from legcal.machine.equations import PoseEquations, posture_constraints
 from legcal.machine.leg import (
     LINKS,
     MAX_LENGTH,
+    MAX_RADIUS,
     MIN_LENGTH,
+    MIN_RADIUS,
     EquationKind,
     JointType,
     Leg,
@@ -214,18 +216,12 @@ def wrong_sizes(described: Description) -> list[str]:
         ]
     for leg in described.legs:
         for end in leg.travel or (0.0,):
-            length = None if leg.offset is None else leg.offset + end
-            if length is not None and not MIN_LENGTH <= length <= MAX_LENGTH:
-                return [_out_of_proportion(described, leg.name, length)]
-    problems = []
+            if leg.offset is not None:
+                _check_length(described, f"leg '{leg.name}'", "a length of", leg.offset + end)
     for side, joints in zip(LINKS, _joints(described), strict=True):
         reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        if reach > MAX_LENGTH:
-            problems.append(
-                f"{described.source}: the {side} joints could not be used: found them "
-                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
-                f"{MAX_LENGTH:g} m; {_about_the_unit(described.unit, too_long=True)}."
-            )
+        _check_length(described, f"the {side} joints", "them apart by", reach, least=0.0)
+    problems = []
     for leg in described.legs:
         motor = leg.actuator
         if motor is None or not motor.turns:
@@ -245,8 +241,14 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        if not MIN_LENGTH <= length <= MAX_LENGTH:
-            return [_out_of_proportion(described, leg.name, float(length))]
+        _check_length(described, f"leg '{leg.name}'", "a length of", float(length))
+        for radius in (leg.tube, leg.rod):
+            if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
+                return [
+                    f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
+                    f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
+                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
+                ]
         if leg.kind is LegKind.CONSTANT or leg.travel is None:
             continue
         q0 = leg.offset or 0.0
@@ -265,24 +267,25 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     return problems
 
 
-def _out_of_proportion(described: Description, leg: str, length: float) -> str:
-    """Return the problem of an implausible leg length."""
-    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
-    return (
-        f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
-        f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
+def _check_length(
+    described: Description, what: str, found: str, length: float, least: float = MIN_LENGTH
+) -> None:
+    """Refuse a length [m] that is most likely in another unit."""
+    if least <= length <= MAX_LENGTH:
+        return
+    unit, remedy = described.unit, "check the numbers and the unit"
+    if length <= 0.0:
+        remedy = "correct its joints, offset or travel (length = offset + reading)"
+    elif unit == ("m" if length > MAX_LENGTH else "mm"):
+        other = "mm" if unit == "m" else "m"
+        remedy = f"these look like {other} values where {unit} are stated: check the unit"
+    raise ModelError(
+        f"{what} could not be used",
+        f"{found} {length:.4g} m with lengths in {unit}",
+        f"{least:g} to {MAX_LENGTH:g} m",
+        remedy,
+        described.source,
     )
-
-
-def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
-    """Return the remedy for implausible sizes."""
-    if not positive:
-        return "correct its joints, offset or travel (length = offset + reading)"
-    if unit == "m" and too_long:
-        return "these look like mm values where m are stated: check the unit"
-    if unit == "mm" and not too_long:
-        return "these look like m values where mm are stated: check the unit"
-    return "check the numbers and the unit"
 
 
 def wrong_axes(
@@ -322,11 +325,6 @@ class AssembledLeg(LegEntry):
     u: Array  # (3,) direction from A to B at home, in the base link
     q0: float  # length at reading zero, or of a constant leg [m]
     q_home: float  # the reading of the motor that carries A at home [m or rad]
-
-    @property
-    def shortest_shown(self) -> float:
-        """The length at reading zero, or at the reading nearest to it within the travel [m]."""
-        return self.q0 + min(max(0.0, self.travel[0]), self.travel[1])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -429,6 +427,14 @@ def _base_frame(described: Description, count: int) -> tuple[str, ...]:
     """Return the legs that define frames: as given, or 1, 3, 5 of six, or the first possible."""
     legs = described.legs
     if described.base_frame is not None:
+        names = [leg.name for leg in legs]
+        named = [names.index(name) for name in described.base_frame]
+        if len(named) != count or _degenerate(described, named):
+            raise ModelError(
+                f"{described.source}: base_frame could not be used: found "
+                f"{', '.join(described.base_frame)}, needed {count} legs whose joints on base and "
+                "platform are not in one point or on one line; choose others, or leave it out."
+            )
         return described.base_frame
     combos = list(combinations(range(len(legs)), count))
     if len(legs) == 6 and count == 3:

@@ -544,7 +544,9 @@ def _half(leg: AssembledLeg, *, near: bool, from_base: bool) -> str:
     radius = leg.tube if near == from_base else leg.rod
     if radius is None:
         return ""
-    length = leg.q0 if leg.kind is LegKind.CONSTANT else VISIBLE * leg.shortest_shown
+    length, (low, high) = leg.q0, leg.travel
+    if leg.kind is not LegKind.CONSTANT:  # at reading zero, or the one nearest to it in the travel
+        length = VISIBLE * (leg.q0 + min(max(0.0, low), high))
     end = length if near else -length
     return visual_xml(f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>', radius, length)
 
