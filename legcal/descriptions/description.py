@@ -216,12 +216,13 @@ def wrong_sizes(described: Description) -> list[str]:
         ]
     for leg in described.legs:
         for end in leg.travel or (0.0,):
-            if leg.offset is not None:
-                _check_length(described, f"leg '{leg.name}'", "a length of", leg.offset + end)
+            length = MIN_LENGTH if leg.offset is None else leg.offset + end
+            if problems := _wrong_length(described, f"leg '{leg.name}'", "a length of", length):
+                return problems
+    problems = list[str]()
     for side, joints in zip(LINKS, _joints(described), strict=True):
         reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        _check_length(described, f"the {side} joints", "them apart by", reach, least=0.0)
-    problems = []
+        problems += _wrong_length(described, f"the {side} joints", "them apart by", reach, 0.0)
     for leg in described.legs:
         motor = leg.actuator
         if motor is None or not motor.turns:
@@ -241,7 +242,8 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        _check_length(described, f"leg '{leg.name}'", "a length of", float(length))
+        if wrong := _wrong_length(described, f"leg '{leg.name}'", "a length of", float(length)):
+            return wrong
         for radius in (leg.tube, leg.rod):
             if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [
@@ -267,25 +269,22 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     return problems
 
 
-def _check_length(
+def _wrong_length(
     described: Description, what: str, found: str, length: float, least: float = MIN_LENGTH
-) -> None:
-    """Refuse a length [m] that is most likely in another unit."""
+) -> list[str]:
+    """Return the problem of a length [m] that is most likely in another unit, or none."""
     if least <= length <= MAX_LENGTH:
-        return
+        return []
     unit, remedy = described.unit, "check the numbers and the unit"
     if length <= 0.0:
         remedy = "correct its joints, offset or travel (length = offset + reading)"
     elif unit == ("m" if length > MAX_LENGTH else "mm"):
         other = "mm" if unit == "m" else "m"
         remedy = f"these look like {other} values where {unit} are stated: check the unit"
-    raise ModelError(
-        f"{what} could not be used",
-        f"{found} {length:.4g} m with lengths in {unit}",
-        f"{least:g} to {MAX_LENGTH:g} m",
-        remedy,
-        described.source,
-    )
+    return [
+        f"{described.source}: {what} could not be used: found {found} {length:.4g} m with lengths "
+        f"in {unit}, needed {least:g} to {MAX_LENGTH:g} m; {remedy}."
+    ]
 
 
 def wrong_axes(
