@@ -37,6 +37,7 @@ from legcal.machine.configurations import random_poses, workspace
 from legcal.machine.kinematics import poses_at_readings
 from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
+from legcal.machine.picture import round_length
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
 from legcal.version import __version__
 
@@ -393,9 +394,7 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
     middle = 0.5 * (nozzle.min(axis=0) + nozzle.max(axis=0))
     scale = (side - 2.0 * edge) / max(float(np.ptp(nozzle[:, :2], axis=0).max()), 1e-6)
     most = max(float(np.linalg.norm(errors, axis=1).max()) for _, errors in panels)
-    power = 10.0 ** np.floor(np.log10(max(most, 1e-6)))
-    lengths = power * np.array([1.0, 2.0, 5.0])
-    longest = float(lengths[lengths <= max(most, power)].max())
+    longest = round_length(max(most, 1e-6))
     magnified = 30.0 / longest
     for k, (label, errors) in enumerate(panels):
         at = np.array([side * (k + 0.5), 0.5 * side])
