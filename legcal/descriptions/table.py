@@ -495,12 +495,10 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
         if motor is not None:
             moves = ActuatorKind.REVOLUTE if actuators[motor].turns else ActuatorKind.PRISMATIC
         if moves is not type_.actuator:
-            found, needed = (
-                f"no motor that it hangs on and the type {type_}",
-                (
-                    "actuators and hangs_on (in a CSV a column 'rail') for types that begin with the "
-                    "motor of a rod (PSS, RSS, PRS)"
-                ),
+            found = f"no motor that it hangs on and the type {type_}"
+            needed = (
+                "actuators and hangs_on (in a CSV a column 'rail') for types that begin with the "
+                "motor of a rod (PSS, RSS, PRS)"
             )
             if moves is not None:
                 how, letter = ("slides", "P") if moves == "prismatic" else ("turns", "R")

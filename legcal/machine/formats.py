@@ -237,9 +237,8 @@ def rotation_letters(kind: str) -> str | None:
 
 def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
     """Replace the stand-in joints of a URDF; return the frames that they carried."""
-    text = UrdfBuilder(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
     elements = {e.get("name"): e for e in robot if e.tag == "joint"}
-    replaced = {}
+    replaced, taken = {}, {*urdf.links, *urdf.joints}
     for name, kind in zip(file.joint_name, file.joint_type, strict=True):
         element, joint = elements[name], urdf.joints[name]
         if kind == "FIXED":
@@ -247,15 +246,11 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
             continue
         replaced[name] = joint.child
         axes = {letter: _AXES[letter] for letter in str(rotation_letters(kind))}
-        there = len(text.links), len(text.joints)
+        text = UrdfBuilder(taken=taken)
         text.turns(name, joint.parent, joint.child, joint.T_parent_origin, axes)
         at = robot.index(element)
-        robot.remove(element)
-        lines = [*text.links.values()][there[0] :] + [*text.joints.values()][there[1] :]
-        for line in reversed(lines):
-            new = etree.fromstring(line)
-            new.tail = "\n"
-            robot.insert(at, new)
+        robot[at : at + 1] = text.elements()
+        taken |= text.links.keys() | text.joints.keys()
     return replaced
 
 

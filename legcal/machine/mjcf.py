@@ -121,12 +121,12 @@ class MjcfReader:
 
     def __init__(self, root: etree._Element, problems: XmlProblems) -> None:
         self.root, self.problems = root, problems
-        self.tree = UrdfBuilder()
+        self._names: set[str] = set()  # taken names of links and joints
+        self.tree = UrdfBuilder(taken=self._names)
         self.poses: dict[str, RigidTransform] = {WORLD: EYE}  # pose of every body in the world
         self.references: dict[str, float] = {}  # values of joints in the file [rad] or [m]
         self._joints: dict[str, str] = {}  # type of every joint
         self.sites: dict[str, LinkFrame] = {}
-        self._names: set[str] = set()  # taken names of links and joints
         named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
         self._driven = frozenset(str(element.get("joint")) for element in named)
         self._defaults: dict[str, Defaults] = {"main": {}}
@@ -268,7 +268,7 @@ class MjcfReader:
         child = part.body if last and centred else self._unused(f"{name}_link")
         if kind == "ball":
             axes = dict(zip("xyz", np.eye(3), strict=True))
-            self.tree.turns(name, at, child, T_at_body * T_body_joint, axes, self._names)
+            self.tree.turns(name, at, child, T_at_body * T_body_joint, axes)
         else:
             self._one_axis(part, attributes, name, kind, (at, child), T_at_body * T_body_joint)
         if child != part.body:
@@ -383,7 +383,7 @@ class MjcfReader:
 
     def _unused(self, name: str) -> str:
         """Return an unused name, and take it."""
-        unused = self.tree.unused(name, self._names)
+        unused = self.tree.unused(name)
         self._names.add(unused)
         return unused
 

@@ -6,7 +6,7 @@ a ``6d`` pair.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from math import pi
@@ -65,10 +65,11 @@ class UrdfBuilder:
 
     links: dict[str, str] = field(default_factory=dict)  # lines of all links, by name
     joints: dict[str, str] = field(default_factory=dict)  # lines of all joints, by name
+    taken: set[str] = field(default_factory=set)  # names of others
 
-    def unused(self, name: str, others: Set[str] = frozenset()) -> str:
+    def unused(self, name: str) -> str:
         """Return a name unused by links and joints: the given one, or it with a number."""
-        taken = self.links.keys() | self.joints.keys() | others
+        taken = self.links.keys() | self.joints.keys() | self.taken
         number, unused = 1, name
         while unused in taken:
             number += 1
@@ -107,26 +108,31 @@ class UrdfBuilder:
         child: str,
         T_parent_origin: RigidTransform,
         axes: Mapping[str, Array],
-        taken: Set[str] = frozenset(),
     ) -> None:
         """Add a ball or universal joint as revolutes, by their letters, with links between them."""
         last = [*axes][-1]
         for letter, axis in axes.items():
-            after = child if letter == last else self.unused(f"{name}_{letter}_link", taken)
+            after = child if letter == last else self.unused(f"{name}_{letter}_link")
             if after != child:
                 self.link(after)
-            joint = self.unused(f"{name}_{letter}", taken)
+            joint = self.unused(f"{name}_{letter}")
             self.joint(joint, "revolute", (parent, after), *parts_of(T_parent_origin), axis)
             parent, T_parent_origin = after, EYE
 
-    def body(self) -> str:
-        """Return the lines of all links and joints."""
-        return "\n".join([*self.links.values(), *self.joints.values()])
+    def elements(self) -> list[etree._Element]:
+        """Return all links and joints, each on a line of its own."""
+        elements = [
+            etree.fromstring(line) for line in (*self.links.values(), *self.joints.values())
+        ]
+        for element in elements:
+            element.tail = "\n"
+        return elements
 
     def robot(self, name: str) -> bytes:
         """Return the whole URDF."""
         head = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name={_quoted(name)}>\n'
-        return f"{head}{self.body()}\n</robot>\n".encode()
+        lines = "\n".join([*self.links.values(), *self.joints.values()])
+        return f"{head}{lines}\n</robot>\n".encode()
 
 
 def parts_of(T: RigidTransform) -> tuple[Array, Array]:
@@ -297,11 +303,9 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     problems.raise_if_any()
     for element in elements:
         robot.remove(element)
-    text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
+    text = UrdfBuilder(taken={*bare.links, *bare.joints})
     closures = close_loops(loops, text, path)
-    for line in filter(None, text.body().split("\n")):
-        robot.append(etree.fromstring(line))
-        robot[-1].tail = "\n"
+    robot.extend(text.elements())
     named = closing_frames(robot, path)
     if named:
         notes.append(
