@@ -443,16 +443,11 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
     lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
     # The joint centres, or the feet of the (common) perpendicular
     base, platform = _pivot(lower, None, leg, within), _pivot(upper, None, leg, within)
-    A, B = base.centre, platform.centre
-    if A is None and B is None:
+    if base.centre is None and platform.centre is None:
         v, w = base.axes[0], platform.axes[0]
         A, B = v.nearest(w) or (v.point, w.foot(v.point))  # if parallel, at the joint at the base
-    elif A is None and B is not None:
-        A = base.axes[0].foot(B)
-    elif B is None and A is not None:
-        B = platform.axes[0].foot(A)
-    if A is None or B is None:
-        raise ValueError("a rod without any joint has no centre")
+    else:
+        A, B = base.near(platform.centre), platform.near(base.centre)
     length = float(np.linalg.norm(B - A))
     if length < within:
         raise OutOfClass(

@@ -223,6 +223,12 @@ class Pivot:
     spins: tuple[Axis, ...] = ()  # revolutes along the leg that are not part of it
     spare: int = 0  # freedoms beyond those of its type
 
+    def near(self, point: Array | None) -> Array:
+        """Return the centre, of an R the point of its axis nearest to a point (3,) [m]."""
+        if self.centre is not None:
+            return self.centre
+        return self.axes[0].point if point is None else self.axes[0].foot(point)
+
     @property
     def outer(self) -> Array | None:
         """The direction fixed in base or platform of R or U."""

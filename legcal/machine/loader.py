@@ -20,7 +20,7 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
-from legcal.machine.chain import Bodies, ClosedChain, Closure, rigid_bodies
+from legcal.machine.chain import Bodies, ClosedChain, rigid_bodies
 from legcal.machine.classification import (
     actuator_of,
     joint_tolerance,
@@ -141,8 +141,6 @@ def _load(source: Source) -> Machine:
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
         _check_length(away, words, urdf.path, most=MAX_ORIGIN)
     _check_names(source)
-    # In a fixed order, since sums depend on it.
-    closures = sorted(source.closures, key=lambda closure: (closure.frames, closure.kind))
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
     if source.motors:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
@@ -152,20 +150,23 @@ def _load(source: Source) -> Machine:
             T = source.poses[block.base].inv() * source.poses[block.platform]
             drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
             block = block.model_copy(update={"home": drawn_home})
-        machine = _assemble(source, block, closures)
+        # In a fixed order, since sums depend on it.
+        ordered = sorted(source.closures, key=lambda closure: (closure.frames, closure.kind))
+        source = replace(source, closures=tuple(ordered))
+        machine = _assemble(source, block)
     except OutOfClass:
         _check_plane_of_arms(urdf, source.path)
         raise
-    bodies = rigid_bodies(source.urdf, closures, block.platform_joint)
+    bodies = rigid_bodies(source.urdf, source.closures, block.platform_joint)
     drawn, round_parts = with_mesh_cylinders(
         source.urdf, bodies, machine.legs, machine.base, source.leg_radius
     )
     if round_parts or drawn is not source.urdf:
         source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
-        machine = _assemble(source, block, closures)
-    urdf, extended_closures = with_separate_origins(source.urdf, closures, machine)
+        machine = _assemble(source, block)
+    urdf, closures = with_separate_origins(source.urdf, source.closures, machine)
     if urdf is not source.urdf:
-        machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
+        machine = _assemble(replace(source, urdf=urdf, closures=closures), block)
     # A closed home.
     given = machine.home if block.home is not None else None
     if given is not None and source.is_drawn_open and not machine.actuators:
@@ -211,9 +212,9 @@ def _load(source: Source) -> Machine:
     return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
 
 
-def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
+def _assemble(source: Source, block: LegcalBlock) -> Machine:
     """Return the mechanism, with its chain still open."""
-    urdf, yaml_path = source.urdf, source.path
+    urdf, closures, yaml_path = source.urdf, source.closures, source.path
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = _legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform, source.motors),

@@ -101,7 +101,7 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
 
 def with_separate_origins(
     urdf: Urdf, closures: Sequence[Closure], machine: Machine
-) -> tuple[Urdf, list[Closure]]:
+) -> tuple[Urdf, tuple[Closure, ...]]:
     """Return the tree of a machine and its closures with an origin for every number of a leg.
 
     Links are added as needed: between a joint and its child link, and for closure frames on links
@@ -129,7 +129,7 @@ def with_separate_origins(
                 changed[missing.closure] = _with_frame(changed[missing.closure], frame, link)
             urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
-            return urdf, changed
+            return urdf, tuple(changed)
 
 
 def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
