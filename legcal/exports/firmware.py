@@ -274,22 +274,22 @@ class _Row(NamedTuple):
     @classmethod
     def of(cls, actuator: Actuator, A: Array, B: Array, rod: float, frame: Array) -> _Row:
         """Return the tower of a motor with A at reading 0, both joints in the frame [m]."""
-        axis, point, upwards = actuator.axis @ frame, actuator.point @ frame, actuator.axis @ frame
-        shaft = A  # of a carriage there is none
-        if actuator.turns:
-            shaft = point + ((A - point) @ axis) * axis
-            upwards = cross(axis, (shaft - B) * [1.0, 1.0, 0.0])
-        sign = 1.0 if upwards[2] > 0.0 else -1.0
+        axis, point = actuator.axis @ frame, actuator.point @ frame
+        if not actuator.turns:
+            sign = 1.0 if axis[2] > 0.0 else -1.0
+            top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
+            at_top = A + actuator.gain * top * axis
+            height = _MM * (at_top[2] - B[2])
+            return cls(actuator, _MM * (at_top - B)[:2], _MM * rod, 0.0, 0.0, height, top, sign)
+        shaft = point + ((A - point) @ axis) * axis
+        across, arm = (shaft - B)[:2], A - shaft
+        outwards = np.array([*across, 0.0]) / np.linalg.norm(across)
+        sign = 1.0 if cross(axis, outwards)[2] > 0.0 else -1.0
         top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
-        across, arm, height = (shaft - B)[:2], A - shaft, float(shaft[2] - B[2])
-        if actuator.turns:
-            at_zero = np.arctan2(arm[2], arm[:2] @ across / np.linalg.norm(across))
-            stop = float(np.degrees(at_zero + sign * actuator.gain * top))
-        else:
-            across = across + actuator.gain * top * axis[:2]
-            stop, height = _MM * (height + actuator.gain * top * float(axis[2])), 0.0
-        length = _MM * float(np.linalg.norm(arm))
-        return cls(actuator, _MM * across, _MM * rod, length, _MM * height, stop, top, sign)
+        at_zero = float(np.arctan2(arm[2], arm @ outwards))
+        stop = float(np.degrees(at_zero + sign * actuator.gain * top))
+        length, height = float(np.linalg.norm(arm)), float(shaft[2] - B[2])
+        return cls(actuator, _MM * across, _MM * rod, _MM * length, _MM * height, stop, top, sign)
 
 
 def _poses_to_print(mount: _Mounted) -> tuple[Array, Array]:
