@@ -554,28 +554,27 @@ def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, fl
         readings[actuator.joint] = chosen
         scale, unit = SHOWN_IN[actuator.unit]
         low, high = (scale * end for end in actuator.travel)
-        where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
-        needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"
         outside = [max(low - scale * q, scale * q - high) > 1e-6 for q in (chosen, other)]
+        both = f"{scale * chosen:.6g} and {scale * other:.6g} {unit}"
+        needed, fault = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}", None
         if outside[0]:
-            problems.append(
-                f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "
-                f"there, {needed}; correct home, lengths or travel."
-            )
+            fault = f"found the readings {both} there, {needed}; correct home, lengths or travel"
         elif stated is not None:
             if abs(chosen - stated) > MAX_HOME_RESIDUAL * (actuator.travel[1] - actuator.travel[0]):
-                problems.append(
-                    f"{where} at the reading {scale * stated:.6g} {unit} of home_readings: found "
-                    f"{scale * chosen:.6g} and {scale * other:.6g} {unit} there, needed one within "
-                    f"{MAX_HOME_RESIDUAL:.0%} of its travel; correct home or home_readings."
+                fault = (
+                    f"found {both} there, needed one within {MAX_HOME_RESIDUAL:.0%} of its travel "
+                    f"from {scale * stated:.6g} {unit} of home_readings; correct home or "
+                    "home_readings"
                 )
         elif not outside[1] and abs(other - chosen) > 1e-9:
-            problems.append(
-                f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the right one in home_readings, or limit "
-                "the travel to one side of the turning point of "
-                f"{legs_in_words([leg.name for leg in rods])}."
+            fault = (
+                f"found two readings there, {both}, {needed} and not two; write the right one in "
+                "home_readings, or limit the travel to one side of the turning point of "
+                f"{legs_in_words([leg.name for leg in rods])}"
             )
+        if fault is not None:
+            start = f"{described.source}: motor '{actuator.joint}' cannot close at home"
+            problems.append(f"{start}: {fault}.")
     _refuse(problems)
     return readings
 
