@@ -503,9 +503,7 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
             if moves is not None:
                 how, letter = ("slides", "P") if moves == "prismatic" else ("turns", "R")
                 found = f"the type {type_} on '{motor}', which {how}"
-                needed = (
-                    f"a type that begins with {letter} for rods on such a motor (PSS, RSS, PRS)"
-                )
+                needed = f"a type that begins with {letter} for its rods (PSS, RSS, PRS)"
             problems.add(refused, found, needed, "correct the type or the motor")
     for name in actuators:
         if name not in motors:
