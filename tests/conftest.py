@@ -102,9 +102,10 @@ def _models_are_read_once() -> Iterator[None]:
     machines: dict[tuple[str, ...], Machine] = {}
 
     def load_once(source: Source) -> Machine:
-        if source.file.legcal is None or source.notes or source.poses is not None:
+        if source.block is None or source.notes or source.poses is not None:
             return load(source)
-        key = (source.path.name, source.urdf.path.name, repr(source.file), source.urdf.text)
+        stated = repr((source.closures, source.motors, source.block))
+        key = (source.path.name, source.urdf.path.name, stated, source.urdf.text)
         if key not in machines:
             machines[key] = load(source)
         found = machines[key]

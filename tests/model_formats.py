@@ -48,7 +48,7 @@ def _with_loops(machine: Machine, style: str) -> str:
     below = {j.child: j for j in machine.urdf.joints.values() if not j.moves}
     for i, closure in enumerate(machine.chain.closures):
         kind = "spherical" if closure.kind == "3d" else "fixed"
-        ends = [below[frame] for frame in (closure.frame_1, closure.frame_2)]
+        ends = [below[frame] for frame in closure.frames]
         places = [etree.fromstring(origin(end.T_parent_origin)) for end in ends]
         for end in ends:
             _remove(robot, end)
@@ -94,7 +94,7 @@ def _gepetto(machine: Machine, folder: Path) -> Path:
             robot.remove(elements["link", before.child])
             robot.remove(elements["joint", joint.name])
     document = {
-        "closed_loop": [[c.frame_1, c.frame_2] for c in machine.chain.closures],
+        "closed_loop": [[*c.frames] for c in machine.chain.closures],
         "type": [c.kind.upper() for c in machine.chain.closures],
         "name_mot": [str(machine.legs[j].prismatic) for j in machine.motors],
         "joint_name": names,

@@ -137,7 +137,7 @@ def test_a_singular_home_comes_with_the_motion_that_is_free_and_the_nearest_good
     machine = load_mechanism(made.yaml_path)
     (note,) = [note for note in machine.diagnostics if "is singular at home" in note]
     assert "can turn about (0, 0, 1) and move along (0, 0, 1) of the base there" in note
-    found = re.search(r"xyz \[(.*?)\], quat_xyzw \[(.*?)\]", note)
+    found = re.search(r"xyz: \[(.*?)\], quat_xyzw: \[(.*?)\]", note)
     assert found is not None
     xyz, quat = ([float(x) for x in group.split(",")] for group in found.groups())
     keyed(model, legcal__home={"xyz": xyz, "quat_xyzw": quat})(folder)

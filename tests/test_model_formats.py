@@ -149,7 +149,7 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
     root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), XmlProblems(path)
     reader = MjcfReader(root, problems)
     reader.read_bodies()
-    pairs, _ = close_loops(list(reader.loops()), reader.tree, path)
+    closures = close_loops(list(reader.loops()), reader.tree, path)
     problems.raise_if_any()
     chain = ClosedChain(reader.tree.robot("machine").decode(), [])
     q = chain.neutral()
@@ -175,6 +175,6 @@ def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
         T = chain.pose(q, "world", body) * T_body_site
         np.testing.assert_allclose(T.translation, position, atol=1e-12)
         np.testing.assert_allclose(T.rotation.as_matrix().ravel(), matrix, atol=1e-12)
-    for pair, off in zip(pairs, values["closures"], strict=True):
-        one, two = (chain.pose(q, "world", frame).translation for frame in pair)
+    for closure, off in zip(closures, values["closures"], strict=True):
+        one, two = (chain.pose(q, "world", frame).translation for frame in closure.frames)
         np.testing.assert_allclose(one - two, off, atol=1e-12)

@@ -65,11 +65,8 @@ def firmware_table(
     *unit* is that of lengths, *given* has entries of the table and *effector* is the radius of the
     joints on it, where stated by others.
 
-    Raises
-    ------
-    ModelError
-        With a sentence for each number that is missing or impossible, and for a file that cannot
-        be included.
+    Raises ModelError with a sentence for each number that is missing or impossible, and for a file
+    that cannot be included.
     """
     text = _with_named_files(path, text)
     for reads in _DELTAS:

@@ -16,10 +16,10 @@ from legcal.errors import ModelError, Problems
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.lines import cross, distance_to_line
 from legcal.geometry.motions import frame_on_points, motion_of, pose_distance
-from legcal.geometry.rotations import cross_matrices
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.equations import posture_constraints
+from legcal.machine.closing import solve_poses, solve_postures
+from legcal.machine.equations import PoseEquations, posture_constraints
 from legcal.machine.leg import (
     LINKS,
     MAX_LENGTH,
@@ -31,8 +31,7 @@ from legcal.machine.leg import (
     Leg,
     LegKind,
 )
-from legcal.machine.rods import actuators_of, joints_at, reading_of_rod
-from legcal.machine.solver import postures_after, solve
+from legcal.machine.rods import actuators_of, both_readings, first_rods, joints_at
 
 MAX_NUMBER = 1e9  # largest number of a description, in any unit
 _TYPE = re.compile(r"([PR])([RUS])([RUS])|([RUS])(P?)([RUS]?)")
@@ -208,7 +207,7 @@ ALONG = 1.0  # [deg] least angle of outer axis and leg; a U joint is singular if
 
 
 def wrong_sizes(described: Description) -> list[str]:
-    """Return the problems of radii, offsets and travels in themselves."""
+    """Return the problems of offsets and travels in themselves."""
     if all_revolute(described) and any(leg.actuator for leg in described.legs):
         return [
             f"{described.source}: this mechanism is not supported: found a planar machine whose "
@@ -217,18 +216,13 @@ def wrong_sizes(described: Description) -> list[str]:
         ]
     for leg in described.legs:
         for end in leg.travel or (0.0,):
-            length = None if leg.offset is None else leg.offset + end
-            if length is not None and not MIN_LENGTH <= length <= MAX_LENGTH:
-                return [_out_of_proportion(described, leg.name, length)]
-    problems = []
+            length = MIN_LENGTH if leg.offset is None else leg.offset + end
+            if problems := _wrong_length(described, f"leg '{leg.name}'", "a length of", length):
+                return problems
+    problems = list[str]()
     for side, joints in zip(LINKS, _joints(described), strict=True):
         reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        if reach > MAX_LENGTH:
-            problems.append(
-                f"{described.source}: the {side} joints could not be used: found them "
-                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
-                f"{MAX_LENGTH:g} m; {_about_the_unit(described.unit, too_long=True)}."
-            )
+        problems += _wrong_length(described, f"the {side} joints", "them apart by", reach, 0.0)
     for leg in described.legs:
         motor = leg.actuator
         if motor is None or not motor.turns:
@@ -248,8 +242,8 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     problems = list[str]()
     outside = list[tuple[str, float, float, float]]()
     for leg, length in zip(described.legs, lengths, strict=True):
-        if not MIN_LENGTH <= length <= MAX_LENGTH:
-            return [_out_of_proportion(described, leg.name, float(length))]
+        if wrong := _wrong_length(described, f"leg '{leg.name}'", "a length of", float(length)):
+            return wrong
         for radius in (leg.tube, leg.rod):
             if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [
@@ -275,24 +269,22 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
     return problems
 
 
-def _out_of_proportion(described: Description, leg: str, length: float) -> str:
-    """Return the problem of an implausible leg length."""
-    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
-    return (
-        f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
-        f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
-    )
-
-
-def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
-    """Return the remedy for implausible sizes."""
-    if not positive:
-        return "correct its joints, offset or travel (length = offset + reading)"
-    if unit == "m" and too_long:
-        return "these look like mm values where m are stated: check the unit"
-    if unit == "mm" and not too_long:
-        return "these look like m values where mm are stated: check the unit"
-    return "check the numbers and the unit"
+def _wrong_length(
+    described: Description, what: str, found: str, length: float, least: float = MIN_LENGTH
+) -> list[str]:
+    """Return the problem of a length [m] that is most likely in another unit, or none."""
+    if least <= length <= MAX_LENGTH:
+        return []
+    unit, remedy = described.unit, "check the numbers and the unit"
+    if length <= 0.0:
+        remedy = "correct its joints, offset or travel (length = offset + reading)"
+    elif unit == ("m" if length > MAX_LENGTH else "mm"):
+        other = "mm" if unit == "m" else "m"
+        remedy = f"these look like {other} values where {unit} are stated: check the unit"
+    return [
+        f"{described.source}: {what} could not be used: found {found} {length:.4g} m with lengths "
+        f"in {unit}, needed {least:g} to {MAX_LENGTH:g} m; {remedy}."
+    ]
 
 
 def wrong_axes(
@@ -316,6 +308,7 @@ APART = 0.1  # least distance of two poses that are not the same [sizes of the m
 LIKELY = 1.2  # turn of a pose that is as likely as home, relative to that of home
 CLOSED = 1e-10  # largest residual of a closed pose, relative to the size of the machine
 ROUNDING = 1e-13
+IN_SPACE = (0, 1, 2)  # legs that define frames, of a platform with all six freedoms
 MAX_HOME_RESIDUAL = 0.01  # of a stated home, relative to the size; rounded digits give less
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # range of passive sliders without limits, relative to length at home
@@ -331,11 +324,6 @@ class AssembledLeg(LegEntry):
     u: Array  # (3,) direction from A to B at home, in the base link
     q0: float  # length at reading zero, or of a constant leg [m]
     q_home: float  # the reading of the motor that carries A at home [m or rad]
-
-    @property
-    def shortest_shown(self) -> float:
-        """The length at reading zero, or at the reading nearest to it within the travel [m]."""
-        return self.q0 + min(max(0.0, self.travel[0]), self.travel[1])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -371,9 +359,22 @@ def assemble(described: Description) -> Assembled:
     legs, problems = [], []
     for j, entry in enumerate(described.legs):
         q = 0.0 if entry.actuator is None else readings[entry.actuator.joint]
-        base_axis, platform_axis = axes = _axes(entry, tangents[j], T, q)
-        problems += wrong_axes(described, entry, u[j], axes)
-        q0, travel = _law(entry, float(lengths[j]))
+        base_axis = platform_axis = tangents[j]
+        if entry.base_axis is not None:
+            turn = (
+                np.eye(3) if entry.actuator is None else entry.actuator.rotations(np.array([q]))[0]
+            )
+            base_axis = np.asarray(turn @ entry.base_axis)
+        if entry.platform_axis is not None:
+            platform_axis = np.asarray(T.rotation.apply(entry.platform_axis))
+        problems += wrong_axes(described, entry, u[j], (base_axis, platform_axis))
+        length, travel = float(lengths[j]), entry.travel
+        q0 = length if entry.kind is LegKind.CONSTANT else 0.0
+        q0 = q0 if entry.offset is None else entry.offset
+        if entry.kind is LegKind.CONSTANT:
+            travel = (0.0, 0.0)
+        elif travel is None:
+            travel = (FREE_TRAVEL[0] * length - q0, FREE_TRAVEL[1] * length - q0)
         numbers = {"travel": travel, "base_axis": base_axis, "platform_axis": platform_axis}
         legs.append(AssembledLeg(**(vars(entry) | numbers), u=u[j], q0=q0, q_home=q))
     _refuse(problems)
@@ -419,27 +420,6 @@ def across_leg(u: Array, outward: Array) -> Array:
     )
     across = across - (across @ u) * u
     return np.asarray(across / np.linalg.norm(across))
-
-
-def _axes(entry: LegEntry, tangent: Array, T: RigidTransform, q: float) -> tuple[Array, Array]:
-    """Return the axes of a leg at base and platform at home, both in the base link."""
-    base = tangent
-    if entry.base_axis is not None:
-        turn = np.eye(3) if entry.actuator is None else entry.actuator.rotations(np.array([q]))[0]
-        base = np.asarray(turn @ entry.base_axis)
-    platform = tangent
-    if entry.platform_axis is not None:
-        platform = np.asarray(T.rotation.apply(entry.platform_axis))
-    return base, platform
-
-
-def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
-    """Return length at reading zero and travel of a leg [m]."""
-    if entry.kind is LegKind.CONSTANT:
-        return length if entry.offset is None else entry.offset, (0.0, 0.0)
-    q0 = 0.0 if entry.offset is None else entry.offset
-    free = (FREE_TRAVEL[0] * length - q0, FREE_TRAVEL[1] * length - q0)
-    return q0, free if entry.travel is None else entry.travel
 
 
 def _base_frame(described: Description, count: int) -> tuple[str, ...]:
@@ -494,8 +474,7 @@ def home_of_description(described: Description) -> tuple[RigidTransform, list[st
     """
     if described.home is not None:
         return _project(described, described.home), []
-    closure = _ClosingEquations(described, mid_travel=True)
-    homes = _search(closure, turning=False) or _search(closure, turning=True)
+    homes = _search(described, turning=False) or _search(described, turning=True)
     if not homes:
         raise ModelError(
             f"{described.source}: no home was found: no pose has all motors at the middle of "
@@ -515,121 +494,39 @@ def home_of_description(described: Description) -> tuple[RigidTransform, list[st
     return homes[0], [note] if len(homes) > 1 else []
 
 
-class _ClosingEquations:
-    """The equations of home: lengths, axes of R joints, and in a plane parallel axes.
+def _legs_to_close(described: Description) -> tuple[Leg, ...]:
+    """Return the legs as described; a constant length that is not stated may be any.
 
-    Unknown are the pose and the readings of motors that carry joints; the readings are fixed if
-    home is at mid-travel. Residuals are relative to the size of the machine.
+    In a plane axes are z unless they are stated, and those of a leg are parallel: its twist is 0.
     """
-
-    def __init__(self, described: Description, *, mid_travel: bool) -> None:
-        self.planar = all_revolute(described)
-        self.stated = described.home_readings
-        legs = [_fixed_leg(entry, self.planar, mid_travel) for entry in described.legs]
-        self.legs = tuple(leg for leg in legs if leg.n_constraints)
-        self.actuators = actuators_of(self.legs)
-        self.still: Array | None = None
-        if mid_travel:
-            middles = [self.stated.get(a.joint, 0.5 * sum(a.travel)) for a in self.actuators]
-            self.still = np.array(middles)
-        self.A = np.array([leg.A for leg in legs])
-        self.B = np.array([leg.B for leg in legs])
-        lengths = [leg.q0 for leg in self.legs if leg.kind is LegKind.CONSTANT]
-        spread = max(float(np.ptp(points, axis=0).max()) for points in (self.A, self.B))
-        self.size = max(spread, 1e-3, *lengths)
-        turns = [1.0 if actuator.turns else self.size for actuator in self.actuators]
-        self.unit = np.array([1.0] * 3 + [self.size] * 3 + turns)
-
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Return residuals (k, m) and derivatives (k, m, 6 + n) at poses and n readings."""
-        poses, q = points[:, :12].reshape(-1, 3, 4), points[:, 12:]
-        if not self.legs:
-            return np.zeros((len(q), 0)), np.zeros((len(q), 0, 6))
-        R, t = poses[:, :, :3], poses[:, :, 3]
-        with np.errstate(invalid="ignore"):  # a leg without length has no direction
-            equations = posture_constraints(self.legs, R, t, q)
-        values = [equations.values / self.size]
-        slopes = [np.concatenate([equations.by_pose, equations.by_q], axis=2) / self.size]
-        if self.still is not None:
-            slopes[0][:, :, 6:] = 0.0
-        for leg in self.legs if self.planar else ():
-            if leg.base_axis is not None and leg.platform_axis is not None:
-                turned = R @ leg.platform_axis
-                values.append(cross(leg.base_axis, turned))
-                slope = -cross_matrices(leg.base_axis) @ cross_matrices(turned)
-                slopes.append(np.concatenate([slope, np.zeros_like(slope)], axis=2))
-        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
-
-    def readings_at(self, T: RigidTransform) -> Array:
-        """Return the readings (n,) at a pose: fixed ones, or those of the first rods."""
-        if self.still is not None:
-            return self.still
-        first = {a.joint: leg for leg in reversed(self.legs) if (a := leg.actuator) is not None}
-        candidates = [
-            _candidates(first[a.joint], T, self.stated.get(a.joint)) for a in self.actuators
-        ]
-        return np.array([pair[0] for pair in candidates])
-
-    def _point(self, T: RigidTransform) -> Array:
-        """Return a pose with its readings, (1, 12 + n)."""
-        return np.concatenate([T.as_matrix()[:3].ravel(), self.readings_at(T)])[None]
-
-    def residual(self, T: RigidTransform) -> float:
-        """Return the largest residual at a pose."""
-        return float(np.abs(self(self._point(T))[0]).max(initial=0.0))
-
-    def nearest(self, T: RigidTransform) -> RigidTransform:
-        """Return the nearest pose that closes, as far as steps get nearer to one."""
-        solution = solve(
-            self, postures_after, self._point(T), tolerance=1e-16, unit=self.unit, steps=30
-        )
-        pose = solution.points[0, :12].reshape(3, 4)
-        return motion_of(pose[:, :3], pose[:, 3])
-
-    def describe(self, T: RigidTransform) -> list[str]:
-        """Return the residuals at a pose in words."""
-        matrix, q = T.as_matrix()[None], self.readings_at(T)[None]
-        equations = posture_constraints(self.legs, matrix[:, :3, :3], matrix[:, :3, 3], q)
-        (A,) = joints_at(self.legs, q)
-        words, lengths = list[str](), dict[str, list[str]]()  # lengths: legs with the same residual
-        for j, kind, value in zip(equations.leg, equations.kinds, equations.values[0], strict=True):
-            leg = self.legs[j]
-            length = float(np.linalg.norm(T.apply(leg.B) - A[j]))
-            if kind is EquationKind.LENGTH:
-                if abs(value) > CLOSED * self.size:
-                    off = f"{1e3 * length:.6g} mm long instead of {1e3 * leg.q0:.6g} mm"
-                    lengths.setdefault(off, []).append(leg.name)
-                continue
-            angle = np.degrees(np.arccos(min(1.0, abs(float(value)) / length)))
-            if 90.0 - angle > 1e-6:
-                side = "base" if kind is EquationKind.BASE_AXIS else "platform"
-                words.append(
-                    f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
-                    "instead of 90 deg, which an R joint needs,"
-                )
-        words[:0] = [f"{legs_in_words(names)} {off}" for off, names in lengths.items()]
-        return words or ["axes of a planar mechanism that are not parallel"]
-
-
-def _fixed_leg(entry: LegEntry, planar: bool, mid_travel: bool) -> Leg:
-    """Return a leg with its length at home, passive if any length will do."""
-    length = entry.offset if entry.kind is LegKind.CONSTANT else None
-    if mid_travel and entry.kind is LegKind.ACTUATED and entry.travel is not None:
-        length = (entry.offset or 0.0) + 0.5 * sum(entry.travel)
+    planar = all_revolute(described)
     z = np.array([0.0, 0.0, 1.0]) if planar else None
-    return Leg(
-        entry.type.base,
-        entry.type.platform,
-        LegKind.PASSIVE if length is None else LegKind.CONSTANT,
-        entry.A_base,
-        entry.B_platform,
-        0.0 if length is None else length,
-        z if entry.base_axis is None else entry.base_axis,
-        z if entry.platform_axis is None else entry.platform_axis,
-        travel=(0.0, 0.0) if entry.actuator is None else entry.actuator.travel,
-        name=entry.name,
-        actuator=entry.actuator,
-    )
+    legs = []
+    for entry in described.legs:
+        is_open = entry.kind is LegKind.CONSTANT and entry.offset is None
+        travel = entry.travel if entry.actuator is None else entry.actuator.travel
+        leg = Leg(
+            entry.type.base,
+            entry.type.platform,
+            LegKind.PASSIVE if is_open else entry.kind,
+            entry.A_base,
+            entry.B_platform,
+            entry.offset or 0.0,
+            z if entry.base_axis is None else entry.base_axis,
+            z if entry.platform_axis is None else entry.platform_axis,
+            twist=0.0 if planar else None,
+            name=entry.name,
+            travel=travel or (0.0, 0.0),
+            actuator=entry.actuator,
+        )
+        legs.append(leg)
+    return tuple(legs)
+
+
+def _size(legs: Sequence[Leg]) -> float:
+    """Return the extent of the joints of a machine, or its longest constant leg [m]."""
+    spread = max(float(np.ptp([getattr(x, end) for x in legs], axis=0).max()) for end in "AB")
+    return max(spread, 1e-3, *(leg.q0 for leg in legs if leg.kind is LegKind.CONSTANT))
 
 
 def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> list[float]:
@@ -637,9 +534,7 @@ def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> lis
 
     The first is the one inside the travel, or the one nearer to the stated reading.
     """
-    B = np.asarray(T.apply(leg.B))[None]
-    low, high = leg.travel
-    readings = [float(reading_of_rod(replace(leg, mode=mode), B)[0]) for mode in (1, -1)]
+    readings, (low, high) = both_readings(leg, np.asarray(T.apply(leg.B))), leg.travel
     if stated is not None:
         return sorted(readings, key=lambda q: abs(q - stated))
     return sorted(readings, key=lambda q: max(low - q, q - high, 0.0))
@@ -648,92 +543,125 @@ def _candidates(leg: Leg, T: RigidTransform, stated: float | None = None) -> lis
 def _readings_at_home(described: Description, T: RigidTransform) -> dict[str, float]:
     """Return the readings at home of motors that carry joints.
 
-    Raises
-    ------
-    ModelError
-        If home is outside a travel, or both readings of a rod are inside it.
+    Raises ModelError if home is outside a travel, or both readings of a rod are inside it.
     """
-    closure = _ClosingEquations(described, mid_travel=False)
+    legs = _legs_to_close(described)
     readings, problems = dict[str, float](), list[str]()
-    for actuator in closure.actuators:
-        rods = [leg for leg in closure.legs if leg.actuator is actuator]
+    for actuator in actuators_of(legs):
+        rods = [leg for leg in legs if leg.actuator is actuator]
         stated = described.home_readings.get(actuator.joint)
         chosen, other = _candidates(rods[0], T, stated)
         readings[actuator.joint] = chosen
         scale, unit = SHOWN_IN[actuator.unit]
         low, high = (scale * end for end in actuator.travel)
-        where = f"{described.source}: motor '{actuator.joint}' cannot close at home"
-        needed = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}"
         outside = [max(low - scale * q, scale * q - high) > 1e-6 for q in (chosen, other)]
+        both = f"{scale * chosen:.6g} and {scale * other:.6g} {unit}"
+        needed, fault = f"needed one in its travel of {low:.6g} to {high:.6g} {unit}", None
         if outside[0]:
-            problems.append(
-                f"{where}: found the readings {scale * chosen:.6g} and {scale * other:.6g} {unit} "
-                f"there, {needed}; correct home, lengths or travel."
-            )
+            fault = f"found the readings {both} there, {needed}; correct home, lengths or travel"
         elif stated is not None:
             if abs(chosen - stated) > MAX_HOME_RESIDUAL * (actuator.travel[1] - actuator.travel[0]):
-                problems.append(
-                    f"{where} at the reading {scale * stated:.6g} {unit} of home_readings: found "
-                    f"{scale * chosen:.6g} and {scale * other:.6g} {unit} there, needed one within "
-                    f"{MAX_HOME_RESIDUAL:.0%} of its travel; correct home or home_readings."
+                fault = (
+                    f"found {both} there, needed one within {MAX_HOME_RESIDUAL:.0%} of its travel "
+                    f"from {scale * stated:.6g} {unit} of home_readings; correct home or "
+                    "home_readings"
                 )
         elif not outside[1] and abs(other - chosen) > 1e-9:
-            problems.append(
-                f"{where}: found two readings there, {scale * chosen:.6g} and {scale * other:.6g} "
-                f"{unit}, {needed} and not two; write the right one in home_readings, or limit "
-                "the travel to one side of the turning point of "
-                f"{legs_in_words([leg.name for leg in rods])}."
+            fault = (
+                f"found two readings there, {both}, {needed} and not two; write the right one in "
+                "home_readings, or limit the travel to one side of the turning point of "
+                f"{legs_in_words([leg.name for leg in rods])}"
             )
+        if fault is not None:
+            start = f"{described.source}: motor '{actuator.joint}' cannot close at home"
+            problems.append(f"{start}: {fault}.")
     _refuse(problems)
     return readings
 
 
 def _project(described: Description, home: RigidTransform) -> RigidTransform:
     """Return the closed pose nearest to home."""
-    closure, T = _ClosingEquations(described, mid_travel=False), home
-    if ROUNDING <= closure.residual(T) < MAX_HOME_RESIDUAL:
-        T = closure.nearest(T)
-    if closure.residual(T) < CLOSED:
-        return T
+    size = _size(every := _legs_to_close(described))
+    legs = [leg for leg in every if leg.n_constraints]
+    if not legs:
+        return home
+    rods = [legs[j] for j in first_rods(legs)]
+    stated = described.home_readings
+    q = np.array([_candidates(leg, home, stated.get(leg.motor_label))[0] for leg in rods])
+    turns = [1.0 if actuator.turns else size for actuator in actuators_of(legs)]
+    matrix, scale = home.as_matrix()[None], np.array([1.0] * 3 + [size] * 3 + turns)
+    R, t = matrix[:, :3, :3], matrix[:, :3, 3]
+    with np.errstate(invalid="ignore"):  # a leg without length has no direction
+        at_home = posture_constraints(legs, R, t, q[None])
+        worst = float(np.abs(at_home.values).max())
+        if worst < ROUNDING * size:
+            return home
+        if worst < MAX_HOME_RESIDUAL * size:
+            solved, _ = solve_postures(legs, IN_SPACE, R, t, q[None], scale)
+            if solved.missed[0] < CLOSED * size:
+                return motion_of(solved.R[0], solved.t[0])
     raise ModelError(
         [
             f"{described.source}: home could not be used: found {residual} there, needed a pose in "
             "which the machine closes; correct home, lengths or axes."
-            for residual in closure.describe(home)
+            for residual in _in_words(legs, at_home, home, joints_at(legs, q[None])[0], size)
         ]
     )
 
 
-def _search(closure: _ClosingEquations, *, turning: bool) -> list[RigidTransform]:
-    """Return the best pose that seeded starts lead to, and others that are as likely as home."""
-    rng = np.random.default_rng(1965)
-    centre = closure.A.mean(axis=0) - closure.B.mean(axis=0)
+def _in_words(
+    legs: Sequence[Leg], at_home: PoseEquations, home: RigidTransform, A: Array, size: float
+) -> list[str]:
+    """Return the constraints that home violates, with joints A (n, 3) there, in words."""
+    words, lengths = list[str](), dict[str, list[str]]()  # lengths: legs that are alike
+    for j, kind, value in zip(at_home.leg, at_home.kinds, at_home.values[0], strict=True):
+        leg = legs[j]
+        length = float(np.linalg.norm(home.apply(leg.B) - A[j]))
+        if kind is EquationKind.LENGTH:
+            if abs(value) > CLOSED * size:
+                off = f"{1e3 * length:.6g} mm long instead of {1e3 * leg.q0:.6g} mm"
+                lengths.setdefault(off, []).append(leg.name)
+            continue
+        angle = np.degrees(np.arccos(min(1.0, abs(float(value)) / length)))
+        if 90.0 - angle > 1e-6 and kind is not EquationKind.TWIST:
+            side = "base" if kind is EquationKind.BASE_AXIS else "platform"
+            words.append(
+                f"the {side} axis of leg '{leg.name}' at {angle:.4g} deg to the leg "
+                "instead of 90 deg, which an R joint needs,"
+            )
+    words[:0] = [f"{legs_in_words(names)} {off}" for off, names in lengths.items()]
+    return words or ["axes of a planar mechanism that are not parallel"]
+
+
+def _search(described: Description, *, turning: bool) -> list[RigidTransform]:
+    """Return the best pose at mid-travel from seeded starts, and others that are as likely."""
+    legs = _legs_to_close(described)
+    middle = [described.home_readings.get(leg.motor_label, 0.5 * sum(leg.travel)) for leg in legs]
+    A, B = (np.array([getattr(leg, end) for leg in legs]) for end in "AB")
+    rng, size = np.random.default_rng(1965), _size(legs)
     n_trials = TRIALS if turning else 8
-    still = np.zeros(0) if closure.still is None else closure.still
-    starts = np.zeros((n_trials, 3, 4))
+    shifts, turns = np.array([[0.0, 0.0, 1.0]] * n_trials), np.zeros((n_trials, 3))
     for trial in range(n_trials):
-        shift = rng.normal(0.0, 1.0, 3) if trial else np.array([0.0, 0.0, 1.0])
-        starts[trial, :, 3] = centre + closure.size * shift
-        turn = rng.normal(0.0, 0.3, 3) if turning else np.zeros(3)
-        starts[trial, :, :3] = Rotation.from_rotvec(turn).as_matrix()
-
-    def equations(points: Array) -> tuple[Array, Array]:
-        values, slopes = closure(points)
-        slopes[:, :, :3] *= turning
-        return values, slopes
-
-    points = np.concatenate([starts.reshape(-1, 12), np.tile(still, (n_trials, 1))], axis=1)
-    solution = solve(
-        equations, postures_after, points, tolerance=1e-15, unit=closure.unit, damped=True
+        if trial:
+            shifts[trial] = rng.normal(0.0, 1.0, 3)
+        if turning:
+            turns[trial] = rng.normal(0.0, 0.3, 3)
+    solved = solve_poses(
+        legs,
+        IN_SPACE,
+        Rotation.from_rotvec(turns).as_matrix(),
+        A.mean(axis=0) - B.mean(axis=0) + size * shifts,
+        np.tile(middle, (n_trials, 1)),
+        scale=np.repeat([float(turning), size], 3),
     )
     closed, best = list[tuple[float, RigidTransform]](), list[tuple[float, RigidTransform]]()
-    for pose in solution.points[solution.worst <= CLOSED, :12].reshape(-1, 3, 4):
-        T = motion_of(pose[:, :3], pose[:, 3])
-        below = float((T.apply(closure.B) - closure.A).mean(axis=0)[2]) < -1e-9
+    for k in np.flatnonzero(solved.missed <= CLOSED * size):
+        T = motion_of(solved.R[k], solved.t[k])
+        below = float((T.apply(B) - A).mean(axis=0)[2]) < -1e-9
         closed.append((10.0 * below + float(T.rotation.magnitude()), T))
     for rank, T in sorted(closed, key=lambda entry: round(entry[0], 6)):
         upright = rank % 10.0 if T.translation[2] > -1e-9 else rank
-        apart = [max(np.divide(pose_distance(T, other), (closure.size, 1.0))) for _, other in best]
+        apart = [max(np.divide(pose_distance(T, other), (size, 1.0))) for _, other in best]
         if not best or (min(apart) > APART and upright < LIKELY * best[0][0] + APART):
             best.append((rank, T))
-    return [closure.nearest(T) for _, T in best]
+    return [T for _, T in best]

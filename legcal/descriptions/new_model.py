@@ -40,13 +40,14 @@ from legcal.machine.leg import JointType, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.spanning_tree import (
+    UNTURNED,
+    ZERO,
     UrdfBuilder,
-    axis_xml,
     box_xml,
-    limit_xml,
-    origin_xml_at,
+    origin_xml,
     visual_xml,
 )
+from legcal.machine.urdf import UrdfJointType
 
 SPREAD = 30.0  # angle between the two joints of a pair of a hexapod [deg]
 SHORTEST, LONGEST = 0.8, 1.2  # range of leg lengths, relative to the length at home
@@ -166,11 +167,8 @@ def _check_unit(given: Dimensions) -> None:
 def family_table(given: Dimensions) -> dict[str, Any]:
     """Return the table of a family, as in YAML, in the unit of the dimensions.
 
-    Raises
-    ------
-    UsageError
-        With one sentence for each dimension that is missing, impossible or belongs to another
-        family.
+    Raises UsageError with one sentence for each dimension that is missing, impossible or belongs to
+    another family.
     """
     _check_unit(given)
     name = str(given.family).lower()
@@ -383,7 +381,7 @@ def flag(name: str) -> str:
 
 TURN = (-3.15, 3.15)  # limits of revolutes [rad]
 VISIBLE = 0.9  # length of tube and rod together, relative to the shortest leg
-_AXES = {letter: axis_xml(axis) for letter, axis in zip("xyz", np.eye(3), strict=True)}
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
 
 
 def urdf_text(machine: Assembled) -> str:
@@ -393,12 +391,12 @@ def urdf_text(machine: Assembled) -> str:
     tree.link("platform")
     if machine.planar:
         height = np.array([0.0, 0.0, machine.home.translation[2]])
-        tree.connect("platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
+        tree.joint("platform_free", "planar", ("base", "platform"), height, axis=_AXES["z"])
     else:
-        tree.connect("platform_free", "floating", ("base", "platform"))
+        tree.joint("platform_free", "floating", ("base", "platform"))
     _add_actuators(tree, machine)
     for leg in machine.legs:
-        _Branch(tree, machine, leg).write()
+        _write_leg(tree, machine, leg)
     return tree.robot(machine.name).decode()
 
 
@@ -447,10 +445,9 @@ def _add_actuators(tree: UrdfBuilder, machine: Assembled) -> None:
         motor, carried = motor_visuals(actuator, rods)
         on_base += motor
         tree.link(actuator.link, "".join(carried))
-        kind = actuator.kind.value
-        moving = axis_xml(actuator.axis) + limit_xml(actuator.travel)
-        links = "base", actuator.link
-        tree.connect(actuator.joint, kind, links, actuator.point, moving=moving)
+        kind: UrdfJointType = "revolute" if actuator.turns else "prismatic"
+        links, moves = ("base", actuator.link), (actuator.axis, actuator.travel)
+        tree.joint(actuator.joint, kind, links, actuator.point, UNTURNED, *moves)
     if on_base:
         tree.link("base", "".join(on_base))
 
@@ -470,122 +467,88 @@ def _joint_of(leg: AssembledLeg) -> str:
     return f"{leg.name}_prismatic"
 
 
-class _Branch:
-    """One leg, from the link at its start to the frames that close its loop."""
+def _write_leg(tree: UrdfBuilder, machine: Assembled, leg: AssembledLeg) -> None:
+    """Add a leg: its joints from the link at its start on, and the frames that close its loop.
 
-    def __init__(self, tree: UrdfBuilder, machine: Assembled, leg: AssembledLeg) -> None:
-        self._tree, self._leg = tree, leg
-        self._from_base = _hangs_from_base(leg)
-        self._R_base_platform = machine.home.rotation.as_matrix()
-        self._carrier, self._A = "base", leg.A_base  # the link at the start, and A in it
-        self._R_base_carrier = np.eye(3)  # at home
-        if leg.actuator is not None:
-            self._carrier, self._A = leg.actuator.link, leg.A_base - leg.actuator.point
-            self._R_base_carrier = leg.actuator.rotations(np.array([leg.q_home]))[0]
-        self._link = self._carrier if self._from_base else "platform"
-        self._along = np.zeros(3)  # position of the next joint in the previous link
+    Frames are rotation matrices in the base link at home, with z from the start of the leg on.
+    """
+    R_platform, carrier, A = machine.home.rotation.as_matrix(), "base", leg.A_base
+    R_carrier = np.eye(3)
+    if leg.actuator is not None:
+        carrier, A = leg.actuator.link, leg.A_base - leg.actuator.point
+        R_carrier = leg.actuator.rotations(np.array([leg.q_home]))[0]
+    on_base, on_platform = (carrier, A, R_carrier), ("platform", leg.B_platform, R_platform)
+    of_base = "a", leg.type.base, leg.base_axis
+    of_platform = "b", leg.type.platform, leg.platform_axis
+    starts_at_base = _hangs_from_base(leg)
+    (link, at, R), end = (on_base, on_platform) if starts_at_base else (on_platform, on_base)
+    side, joint, axis = of_base if starts_at_base else of_platform
+    u = leg.u if starts_at_base else -leg.u
 
-    def write(self) -> None:
-        """Add the leg to the tree."""
-        leg = self._leg
-        if self._from_base:
-            R_base_start, u, at = self._R_base_carrier, leg.u, self._A
-            side, joint, axis = "a", leg.type.base, leg.base_axis
-        else:
-            R_base_start, u, at = self._R_base_platform, -leg.u, leg.B_platform
-            side, joint, axis = "b", leg.type.platform, leg.platform_axis
-        R = self._near(side, joint, R_base_start.T @ u, R_base_start.T @ axis, at)
-        R = R_base_start @ R
-        self._half(near=True)
-        if leg.kind is LegKind.CONSTANT:
-            self._along = np.array([0.0, 0.0, leg.q0])
-        else:
-            far = f"{leg.name}_{'rod' if self._from_base else 'tube'}"
-            offset = np.array([0.0, 0.0, leg.q0])
-            self._to(f"{leg.name}_prismatic", "prismatic", far, offset, None, "z", leg.travel)
-            self._half(near=False)
-        if self._from_base and not leg.type.has_sphere:
-            R = self._far(R)
-        self._close(R)
-
-    def _near(self, side: str, joint: JointType, u: Array, axis: Array, at: Array) -> Array:
-        """Add the joint at the start of the leg, and return the frame of the leg there."""
-        y = _unit(cross(u, axis))
-        along = np.column_stack([cross(y, u), y, u])
-        if joint is JointType.FIXED:
-            root = f"{self._leg.name}_rod"
-            self._tree.link(root)
-            self._tree.connect(f"{root}_frame", "fixed", (self._link, root), at, along)
-            self._link = root
-            return along
-        first = np.column_stack([axis, y, cross(axis, y)]) if joint.inner_is_across else along
-        for number, name in enumerate("xyz"[: joint.n_freedoms], start=1):
-            place, frame = (at, first) if number == 1 else (None, None)
-            if number == 2 and joint.inner_is_across:
-                frame = first.T @ along
-            self._turn(f"{side}{number}", place, frame, name)
-        return along
-
-    def _far(self, R: Array) -> Array:
-        """Add the platform joint of a leg without S, and return the frame after it."""
-        leg = self._leg
-        if leg.type.platform is JointType.FIXED:
-            return R
-        y = _unit(cross(leg.u, leg.platform_axis))
-        along = np.column_stack([cross(y, leg.u), y, leg.u])
-        if leg.type.platform is JointType.REVOLUTE:
-            self._turn("b1", self._along, R.T @ along, "x")
-            return along
-        last = np.column_stack([leg.platform_axis, y, cross(leg.platform_axis, y)])
-        self._turn("b2", self._along, R.T @ along, "y")
-        self._turn("b1", None, along.T @ last, "x")
-        return last
-
-    def _close(self, R: Array) -> None:
-        """Add the coincident frames that close the loop."""
-        leg, tree = self._leg, self._tree
-        end, seat = f"{leg.name}_end", f"{leg.name}_seat"
-        tree.link(end)
-        tree.link(seat)
-        tree.connect(f"{end}_frame", "fixed", (self._link, end), self._along)
-        at_base = self._carrier, self._A
-        carrier, at = ("platform", leg.B_platform) if self._from_base else at_base
-        turned = None if leg.type.has_sphere else self._R_base_platform.T @ R
-        tree.connect(f"{seat}_frame", "fixed", (carrier, seat), at, turned)
-
-    def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
-        name = f"{self._leg.name}_{joint}"
-        self._to(name, "revolute", f"{name}_link", at, rotation, axis, TURN)
-
-    def _to(
-        self,
-        joint: str,
-        kind: str,
+    def add(
+        name: str,
+        kind: UrdfJointType,
         child: str,
-        at: Array | None,
-        rotation: Array | None,
-        axis: str,
-        limits: tuple[float, float],
+        at: Array,
+        frame: Array,
+        letter: str = "",
+        limits: tuple[float, float] = TURN,
     ) -> None:
-        """Add a joint and continue from its child."""
-        self._tree.link(child)
-        moving = _AXES[axis] + limit_xml(limits)
-        self._tree.connect(joint, kind, (self._link, child), at, rotation, moving)
-        self._link, self._along = child, np.zeros(3)
+        """Add a joint at a point of the last link, and continue from its child."""
+        nonlocal link, R
+        tree.link(child)
+        turned = UNTURNED if frame is R else frame if link == "base" else R.T @ frame
+        tree.joint(name, kind, (link, child), at, turned, _AXES.get(letter), limits)
+        link, R = child, frame
 
-    def _half(self, *, near: bool) -> None:
-        """Add the visual of the half of the leg on the current link."""
-        leg = self._leg
-        radius = leg.tube if near == self._from_base else leg.rod
-        if radius is None:
-            return
-        if leg.kind is LegKind.CONSTANT:
-            length = end = leg.q0
-        else:
-            length = VISIBLE * leg.shortest_shown
-            end = length if near else -length
-        at = f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>'
-        self._tree.link(self._link, visual_xml(at, radius, length))
+    for number, (letter, frame) in enumerate(_frames(joint, u, axis), start=1):
+        name = f"{leg.name}_{side}{number}"
+        add(name, "revolute", f"{name}_link", at, frame, letter)
+        at = ZERO
+    if joint is JointType.FIXED:
+        along = _frames(JointType.REVOLUTE, u, axis)[0][1]
+        add(f"{leg.name}_rod_frame", "fixed", f"{leg.name}_rod", at, along)
+    tree.link(link, _half(leg, near=True, from_base=starts_at_base))
+    at = np.array([0.0, 0.0, leg.q0])
+    if leg.kind is not LegKind.CONSTANT:
+        far = f"{leg.name}_{'rod' if starts_at_base else 'tube'}"
+        add(f"{leg.name}_prismatic", "prismatic", far, at, R, "z", leg.travel)
+        tree.link(link, _half(leg, near=False, from_base=starts_at_base))
+        at = ZERO
+    if starts_at_base and not leg.type.has_sphere:
+        side, joint, axis = of_platform
+        for number, (letter, frame) in reversed([*enumerate(_frames(joint, u, axis), start=1)]):
+            name = f"{leg.name}_{side}{number}"
+            add(name, "revolute", f"{name}_link", at, frame, letter)
+            at = ZERO
+    ends = f"{leg.name}_end", f"{leg.name}_seat"
+    for frame_link in ends:
+        tree.link(frame_link)
+    tree.joint(f"{ends[0]}_frame", "fixed", (link, ends[0]), at)
+    carrier, at, R_end = end
+    turned = UNTURNED if leg.type.has_sphere else R_end.T @ R
+    tree.joint(f"{ends[1]}_frame", "fixed", (carrier, ends[1]), at, turned)
+
+
+def _frames(joint: JointType, u: Array, axis: Array) -> list[tuple[str, Array]]:
+    """Return the revolutes of a joint from its link to the leg: their axes, and frames at home."""
+    y = _unit(cross(u, axis))
+    along = np.column_stack([cross(y, u), y, u])
+    if joint is JointType.UNIVERSAL:
+        return [("x", np.column_stack([axis, y, cross(axis, y)])), ("y", along)]
+    return [(letter, along) for letter in "xyz"[: joint.n_freedoms]]
+
+
+def _half(leg: AssembledLeg, *, near: bool, from_base: bool) -> str:
+    """Return the visual of the half of a leg on its link, empty if it has no radius."""
+    radius = leg.tube if near == from_base else leg.rod
+    if radius is None:
+        return ""
+    length, (low, high) = leg.q0, leg.travel
+    if leg.kind is not LegKind.CONSTANT:  # at reading zero, or the one nearest to it in the travel
+        length = VISIBLE * (leg.q0 + min(max(0.0, low), high))
+    end = length if near else -length
+    return visual_xml(f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>', radius, length)
 
 
 def _unit(vector: Array) -> Array:
@@ -649,13 +612,11 @@ def motor_visuals(actuator: Actuator, rods: Sequence[AssembledLeg]) -> tuple[lis
     radii = [r for rod in rods for r in (rod.tube, rod.rod) if r is not None]
     if not radii:
         return [], []
-    make = _turning if actuator.turns else _sliding
-    return make(actuator, np.array([rod.A_base for rod in rods]), rods, max(radii))
+    A, r = np.array([rod.A_base for rod in rods]), max(radii)
+    return _turning(actuator, A, r) if actuator.turns else _sliding(actuator, A, rods, r)
 
 
-def _turning(
-    actuator: Actuator, A: Array, _rods: Sequence[AssembledLeg], r: float
-) -> tuple[list[str], list[str]]:
+def _turning(actuator: Actuator, A: Array, r: float) -> tuple[list[str], list[str]]:
     """Return a motor along the axis, an arm across it and a bar between the joints."""
     w, middle = actuator.axis, A.mean(axis=0)
     foot = actuator.point + ((middle - actuator.point) @ w) * w
@@ -715,7 +676,7 @@ def _box(at: Array, sizes: Array, frame: Array) -> str:
 
 
 def _at(place: Array, frame: Array) -> str:
-    return origin_xml_at(np.round(place, _ROUND), frame)
+    return origin_xml(np.round(place, _ROUND), frame)
 
 
 def _rounded(size: float) -> float:

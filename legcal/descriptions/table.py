@@ -419,10 +419,7 @@ def _is_csv(path: Path, content: str) -> bool:
 def described_machine(table: Mapping[str, Any], source: Path) -> Description:
     """Return the machine of a table (as in YAML); messages name its source.
 
-    Raises
-    ------
-    ModelError
-        With one sentence for each entry that is impossible or contradicts others.
+    Raises ModelError with one sentence for each entry that is impossible or contradicts others.
     """
     file, problems = validate(TableFile, table, source, kind=ModelError), Problems(source)
     _check_entries(file, problems)
@@ -493,25 +490,21 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
         if motor is not None and motor not in actuators:
             missing = f"'{motor}' in hangs_on, which is not among actuators"
             problems.add(refused, missing, remedy=closest(motor, list(actuators) or ["none"]))
-        elif (motor is None) is not (type_.actuator is None):
-            on = "no motor that it hangs on" if motor is None else f"it on '{motor}'"
-            problems.add(
-                refused,
-                f"{on} and the type {type_}",
+            continue
+        moves = None
+        if motor is not None:
+            moves = ActuatorKind.REVOLUTE if actuators[motor].turns else ActuatorKind.PRISMATIC
+        if moves is not type_.actuator:
+            found = f"no motor that it hangs on and the type {type_}"
+            needed = (
                 "actuators and hangs_on (in a CSV a column 'rail') for types that begin with the "
-                "motor of a rod (PSS, RSS, PRS), and for no others",
-                "correct them",
+                "motor of a rod (PSS, RSS, PRS)"
             )
-        elif motor is not None and actuators[motor].turns is not (
-            type_.actuator is ActuatorKind.REVOLUTE
-        ):
-            moves, letter = ("turns", "R") if actuators[motor].turns else ("slides", "P")
-            problems.add(
-                refused,
-                f"the type {type_} on '{motor}', which {moves}",
-                f"a type that begins with {letter}",
-                "correct the type or the motor",
-            )
+            if moves is not None:
+                how, letter = ("slides", "P") if moves == "prismatic" else ("turns", "R")
+                found = f"the type {type_} on '{motor}', which {how}"
+                needed = f"a type that begins with {letter} for its rods (PSS, RSS, PRS)"
+            problems.add(refused, found, needed, "correct the type or the motor")
     for name in actuators:
         if name not in motors:
             problems.add(

@@ -30,28 +30,20 @@ from legcal.machine.closing import (
 )
 from legcal.machine.configurations import workspace
 from legcal.machine.kinematics import (
-    equations_of_readings,
     platforms_in_base,
     pose_differences,
+    poses_at_readings,
 )
 from legcal.machine.model import Machine, readings_at_poses
-from legcal.machine.solver import poses_after, solve
 from legcal.version import __version__
 
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 TO_FILE = np.array([1e3] * 3 + [float(np.degrees(1.0))] * 3)
-DEFAULT_NODES = {
-    1: 21,
-    2: 21,
-    3: 11,
-    4: 7,
-    5: 5,
-    6: 4,
-}  # nodes per coordinate by number of freedoms, at most 4,096 in total
+# Nodes per coordinate by number of freedoms, at most 4,096 in total.
+DEFAULT_NODES = {1: 21, 2: 21, 3: 11, 4: 7, 5: 5, 6: 4}
 MAX_ROWS = 300_000
 TESTED = 1000  # largest number of cells in whose middle the table is tested
 SHRINKING, ATTEMPTS = 0.8, 20  # factor of the grid size until all nodes are in the travel, attempts
-REACHED = 1e-9  # residual of a reached pose, in leg lengths
 _SEED = 2002
 
 
@@ -62,19 +54,6 @@ def correction_refusal(subject: Subject) -> str | None:
     if not subject.machine.is_determined:
         return f"found that {subject.machine.undetermined}, needed readings that give the pose"
     return None
-
-
-def poses_at_readings(machine: Machine, q: Array, near: Array) -> tuple[Array, BoolArray]:
-    """Return the poses (k, 3, 4) at readings (k, n_legs), near others, and which were reached."""
-    scale = machine.size
-    solution = solve(
-        equations_of_readings(machine, q[:, list(machine.motors)]),
-        poses_after,
-        near,
-        tolerance=1e-14 * scale,
-        unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
-    )
-    return solution.points, solution.worst <= REACHED * scale
 
 
 def correction_files(subject: Subject, path: Path, nodes: int | None = None) -> Rendered:
@@ -177,7 +156,7 @@ def _corrected(
     reached &= ((q[:, motors] >= ends[:, 0]) & (q[:, motors] <= ends[:, 1])).all(axis=1)
     if not reached.all():
         return commands, reached
-    moved, there = poses_at_readings(nominal, q, X)
+    moved, there = poses_at_readings(nominal, q[:, list(nominal.motors)], X)
     coordinates = coordinates_of(moved)[0][:, columns]
     return commands + turned_back(coordinates - commands, columns), reached & there
 
@@ -203,7 +182,8 @@ def _residuals(
     residuals = []
     for asked in (np.mean(corners, axis=0), commands):
         there, _ = poses_at_coordinates(nominal, columns, asked, home)
-        there, _ = poses_at_readings(calibrated, readings_at_poses(nominal, there), X)
+        q = readings_at_poses(nominal, there)[:, list(calibrated.motors)]
+        there, _ = poses_at_readings(calibrated, q, X)
         reached = platforms_in_base(calibrated, motions_of(there[:, :, :3], there[:, :, 3]))
         residuals.append(np.stack(pose_differences(reached, wanted), axis=1))
     return residuals[0], residuals[1]

@@ -14,14 +14,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.descriptions.controllers import SIDES, STRUTS, Rig, read_delta, rig_in
 from legcal.descriptions.firmware import FIRMWARES, TOWERS, Firmware, IdealDelta
-from legcal.exports.correction import poses_at_readings, stacked
+from legcal.exports.correction import stacked
 from legcal.exports.subject import (
     Rendered,
     Subject,
@@ -32,9 +32,12 @@ from legcal.exports.subject import (
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator
+from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses, workspace
-from legcal.machine.leg import LegKind
+from legcal.machine.kinematics import poses_at_readings
+from legcal.machine.leg import JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
+from legcal.machine.picture import round_length
 from legcal.pages.svg import BLUE, DIM, GREY, Canvas
 from legcal.version import __version__
 
@@ -87,7 +90,9 @@ def firmware_files(name: str, subject: Subject, path: Path) -> Rendered:
     after, frame = _in_best_frame(errors, read_delta(path, f"{head}{lines}"))
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        there, reached = poses_at_readings(
+            subject.nominal, readings[:, list(subject.nominal.motors)], poses
+        )
         then = _mounted(subject.nominal, firmware)
         of_nominal = then.errors_at(readings[reached], there[reached])
         before, _ = _in_best_frame(errors, _nearest_delta(firmware, then, of_nominal))
@@ -138,7 +143,7 @@ class _Mounted:
     def _columns(self) -> list[int]:
         legs = self.machine.legs
         return [
-            next(j for j, leg in enumerate(legs) if _joint(leg.actuator) == actuator.joint)
+            next(j for j, leg in enumerate(legs) if leg.motor_label == actuator.joint)
             for actuator in self.actuators
         ]
 
@@ -188,10 +193,6 @@ class _Mounted:
         return replace(self, start=raised, lift=lift)
 
 
-def _joint(actuator: Actuator | None) -> str | None:
-    return None if actuator is None else actuator.joint
-
-
 def _upwards(machine: Machine) -> Array:
     """Return the direction (3,) along the towers, or the axis of the arms, from the platform up."""
     axes = np.array([actuator.axis for actuator in machine.actuators])
@@ -214,16 +215,14 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
     home = machine.home.rotation.as_matrix()
     rows = []
     for actuator in dict.fromkeys(machine.actuators):
-        rods = [j for j, leg in enumerate(machine.legs) if _joint(leg.actuator) == actuator.joint]
+        rods = [j for j, leg in enumerate(machine.legs) if leg.motor_label == actuator.joint]
         A = machine.A_base[rods].mean(axis=0)
         B = home @ machine.B_platform[rods].mean(axis=0)
         rod = float(np.mean([machine.legs[j].q0 for j in rods]))
         rows.append(_Row.of(actuator, A @ frame, B @ frame, rod, frame))
-    places = np.array([row.across for row in rows])
-    angles = np.degrees(np.arctan2(places[:, 1], places[:, 0]))
+    angles = np.array([np.degrees(np.arctan2(*row.across[::-1])) for row in rows])
     if "angle" in firmware.nominal and ((angles[1] - angles[0]) % 360.0) > 180.0:
-        rows = [rows[0], rows[2], rows[1]]
-    angles = np.array([np.degrees(np.arctan2(row.across[1], row.across[0])) for row in rows])
+        rows, angles = [rows[0], rows[2], rows[1]], angles[[0, 2, 1]]
     nominal = np.array(firmware.nominal.get("angle", angles))
     off = (angles - nominal + 180.0) % 360.0 - 180.0
     off = off[0] + ((off - off[0] + 180.0) % 360.0 - 180.0)
@@ -260,8 +259,7 @@ def _mounted(machine: Machine, firmware: Firmware) -> _Mounted:
     return mounted.over_bed()
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
+class _Row(NamedTuple):
     """A tower in the frame of a firmware [mm or deg]."""
 
     actuator: Actuator
@@ -284,9 +282,8 @@ class _Row:
             height = _MM * (at_top[2] - B[2])
             return cls(actuator, _MM * (at_top - B)[:2], _MM * rod, 0.0, 0.0, height, top, sign)
         shaft = point + ((A - point) @ axis) * axis
-        across = (shaft - B)[:2]
+        across, arm = (shaft - B)[:2], A - shaft
         outwards = np.array([*across, 0.0]) / np.linalg.norm(across)
-        arm = A - shaft
         sign = 1.0 if cross(axis, outwards)[2] > 0.0 else -1.0
         top = actuator.travel[1] if sign > 0.0 else actuator.travel[0]
         at_zero = float(np.arctan2(arm[2], arm @ outwards))
@@ -397,9 +394,7 @@ def _picture(title: str, nozzle: Array, after: Array, before: Array | None) -> s
     middle = 0.5 * (nozzle.min(axis=0) + nozzle.max(axis=0))
     scale = (side - 2.0 * edge) / max(float(np.ptp(nozzle[:, :2], axis=0).max()), 1e-6)
     most = max(float(np.linalg.norm(errors, axis=1).max()) for _, errors in panels)
-    power = 10.0 ** np.floor(np.log10(max(most, 1e-6)))
-    lengths = power * np.array([1.0, 2.0, 5.0])
-    longest = float(lengths[lengths <= max(most, power)].max())
+    longest = round_length(max(most, 1e-6))
     magnified = 30.0 / longest
     for k, (label, errors) in enumerate(panels):
         at = np.array([side * (k + 0.5), 0.5 * side])
@@ -522,7 +517,9 @@ def flypt_files(subject: Subject, path: Path) -> Rendered:
     after, _ = _in_best_frame(places.errors, written)
     before = None
     if subject.nominal is not None:
-        there, reached = poses_at_readings(subject.nominal, readings, poses)
+        there, reached = poses_at_readings(
+            subject.nominal, readings[:, list(subject.nominal.motors)], poses
+        )
         of_nominal = _Places(subject.nominal, readings[reached], there[reached], places.order)
         before, _ = _in_best_frame(places.errors, of_nominal.nearest())
     remaining = _Remaining("FlyPT Mover", places.joints, after, before)
@@ -585,7 +582,10 @@ class _Places:
         origin = self._middle + frame[:3]
         near_R = R_base.T @ self.poses[:, :, :3] @ self._of_platform
         near = (self.joints.mean(axis=1) - origin) @ R_base
-        R, t = _forward(sides, sides.Middle + self.moves, near_R, near)
+        pairs = zip(sides.base, sides.platform, strict=True)
+        ends = JointType.UNIVERSAL, JointType.SPHERICAL
+        legs = [Leg(*ends, LegKind.ACTUATED, A, B, sides.Middle) for A, B in pairs]
+        R, t = solve_poses(legs, (0, 2, 4), near_R, near, self.moves, steps=_NEWTON)[:2]
         joints = sides.platform @ np.swapaxes(R, 1, 2) + t[:, None]
         return np.asarray(joints @ R_base.T + origin - self.joints)
 
@@ -600,17 +600,3 @@ def _sides(joints: Array, first: int) -> tuple[float, float]:
     sides = np.linalg.norm(np.roll(joints, -1, axis=0) - joints, axis=1)
     others, pairs = float(sides[1 - first :: 2].mean()), float(sides[first::2].mean())
     return (others, pairs) if first == 0 else (pairs, others)
-
-
-def _forward(rig: Rig, lengths: Array, R: Array, t: Array) -> tuple[Array, Array]:
-    """Return the poses of a rig at lengths (k, 6), near others, by Newton's method."""
-    for _ in range(_NEWTON):
-        arms = rig.platform @ np.swapaxes(R, 1, 2)
-        legs = arms + t[:, None] - rig.base
-        now = np.linalg.norm(legs, axis=2)
-        u = legs / now[..., None]
-        slope = np.concatenate([u, cross(arms, u)], axis=2)
-        step = np.linalg.solve(slope, (lengths - now)[..., None])[..., 0]
-        t = t + step[:, :3]
-        R = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ R
-    return R, t

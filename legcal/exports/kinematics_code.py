@@ -162,10 +162,7 @@ def _numbers(machine: Machine) -> dict[str, Any]:
 
 def _step(leg: Leg, length: float) -> float:
     """Return the largest change of a reading that moves its joint by a length [m]."""
-    if leg.actuator is None or not leg.actuator.turns:
-        return length
-    arm = float(np.linalg.norm(np.cross(leg.actuator.axis, leg.A - leg.actuator.point)))
-    return MAX_TURN if arm * MAX_TURN <= length else length / arm
+    return min(leg.reading_of(length), MAX_TURN) if leg.reads_angle else length
 
 
 def _carrier(j: int, mode: int, actuator: Actuator, at_home: float) -> dict[str, Any]:

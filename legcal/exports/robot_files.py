@@ -61,7 +61,7 @@ def urdf_text(machine: Machine) -> tuple[bytes, tuple[str, ...]]:
     for i, closure in enumerate(machine.chain.closures, start=1):
         kind = "spherical" if closure.kind == "3d" else "fixed"
         loop = etree.SubElement(robot, "loop_joint", name=f"loop_{i}", type=kind)
-        for tag, frame in (("link1", closure.frame_1), ("link2", closure.frame_2)):
+        for tag, frame in zip(("link1", "link2"), closure.frames, strict=True):
             link = frame if frame in machine.urdf.links else joints[frame].child
             etree.SubElement(loop, tag, link=link)
     named = {e.get("name") for e in robot.iterfind("transmission/joint")}
@@ -107,7 +107,7 @@ def _calibration(subject: Subject) -> dict[str, object]:
     calibration: dict[str, object] = {
         "base_link": machine.base,
         "platform_link": machine.platform,
-        "closed_loop": [[c.frame_1, c.frame_2] for c in machine.chain.closures],
+        "closed_loop": [[*c.frames] for c in machine.chain.closures],
         "closed_loop_type": [c.kind for c in machine.chain.closures],
         "home": motion_to_xyz_quat(machine.home),
         "legs": {
@@ -215,7 +215,7 @@ class _Writer:
         equality = etree.SubElement(mujoco, "equality")
         for i, closure in enumerate(machine.chain.closures, start=1):
             sites = {}
-            for number, frame in enumerate((closure.frame_1, closure.frame_2), start=1):
+            for number, frame in enumerate(closure.frames, start=1):
                 link = frame if frame in self._body else machine.urdf.joints[frame].child
                 sites[f"site{number}"] = f"loop_{i}_{number}"
                 etree.SubElement(self._body[link], "site", name=f"loop_{i}_{number}")

@@ -63,12 +63,8 @@ def other_gains(machine: Machine) -> str:
 def load_subject(given: str | Path | Machine | EarlierResult) -> Subject:
     """Return the subject of an export: a result, its folder or ``result.json``, or a mechanism.
 
-    Raises
-    ------
-    DatasetError
-        If the result is damaged, or of another version.
-    ModelError
-        If there is no such mechanism.
+    Raises DatasetError if the result is damaged, or of another version. Raises ModelError if there
+    is no such mechanism.
     """
     if isinstance(given, Machine):
         return Subject(given, str(given.yaml_path))

@@ -6,7 +6,7 @@ Pinocchio. What flows, each step in the modules named:
 
 ===============================  ===============================================
 text to a tree, pairs of frames  files, urdf, mjcf, spanning_tree, formats
-bodies and chains between them   bodies, topology
+bodies and chains between them   chain, topology
 a chain to a leg                 classification, leg, actuator, rods
 legs to a checked machine        loader, home, shapes, origins, model
 numbers to a parameter vector    parameters, ties, tolerance
@@ -16,7 +16,8 @@ random poses of the workspace    configurations
 a machine to people and files    inspection, picture, model_writer
 ===============================  ===============================================
 
-A :class:`Leg` holds its joints and the numbers of its equations, which follow from its joints
-(:class:`JointType`). :func:`pose_equations` is compared with Pinocchio whenever a machine is
+A joint of the tree, or a ``3d`` closure, between two bodies is a :class:`Connection`; those at one
+end of a leg are a :class:`Pivot` of a :class:`JointType`, from which the equations of a
+:class:`Leg` follow. :func:`pose_equations` is compared with Pinocchio whenever a machine is
 loaded. Calibrated URDFs are written as patches of the file read.
 """

@@ -58,10 +58,8 @@ class Pulses:
     ) -> Pulses | None:
         """Return the stated pulses, None if neither number is given.
 
-        Raises
-        ------
-        BadValue
-            If a number is missing or implausible for a servo, or the motor does not turn.
+        Raises BadValue if a number is missing or implausible for a servo, or the motor does not
+        turn.
         """
         if centre is None and per_degree is None:
             return None

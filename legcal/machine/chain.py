@@ -11,7 +11,7 @@ closure. The virtual platform joint carries nothing and is left out.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -22,21 +22,25 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import ModelError
 from legcal.geometry.motions import matrix_inverse, matrix_product, motion_of
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import VIRTUAL, Urdf, UrdfJointType
+
+ClosureKind = Literal["3d", "6d"]
 
 
 @dataclass(frozen=True)
 class Closure:
     """Two frames of the tree that coincide: their points (``3d``) or the whole frames (``6d``)."""
 
-    kind: Literal["3d", "6d"]
-    frame_1: str
-    frame_2: str
+    kind: ClosureKind
+    frames: tuple[str, str]
 
     @property
     def rows(self) -> int:
         """Number of equations."""
         return 3 if self.kind == "3d" else 6
+
+    def __str__(self) -> str:
+        return f"'{self.frames[0]}' and '{self.frames[1]}'"
 
 
 class ClosedChain:
@@ -49,10 +53,7 @@ class ClosedChain:
     all joints move in the plane, rounding of their axes opens it across. *gains* of joints, by
     name, divide their values in configurations, as encoders read them.
 
-    Raises
-    ------
-    ModelError
-        If Pinocchio cannot build the model.
+    Raises ModelError if Pinocchio cannot build the model.
     """
 
     def __init__(
@@ -93,6 +94,20 @@ class ClosedChain:
         # Last configurations evaluated in the work space of Pinocchio, as bytes.
         self._placed_at = self._linearized_at = b""
         self._linear = np.zeros(0), np.zeros((0, 0))  # last result of linearize
+
+    @classmethod
+    def of(
+        cls,
+        urdf: Urdf,
+        closures: Sequence[Closure],
+        normals: Sequence[Array | None] = (),
+        gains: Mapping[str, float] = MappingProxyType({}),
+    ) -> "ClosedChain":
+        """Return the closed chain of a URDF, which errors name."""
+        try:
+            return cls(urdf.text, closures, normals, gains)
+        except ModelError as error:
+            raise error.told(lambda problem: problem.in_file(urdf.path)) from error
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
         return ClosedChain, (self.text, self.closures, self.normals, self.gains)
@@ -163,9 +178,7 @@ class ClosedChain:
 
     def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
         """Return T_base_frame between two frames at a configuration."""
-        self._place(configuration)
-        M = self._placement(base).actInv(self._placement(frame))
-        return motion_of(M.rotation, M.translation)
+        return motion_of(*self.placement(configuration, base, frame))
 
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
         """Return residual (6,) [m, rad] and Jacobian (6, nv) of holding a frame at a pose.
@@ -283,9 +296,7 @@ class ClosedChain:
 
     def _anchor(self, closure: Closure) -> Any:
         """Return Pinocchio's constraint for a closure."""
-        first, second = (
-            self._model.frames[self._frame(name)] for name in (closure.frame_1, closure.frame_2)
-        )
+        first, second = (self._model.frames[self._frame(name)] for name in closure.frames)
         make = (
             pin.PointAnchorConstraintModel
             if closure.kind == "3d"
@@ -304,18 +315,43 @@ def _projector(normal: Array) -> Array:
     return projector
 
 
-ConnectionType = Literal["revolute", "prismatic", "sphere"]
-
-
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """A joint of the mechanism between two bodies: one of the tree, or a ``3d`` closure."""
+    """A joint between two bodies, one of the tree or a ``3d`` closure, passed in one direction."""
 
-    type: ConnectionType
-    bodies: tuple[str, str]  # named by one of their links; parent and child of a joint of the tree
-    T_body_joint: tuple[Array, Array]  # (4, 4) each; the joint moves the second frame in the first
+    type: UrdfJointType | Literal["sphere"]
+    bodies: tuple[str, str]  # near and far, named by one of their links
+    T_body_joint: tuple[Array, Array]  # (4, 4) each
+    axis: Array | None  # (3,) unit axis in the joint frame; None for a sphere
     joint: str | None  # the URDF joint; None for a closure
     closure: int | None  # the index of the closure; None for a joint of the tree
+    is_forward: bool = True  # from parent to child: the joint moves the far body in the near one
+
+    @property
+    def name(self) -> str:
+        """The joint, in words."""
+        return self.joint or "the 3d closure"
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether it can only say where the platform is, as no joint of a leg."""
+        return self.type in VIRTUAL
+
+    def line(self, side: int) -> tuple[Array, Array]:
+        """Return a point [m] and the direction of the axis in the near (0) or far body (1)."""
+        matrix = self.T_body_joint[side]
+        return matrix[:3, 3], matrix[:3, :3] @ (np.zeros(3) if self.axis is None else self.axis)
+
+    def from_body(self, body: str) -> "Connection":
+        """Return the joint passed from one of its bodies to the other."""
+        if self.bodies[0] == body:
+            return self
+        return replace(
+            self,
+            bodies=self.bodies[::-1],
+            T_body_joint=self.T_body_joint[::-1],
+            is_forward=not self.is_forward,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,10 +366,7 @@ class Bodies:
 def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | None) -> Bodies:
     """Return the bodies of a tree with closures, and the joints between them.
 
-    Raises
-    ------
-    ModelError
-        If a weld closes a loop of bodies that are rigid already.
+    Raises ModelError if a weld closes a loop of bodies that are rigid already.
     """
     body_of = {link: link for link in urdf.links}
     T_body_link = {link: np.eye(4) for link in urdf.links}
@@ -343,11 +376,10 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
             _merge(body_of, T_body_link, joint.parent, joint.child, T)
     for closure in closures:
         if closure.kind == "6d":
-            first, second = (urdf.link_of(name) for name in (closure.frame_1, closure.frame_2))
+            first, second = map(urdf.link_of, closure.frames)
             if body_of[first] == body_of[second]:
                 raise ModelError(
-                    f"the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' could not "
-                    "be used",
+                    f"the 6d closure of {closure} could not be used",
                     "both on one rigid body",
                     "two",
                     "remove it",
@@ -356,12 +388,13 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
             _merge(body_of, T_body_link, first, second, np.eye(4))
     tree = [
         Connection(
-            "prismatic" if joint.type == "prismatic" else "revolute",
+            "revolute" if joint.type == "continuous" else joint.type,
             (body_of[joint.parent], body_of[joint.child]),
             (
                 matrix_product(T_body_link[joint.parent], joint.T_parent_origin.as_matrix()),
                 T_body_link[joint.child],
             ),
+            joint.axis,
             joint.name,
             None,
         )
@@ -371,12 +404,12 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
     spheres = []
     for i, closure in enumerate(closures):
         if closure.kind == "3d":
-            first, second = (urdf.link_of(name) for name in (closure.frame_1, closure.frame_2))
+            first, second = map(urdf.link_of, closure.frames)
             bodies, poses = (
                 (body_of[first], body_of[second]),
                 (T_body_link[first], T_body_link[second]),
             )
-            spheres.append(Connection("sphere", bodies, poses, None, i))
+            spheres.append(Connection("sphere", bodies, poses, None, None, i))
     return Bodies(body_of, T_body_link, (*tree, *spheres))
 
 

@@ -8,7 +8,6 @@ S joint each; revolutes along the leg only spin it.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +18,15 @@ from legcal.geometry.lines import cross, normal_basis
 from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_product
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, ActuatorKind
-from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
+from legcal.machine.chain import Connection
+from legcal.machine.leg import PERPENDICULAR, Axis, JointType, Leg, LegChain, LegKind, Pivot
 
 CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
-PERPENDICULAR = 1e-3  # largest angular error of perpendicular and parallel axes [rad]
+_CENTRES = (
+    "a joint whose centre is fixed in the base, at most one slider and "
+    "one motor for each leg, and a joint whose centre is "
+    "fixed in the platform, or a motor that moves the joint at A and then a rod"
+)
 
 
 def joint_tolerance(joints: Iterable[Sequence[Array] | Array]) -> float:
@@ -35,7 +39,7 @@ def joint_tolerance(joints: Iterable[Sequence[Array] | Array]) -> float:
 
 
 def classify_leg(
-    steps: Sequence[Step],
+    steps: Sequence[Connection],
     platform_origin: Array,
     path: Path,
     within: float,
@@ -47,36 +51,30 @@ def classify_leg(
     is one of the *motors* and the others form a rod with a joint at each end, this motor carries
     the rod.
 
-    Raises
-    ------
-    OutOfClass
-        If the leg is not a joint, at most one slider, and a joint, with axes that the method
-        supports.
+    Raises OutOfClass if the leg is not a joint, at most one slider, and a joint, with axes that the
+    method supports.
     """
     poses, axes = [np.eye(4)], list[Axis]()
     for step in steps:
-        T_near, T_far = (step.connection.T_body_joint[side] for side in (step.near, step.far))
+        T_near, T_far = step.T_body_joint
         T = matrix_product(poses[-1], T_near)
-        turns = step.connection.type != "sphere"
-        direction = T[:3, :3] @ step.axis if turns else None
+        direction = None if step.axis is None else T[:3, :3] @ step.axis
         axes.append(Axis(step.name, T[:3, 3], direction))
         poses.append(matrix_product(T, matrix_inverse(T_far)))
-    sliders = [i for i, s in enumerate(steps) if s.connection.type == "prismatic"]
-    leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
+    sliders = [i for i, s in enumerate(steps) if s.type == "prismatic"]
+    leg = next((s.joint for s in steps if s.joint), "") or ""
     hangs = is_actuator(steps[0], motors) and len(steps) > 2
     try:
         carrier = None if sliders else _carrier(axes, poses[-1], platform_origin, leg, within)
         if carrier is not None:
             return LegChain(tuple(steps), tuple(poses), len(steps), None, *carrier)
+        _check_sliders(steps, motors, leg, hangs=hangs)
         if hangs:
-            _check_rod_alone(steps, motors, leg)
-            slider, (n_lower, ends) = None, _rod(axes[1:], leg, within, axes[0].name)
-            chain = LegChain(tuple(steps), tuple(poses), n_lower + 1, slider, *ends, steps[0])
-            axis = axes[0]
-            is_turning = chain.steps[0].connection.type == "revolute"
-            if is_turning and axis.distance(chain.A) < within:
+            n_lower, ends = _rod(axes[1:], leg, within, axes[0].name)
+            chain = LegChain(tuple(steps), tuple(poses), n_lower + 1, None, *ends, steps[0])
+            if steps[0].type == "revolute" and axes[0].distance(chain.A) < within:
                 raise OutOfClass(
-                    f"the leg of motor '{axis.name}' is not supported",
+                    f"the leg of motor '{axes[0].name}' is not supported",
                     "the joint at A on the axis of the motor, which turns the rod and does not "
                     "move its joint",
                     "an arm between them",
@@ -84,25 +82,10 @@ def classify_leg(
                     " calibrated with legcal",
                 )
             return chain
-        if len(sliders) > 1 or 0 in sliders:
-            reason = (
-                f"{len(sliders)} sliders"
-                if len(sliders) > 1
-                else f"the slider '{axes[0].name}' on the base itself, so that the joint at A moves"
-            )
-            raise OutOfClass(
-                f"the leg of joint '{leg}' is not supported",
-                reason,
-                "a joint whose centre is fixed in the base, at most one slider, and a joint "
-                "whose centre is fixed in the platform, or a motor that moves the joint at A "
-                "and then a rod",
-                "name this motor in name_mot, otherwise the machine cannot be calibrated with"
-                " legcal",
-            )
         if sliders:
             origin = matrix_applied(poses[-1], platform_origin)
             n_lower, slider = sliders[0], steps[sliders[0]]
-            towards = -1.0 if slider.near else 1.0
+            towards = 1.0 if slider.is_forward else -1.0
             ends = _telescope(axes, n_lower, towards, origin, leg, within)
         else:
             slider, (n_lower, ends) = None, _rod(axes, leg, within)
@@ -111,48 +94,51 @@ def classify_leg(
     return LegChain(tuple(steps), tuple(poses), n_lower, slider, *ends)
 
 
-def is_actuator(step: Step, motors: Sequence[str]) -> bool:
+def is_actuator(step: Connection, motors: Sequence[str]) -> bool:
     """Return whether a joint on the base is a motor that may carry joints at A."""
-    return step.connection.joint in motors and step.connection.type in ("prismatic", "revolute")
+    return step.joint in motors and step.type in ("prismatic", "revolute")
 
 
-def _check_rod_alone(steps: Sequence[Step], motors: Sequence[str], leg: str) -> None:
-    """Check that an actuator carries nothing but a rod."""
-    onward = [step.connection for step in steps[1:]]
-    second = next((c.joint for c in onward if c.joint in motors), None)
-    if second is not None:
+def _check_sliders(
+    steps: Sequence[Connection], motors: Sequence[str], leg: str, *, hangs: bool
+) -> None:
+    """Check that a leg has no more than one slider or motor, and no slider on the base."""
+    sliders = [step.name for step in steps if step.type == "prismatic"]
+    found = None
+    if hangs:
+        beyond = {step.name: "the slider" for step in steps[1:] if step.type == "prismatic"}
+        beyond |= {step.name: "a second motor" for step in steps[1:] if step.joint in motors}
+        for name, kind in beyond.items():
+            found = f"{kind} '{name}' beyond the motor '{leg}' on the base"
+    elif len(sliders) > 1:
+        found = f"{len(sliders)} sliders"
+    elif steps[0].type == "prismatic":
+        found = f"the slider '{leg}' on the base itself, so that the joint at A moves"
+    if found is not None:
         raise OutOfClass(
             f"the leg of joint '{leg}' is not supported",
-            f"a second motor '{second}' beyond the motor '{leg}' on the base",
-            "one motor for each leg",
-            "remove it from name_mot if it has none, otherwise this machine cannot be "
-            "calibrated with legcal",
-        )
-    slider = next((c.joint for c in onward if c.type == "prismatic"), None)
-    if slider is not None:
-        raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported",
-            f"the slider '{slider}' beyond the motor '{leg}' on the base",
-            "a rod of constant length there",
-            "this machine cannot be calibrated with legcal",
+            found,
+            _CENTRES,
+            "name the motor that moves the joint at A, and no other of this leg, in name_mot, "
+            "otherwise this machine cannot be calibrated with legcal",
         )
 
 
 def actuator_of(
     chain: LegChain, T_body_base: Array, travel: tuple[float, float], link: str
-) -> Actuator | None:
+) -> Actuator:
     """Return the motor that carries the rod of a chain, in the base link (at T_body_base)."""
     step = chain.actuator
     if step is None:
-        return None
+        raise ValueError("a leg without a motor on the base has no actuator")
     inverse = matrix_inverse(T_body_base)
-    point, axis = step.line(step.near)
-    sign = 1.0 if step.near == 0 else -1.0  # a joint moves its child
+    point, axis = step.line(0)
+    sign = 1.0 if step.is_forward else -1.0  # a joint moves its child
     A, at = matrix_applied(inverse, chain.A), matrix_applied(inverse, point)
     direction = sign * (inverse[:3, :3] @ axis)
-    turns = step.connection.type == "revolute"
+    turns = step.type == "revolute"
     return Actuator(
-        joint=str(step.connection.joint),
+        joint=str(step.joint),
         kind=ActuatorKind.REVOLUTE if turns else ActuatorKind.PRISMATIC,
         axis=direction,
         point=at + ((A - at) @ direction) * direction if turns else at,
@@ -256,10 +242,8 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -
     U. A revolute along the leg (whose direction may not be determined yet) only spins it. *axes*
     are ordered from base or platform to the leg, and meet *within* this distance [m].
     """
-    spheres = [axis for axis in axes if axis.direction is None]
-    if spheres:
-        others = [axis for axis in axes if axis is not spheres[0]]
-        return _about_sphere(spheres[0], others, leg, within)
+    if any(axis.direction is None for axis in axes):
+        return Pivot(JointType.SPHERICAL, _centre(axes, leg, within), (), (), len(axes) - 1)
     lines = _distinct(axes, within)
     spare = len(axes) - len(lines)
     spins: tuple[Axis, ...] = ()
@@ -269,7 +253,7 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -
     if len(lines) < 2:
         turns = JointType.REVOLUTE if lines else JointType.FIXED
         return Pivot(turns, None, tuple(lines), spins, spare)
-    centre = _meeting(lines, leg, within)
+    centre = _centre(lines, leg, within)
     if len(lines) > 2:
         return Pivot(JointType.SPHERICAL, centre, (), (), spare + len(lines) - 3)
     tilt = off_square(lines[0].along, lines[1].along)
@@ -281,20 +265,6 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str, within: float) -
             "correct their axes",
         )
     return Pivot(JointType.UNIVERSAL, centre, tuple(lines), (), spare)
-
-
-def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str, within: float) -> Pivot:
-    """Return an S joint made of a sphere and revolutes through its centre."""
-    for axis in others:
-        miss = axis.distance(sphere.point)
-        if miss > within:
-            raise OutOfClass(
-                f"leg '{leg}' could not be classified",
-                f"the axis of '{axis.name}' {1e3 * miss:.4g} mm from the centre of {sphere.name}",
-                f"one joint at each end of the leg within {1e3 * within:.2g} mm",
-                "correct their origins",
-            )
-    return Pivot(JointType.SPHERICAL, sphere.point, (), (), len(others))
 
 
 def _distinct(axes: Sequence[Axis], within: float) -> list[Axis]:
@@ -311,42 +281,26 @@ def _distinct(axes: Sequence[Axis], within: float) -> list[Axis]:
     return lines
 
 
-def _meeting(lines: Sequence[Axis], leg: str, within: float) -> Array:
-    """Return the intersection of axes (3,) [m]."""
-    points = []
-    for first, second in pairwise(lines):
-        near, far = nearest(first, second)
-        gap = None if near is None or far is None else float(np.linalg.norm(far - near))
-        if near is None or gap is None or gap > within:
-            relation = "parallel" if gap is None else f"{1e3 * gap:.4g} mm apart"
+def _centre(axes: Sequence[Axis], leg: str, within: float) -> Array:
+    """Return the point (3,) [m] in which axes meet, the centre of a sphere if there is one."""
+    sphere = next((axis for axis in axes if axis.direction is None), None)
+    meeting = None if sphere is not None else axes[0].nearest(axes[1])
+    centre = (sphere or axes[0]).point if meeting is None else meeting[0]
+    is_parallel = sphere is None and meeting is None
+    for axis in axes if sphere is not None else axes[1:]:
+        miss = math.inf if is_parallel else axis.distance(centre)
+        if miss > within:
+            other = f"that of '{axes[0].name}'"
+            if sphere is not None:
+                other = f"the centre of {sphere.name}"
+            far = "parallel to" if is_parallel else f"{1e3 * miss:.4g} mm from"
             raise OutOfClass(
                 f"leg '{leg}' could not be classified",
-                f"the axes of '{first.name}' and '{second.name}' {relation}",
-                f"axes that meet within {1e3 * within:.2g} mm",
+                f"the axis of '{axis.name}' {far} {other}",
+                f"axes that meet within {1e3 * within:.2g} mm in one joint at each end of the leg",
                 "correct their origins",
             )
-        points.append(near)
-    apart = max(float(np.linalg.norm(point - points[0])) for point in points)
-    if apart > within:
-        raise OutOfClass(
-            f"leg '{leg}' could not be classified",
-            f"that the axes of {_names(lines)} meet in two points {1e3 * apart:.4g} mm apart",
-            f"one point within {1e3 * within:.2g} mm",
-            "correct their origins",
-        )
-    return points[0]
-
-
-def nearest(first: Axis, second: Axis) -> tuple[Array, Array] | tuple[None, None]:
-    """Return the nearest points of two axes [m], None if they are parallel."""
-    normal = cross(first.along, second.along)
-    square = float(normal @ normal)
-    if square < PERPENDICULAR**2:
-        return None, None
-    between = second.point - first.point
-    on_first = float(cross(between, second.along) @ normal) / square
-    on_second = float(cross(between, first.along) @ normal) / square
-    return first.point + on_first * first.along, second.point + on_second * second.along
+    return centre
 
 
 def parallel(first: Array, second: Array) -> bool:
@@ -384,21 +338,13 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
             spare[1 - i] -= 1
             ends[i] = replace(ends[i], type=JointType.SPHERICAL, axes=())
     left, twisting = sum(spare), [end.type.twists_freely for end in ends]
-    if ends[0].type is JointType.FIXED:
+    if ends[0].type is JointType.FIXED or (left and not any(twisting)):
         raise OutOfClass(
             f"the leg of joint '{leg}' is not supported",
-            f"the axis of '{base.spins[0].name}' along the leg",
-            f"one perpendicular to it within {np.degrees(PERPENDICULAR):.2g} deg",
-            "this machine cannot be calibrated with legcal",
-        )
-    if left and not any(twisting):
-        name = (*base.spins, *platform.spins)[0].name
-        raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported",
-            f"the axis of '{name}' along the leg, and no S joint",
-            "the inner axis of a universal joint perpendicular to the leg within "
-            f"{np.degrees(PERPENDICULAR):.2g} deg",
-            "correct its axis",
+            f"the axis of '{(*base.spins, *platform.spins)[0].name}' along the leg, and no S joint",
+            "a joint at each end with an axis perpendicular to the leg within "
+            f"{np.degrees(PERPENDICULAR):.2g} deg, or an S joint at one",
+            "correct its axis, otherwise this machine cannot be calibrated with legcal",
         )
     idle = left + base.spare + platform.spare + all(twisting)
     return ends[0], ends[1], idle
@@ -450,21 +396,14 @@ def _rod(
         raise problems[len(places[0])]
     several = len(places) > 2
     where = f"{len(places)} joints in different places" if several else "all joints in one place"
-    if on is not None:
-        raise OutOfClass(
-            f"the leg of motor '{on}' is not supported",
-            f"no slider and {where} beyond it",
-            "a rod of constant length with a joint at each end",
-            "this machine cannot be calibrated with legcal",
-        )
     hangs = ", so that the rod hangs on a moving arm and the joint at A moves" * several
+    beyond = hangs if on is None else f" beyond the motor '{on}'"
     raise OutOfClass(
         f"the leg of joint '{leg}' is not supported",
-        f"no slider and {where}{hangs}",
-        "a joint whose centre is fixed in the base, then a slider or a rod of "
-        "constant length, and a joint whose centre is fixed in the platform, or a "
-        "motor that moves the joint at A",
-        "name this motor in name_mot, otherwise the machine cannot be calibrated this way",
+        f"no slider and {where}{beyond}",
+        _CENTRES,
+        "name the motor that moves the joint at A in name_mot, otherwise the machine cannot be "
+        "calibrated with legcal",
     )
 
 
@@ -504,18 +443,11 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str, within: float) -> L
     lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
     # The joint centres, or the feet of the (common) perpendicular
     base, platform = _pivot(lower, None, leg, within), _pivot(upper, None, leg, within)
-    A, B = base.centre, platform.centre
-    if A is None and B is None:
+    if base.centre is None and platform.centre is None:
         v, w = base.axes[0], platform.axes[0]
-        A, B = nearest(v, w)
-        if A is None or B is None:  # parallel: at the origin of the joint at the base
-            A, B = v.point, w.foot(v.point)
-    elif A is None and B is not None:
-        A = base.axes[0].foot(B)
-    elif B is None and A is not None:
-        B = platform.axes[0].foot(A)
-    if A is None or B is None:
-        raise ValueError("a rod without any joint has no centre")
+        A, B = v.nearest(w) or (v.point, w.foot(v.point))  # if parallel, at the joint at the base
+    else:
+        A, B = base.near(platform.centre), platform.near(base.centre)
     length = float(np.linalg.norm(B - A))
     if length < within:
         raise OutOfClass(
@@ -542,17 +474,8 @@ def _places(axes: Sequence[Axis], within: float) -> list[list[Axis]]:
     """Return the joints of a leg without slider, split where their axes stop meeting."""
     places = [[axes[0]]]
     for axis in axes[1:]:
-        last = places[-1]
-        if axis.direction is None or last[-1].direction is None:
-            line, sphere = (axis, last[-1]) if last[-1].direction is None else (last[-1], axis)
-            meets = line.distance(sphere.point) <= within
-        else:
-            near, far = nearest(last[-1], axis)
-            meets = (
-                near is not None and far is not None and float(np.linalg.norm(near - far)) <= within
-            )
-        if meets:
-            last.append(axis)
+        if places[-1][-1].gap(axis) <= within:
+            places[-1].append(axis)
         else:
             places.append([axis])
     return places
@@ -636,5 +559,5 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
 
 def _crossing(axis: Axis, u: Array, point: Array) -> Array:
     """Return the point of an axis nearest to a line."""
-    on_axis, _ = nearest(axis, Axis("", point, u))
-    return axis.foot(point) if on_axis is None else on_axis
+    ends = axis.nearest(Axis("", point, u))
+    return axis.foot(point) if ends is None else ends[0]

@@ -74,10 +74,8 @@ def close_at(
     from seeded random angles. The pose must meet the constraints; unless it is *exact* the platform
     is free in the final solve and absorbs the errors of axes in the model.
 
-    Raises
-    ------
-    DidNotConverge
-        If a leg does not close; the message names its closure and the remaining distance.
+    Raises DidNotConverge if a leg does not close; the message names its closure and the remaining
+    distance.
     """
     chain, metre = machine.chain, leg_scale(machine, T_base_platform)
     most = POSE_TOLERANCE if exact else AXIS_TOLERANCE
@@ -134,7 +132,7 @@ def worst_closure(machine: Machine, residual: Array) -> str:
     worst = (0.0, "the platform pose")
     for closure in machine.chain.closures:
         gap = float(np.abs(residual[row : row + closure.rows]).max())
-        worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
+        worst = max(worst, (gap, str(closure)))
         row += closure.rows
     return f"{worst[1]} stay {worst[0]:.3g} m apart"
 
@@ -340,7 +338,7 @@ def project_pose(
         return T, describe_worst(machine, first)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        rows = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        rows = machine_equations(machine, poses)
         constraints = ~rows.measured
         return rows.values[:, constraints], rows.by_pose[:, constraints]
 
@@ -492,7 +490,7 @@ def dimensionless(machine: Machine, poses: Array) -> Array:
 
     Poses are matrices T_base_platform (k, 3 or 4, 4).
     """
-    equations = machine_equations(machine, poses[:, :3, :3], poses[:, :3, 3])
+    equations = machine_equations(machine, poses)
     counts = ~equations.measured | np.isin(equations.leg, machine.motors)
     gradient, moment = equations.by_pose[:, counts, 3:], equations.by_pose[:, counts, :3]
     scale = np.linalg.norm(vectors_at(machine, poses), axis=2).mean(axis=1)[:, None, None]
@@ -536,7 +534,7 @@ def independent_coordinates(machine: Machine) -> IntArray:
     in leg lengths.
     """
     pose = machine.home.as_matrix()[None, :3]
-    equations = machine_equations(machine, pose[:, :, :3], pose[:, :, 3])
+    equations = machine_equations(machine, pose)
     scale = machine.size
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
     constraints = equations.by_pose[0, ~equations.measured] * unit
@@ -565,7 +563,7 @@ def poses_at_coordinates(
     scale = machine.size
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        rows = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        rows = machine_equations(machine, poses)
         keep = ~rows.measured
         values, slopes = coordinates_of(poses)
         unit = np.where(columns < 3, 1.0, scale)

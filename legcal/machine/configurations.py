@@ -20,7 +20,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, ModelError, Problem
+from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.lines import segment_distance
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
@@ -142,10 +142,7 @@ def random_poses(
 
     If the motors determine the pose the chain is not closed.
 
-    Raises
-    ------
-    DidNotConverge
-        As :func:`random_configurations`.
+    Raises DidNotConverge as :func:`random_configurations`.
     """
     if not machine.is_determined:
         drawn = random_configurations(machine, count, rng)
@@ -171,13 +168,11 @@ def _require(machine: Machine, count: int, n_reached: int) -> None:
             "figure on base and platform"
         )
     raise DidNotConverge(
-        Problem(
-            "random poses could not be drawn",
-            f"{n_reached} of {count} inside the travel in {MAX_DRAWS} tries for each",
-            "all",
-            remedy,
-            str(machine.yaml_path),
-        )
+        "random poses could not be drawn",
+        f"{n_reached} of {count} inside the travel in {MAX_DRAWS} tries for each",
+        "all",
+        remedy,
+        machine.yaml_path,
     )
 
 
@@ -188,10 +183,7 @@ def workspace(machine: Machine) -> tuple[Array, list[RigidTransform]]:
     All errors over the workspace, predicted or between two models, are errors at these poses. They
     do not depend on the order of the legs.
 
-    Raises
-    ------
-    DidNotConverge
-        As :func:`random_configurations`.
+    Raises DidNotConverge as :func:`random_configurations`.
     """
     names = sorted(machine.leg_names)
     ordered = machine.with_leg_order(names)
@@ -350,14 +342,12 @@ def feasible_poses(
         (main, _), *_others = causes.most_common()
         excluded = ", ".join(_counted(cause, n, obstacles) for cause, n in causes.most_common())
         raise DidNotConverge(
-            Problem(
-                f"{n_poses} poses could not be drawn",
-                f"{len(configurations)} that the machine reaches in "
-                f"{obstacles.total() + len(configurations)} draws, others excluded {excluded}",
-                "all",
-                _REMEDIES[main],
-                str(machine.yaml_path),
-            )
+            f"{n_poses} poses could not be drawn",
+            f"{len(configurations)} that the machine reaches in "
+            f"{obstacles.total() + len(configurations)} draws, others excluded {excluded}",
+            "all",
+            _REMEDIES[main],
+            machine.yaml_path,
         )
     return poses_at(machine, configurations)
 
@@ -396,13 +386,11 @@ class Feasibility:
         problem = self._beyond_limits(machine.home_configuration)
         if problem is not None:
             raise ModelError(
-                Problem(
-                    "no pose could be drawn",
-                    f"{problem} at home",
-                    "every joint inside its limits there",
-                    f"correct the limits, or {machine.urdf.wording.correct_home}",
-                    str(machine.yaml_path),
-                )
+                "no pose could be drawn",
+                f"{problem} at home",
+                "every joint inside its limits there",
+                f"correct the limits, or {machine.urdf.wording.correct_home}",
+                machine.yaml_path,
             )
 
     def problem(self, configuration: Array, *, of_motors: bool = True) -> str | None:

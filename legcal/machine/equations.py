@@ -16,7 +16,7 @@ the equations of all rods on an actuator determines its reading, the others are 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -190,14 +190,10 @@ def equations_at_readings(
     wanted = np.where(equations.measured, lengthening[:, equations.leg], 0.0)
     is_read = np.isfinite(wanted)
     hangs = np.array(on)[equations.leg] >= 0
-    return PoseEquations(
-        np.where(is_read, equations.values - np.where(hangs, 0.0, wanted), 0.0),
-        equations.by_pose * is_read[..., None],
-        equations.by_local,
-        equations.leg,
-        equations.kinds,
-        equations.measured,
-        equations.by_q,
+    return replace(
+        equations,
+        values=np.where(is_read, equations.values - np.where(hangs, 0.0, wanted), 0.0),
+        by_pose=equations.by_pose * is_read[..., None],
     )
 
 
@@ -339,23 +335,26 @@ def least_squares_equations(
     )
 
 
-def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
-    """Return all equations of a machine, with its plane, at poses of its links (no by_local)."""
-    equations = pose_equations(machine.legs, R, t, by_local=False)
-    return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
+def machine_equations(
+    machine: Machine, poses: Array, readings: Array | None = None
+) -> PoseEquations:
+    """Return all equations of a machine, with its plane, at poses of its links (no by_local).
 
-
-def machine_equations_at(machine: Machine, R: Array, t: Array, readings: Array) -> PoseEquations:
-    """Return these equations as residuals at readings of the motors (k, n_motors) [m or rad]."""
-    motors = machine.sign * machine.at_readings(readings)
-    equations = equations_at_readings(machine.legs, R, t, motors)
+    Poses are (k, 3 or 4, 4). With readings of the motors (k, n_motors) [m or rad] the values are
+    residuals there.
+    """
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    if readings is None:
+        equations = pose_equations(machine.legs, R, t, by_local=False)
+    else:
+        motors = machine.sign * machine.at_readings(readings)
+        equations = equations_at_readings(machine.legs, R, t, motors)
     return equations if machine.spatial else _stacked([equations, _plane(machine, R, t)])
 
 
 def equations_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
     """Return the equations of a machine at one pose."""
-    matrix = T_base_platform.as_matrix()[None]
-    return machine_equations(machine, matrix[:, :3, :3], matrix[:, :3, 3])
+    return machine_equations(machine, T_base_platform.as_matrix()[None])
 
 
 def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
@@ -391,10 +390,7 @@ def pose_sensitivity(
     motors the squares of the lengths are minimised, with exact constraints; if the constraints
     alone outnumber the freedoms (a 3-UPU that only translates), the squares of all equations.
 
-    Raises
-    ------
-    NotIdentifiable
-        If readings and legs do not determine a pose.
+    Raises NotIdentifiable if readings and legs do not determine a pose.
     """
     equations = pose_equations(legs, R, t, q=readings_of_rods(legs, R, t))
     columns = list(freedoms(frame_legs))

@@ -5,7 +5,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
@@ -24,6 +24,7 @@ from legcal.files.schema import (
     validate,
 )
 from legcal.machine.actuator import Actuator
+from legcal.machine.chain import Closure, ClosureKind
 from legcal.machine.tolerance import BuiltEntry
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -147,7 +148,6 @@ def _sibling(path: Path, folder: str) -> Path:
     return path.resolve().parent.parent / folder / path.name
 
 
-ClosureKind = Literal["3d", "6d"]  # points coincide, frames coincide
 FILE_KIND = "mechanism file"
 MAX_LOOPS = 100
 GAINS = (0.5, 2.0)  # range of gains of motors that carry rods; others hint at a wrong unit
@@ -210,6 +210,12 @@ class MechanismFile(BaseModel):
     joint_name: list[str] = []
     joint_type: list[str] = []
     legcal: LegcalBlock | None = None
+
+    @property
+    def closures(self) -> tuple[Closure, ...]:
+        """The closures in the order of the file."""
+        pairs = zip(self.closed_loop, self.type, strict=True)
+        return tuple(Closure(kind, (first, second)) for (first, second), kind in pairs)
 
 
 def read_mechanism_file(path: Path) -> MechanismFile:
@@ -277,6 +283,9 @@ def motor_entries(actuators: Sequence[Actuator]) -> dict[str, Any]:
     return entries
 
 
+_OPTIONAL = ("home_readings", "motors", "spline_teeth", "reach")  # left out where empty
+
+
 def mechanism_yaml(
     loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
 ) -> str:
@@ -288,7 +297,7 @@ def mechanism_yaml(
             "name_mot": motors,
             "joint_name": [],
             "joint_type": [],
-            "legcal": {"version": 1, **legcal},
+            "legcal": {"version": 1} | {k: x for k, x in legcal.items() if x or k not in _OPTIONAL},
         }
     )
 

@@ -27,7 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass, Problems, UsageError
 from legcal.files.schema import closest, content_of
 from legcal.geometry.types import Array
-from legcal.machine.chain import ClosedChain, rigid_bodies
+from legcal.machine.chain import ClosedChain, Closure, rigid_bodies
 from legcal.machine.files import (
     FILE_KIND,
     MechanismFile,
@@ -46,11 +46,11 @@ from legcal.machine.spanning_tree import (
     closing_frames,
     moving_groups,
     origin_xml,
+    parts_of,
     read_loop_source,
 )
 from legcal.machine.topology import find_chains, level_rotation, motors_on, propose_block
 from legcal.machine.urdf import (
-    BLOCK,
     LOOP_TAGS,
     NO_BLOCK,
     URDF_LOOPS,
@@ -74,19 +74,18 @@ def read_source(model: str | Path, base: str | None = None, platform: str | None
     source = _read_xml(path) if is_xml(path) else read_yaml_source(path)
     _check_stated(source, base, platform)
     names = {*source.urdf.links, *source.urdf.joints}
-    pairs = source.file.closed_loop
-    if not all(a in names and b in names and a != b for a, b in pairs):
+    if not all(len(names & {*closure.frames}) == 2 for closure in source.closures):
         return source  # refused later, with the location of the name
     source = with_held_joints(source)
-    if source.file.legcal is not None:
+    if source.block is not None:
         check_one_mechanism(source)
-        is_drawn = source.file.legcal.home is None and is_drawn_closed(source)
+        is_drawn = source.block.home is None and is_drawn_closed(source)
         return completed(source) if is_drawn else source
     source = replace(source, base=base, platform=platform)
     if base is not None or platform is not None:
         source = with_held_joints(_of_stated(source))
     check_one_mechanism(source)
-    if source.urdf.wording is URDF_LOOPS and not source.file.name_mot:
+    if source.urdf.wording is URDF_LOOPS and not source.motors:
         source = _with_arms_as_motors(source)
     return completed(source)
 
@@ -95,7 +94,7 @@ def _check_stated(source: Source, base: str | None, platform: str | None) -> Non
     """Refuse links stated for a file that names others itself, or has no such link."""
     problems = Problems(source.path)
     for option, link in (("--base", base), ("--platform", platform)):
-        if link is not None and source.file.legcal is not None:
+        if link is not None and source.block is not None:
             problems.add(
                 f"{option} could not be used",
                 "a file with a block legcal, which names base and platform",
@@ -111,19 +110,11 @@ def _check_stated(source: Source, base: str | None, platform: str | None) -> Non
 
 def _of_stated(source: Source) -> Source:
     """Return a file with the loops of that mechanism alone whose platform or base is stated."""
-    loops, kinds = source.file.closed_loop, source.file.type
-    groups = moving_groups(source.urdf, loops)
+    groups = moving_groups(source.urdf, source.closures)
     stated = {source.base, source.platform}
     mine = {link for links, _ in groups if stated & {*links} for link in links}
-    kept = [
-        i
-        for i, pair in enumerate(loops)
-        if any(source.urdf.link_of(frame) in mine for frame in pair)
-    ]
-    if not kept:
-        return source
-    update = {"closed_loop": [loops[i] for i in kept], "type": [kinds[i] for i in kept]}
-    return replace(source, file=source.file.model_copy(update=update))
+    kept = tuple(c for c in source.closures if mine & {*map(source.urdf.link_of, c.frames)})
+    return replace(source, closures=kept or source.closures)
 
 
 def _with_arms_as_motors(source: Source) -> Source:
@@ -138,17 +129,13 @@ def _with_arms_as_motors(source: Source) -> Source:
         turning = motors_on(bodies, bodies.body_of[block.base])
         chains = find_chains(bodies, urdf, block.base, block.platform, turning)
         moving = {chain.motor for chain in chains}
-        motors = [name for name in turning if name in moving]
+        motors = tuple(name for name in turning if name in moving)
         note = (
             f"The file names no motors: the {len(motors)} joints on the base that move rods "
             f"({', '.join(motors)}) were taken as motors; name the motors in <transmission> "
             "elements if some are not."
         )
-        return replace(
-            source,
-            file=source.file.model_copy(update={"name_mot": motors}),
-            notes=(*source.notes, note),
-        )
+        return replace(source, motors=motors, notes=(*source.notes, note))
     return source
 
 
@@ -194,21 +181,14 @@ def read_yaml_source(path: Path) -> Source:
     urdf = read_urdf(
         find_urdf(path, None if block is None else block.urdf), travel_needed=block is not None
     )
+    if block is None:
+        urdf = replace(urdf, wording=NO_BLOCK)
+    source = Source(path, urdf, file.closures, tuple(file.name_mot), block)
     check_stand_ins(file, urdf, path)
     if not file.joint_name:
-        return Source(path, file, urdf if block else replace(urdf, wording=NO_BLOCK))
-    return _converted(path, file, urdf)
-
-
-def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
-    """Return a mechanism after replacing the stand-in joints of its URDF."""
-    robot, block = urdf.robot(), file.legcal
+        return source
+    robot = urdf.robot()
     frames = replace_stand_ins(robot, file, urdf)
-    changes = {
-        "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
-        "joint_name": [],
-        "joint_type": [],
-    }
     on_replaced = [joint for joint in (block.legs.values() if block else ()) if joint in frames]
     if on_replaced:
         raise ModelError(
@@ -218,9 +198,13 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
             "name its prismatic joint",
             path,
         )
-    completed = urdf.edited(robot, travel_needed=block is not None)
-    completed = replace(completed, wording=BLOCK if block else NO_BLOCK)
-    return Source(path, file.model_copy(update=changes), completed)
+    closures = tuple(
+        Closure(closure.kind, (frames.get(first, first), frames.get(second, second)))
+        for closure in file.closures
+        for first, second in [closure.frames]
+    )
+    urdf = urdf.edited(robot, travel_needed=block is not None)
+    return replace(source, urdf=urdf, closures=closures)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -253,9 +237,8 @@ def rotation_letters(kind: str) -> str | None:
 
 def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
     """Replace the stand-in joints of a URDF; return the frames that they carried."""
-    text = UrdfBuilder(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
     elements = {e.get("name"): e for e in robot if e.tag == "joint"}
-    replaced = {}
+    replaced, taken = {}, {*urdf.links, *urdf.joints}
     for name, kind in zip(file.joint_name, file.joint_type, strict=True):
         element, joint = elements[name], urdf.joints[name]
         if kind == "FIXED":
@@ -263,15 +246,11 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
             continue
         replaced[name] = joint.child
         axes = {letter: _AXES[letter] for letter in str(rotation_letters(kind))}
-        there = len(text.links), len(text.joints)
+        text = UrdfBuilder(taken=taken)
         text.turns(name, joint.parent, joint.child, joint.T_parent_origin, axes)
         at = robot.index(element)
-        robot.remove(element)
-        lines = [*text.links.values()][there[0] :] + [*text.joints.values()][there[1] :]
-        for line in reversed(lines):
-            new = etree.fromstring(line)
-            new.tail = "\n"
-            robot.insert(at, new)
+        robot[at : at + 1] = text.elements()
+        taken |= text.links.keys() | text.joints.keys()
     return replaced
 
 
@@ -292,13 +271,18 @@ def with_held_joints(source: Source) -> Source:
 
     A chain with a motor and a passive joint that ends in the air is refused: a leg left open.
     """
-    urdf, motors = source.urdf, source.file.name_mot
-    held = open_joints(urdf, source.file.closed_loop)
-    if source.file.legcal is not None:
-        held.pop(source.file.legcal.platform_joint or "", None)
+    urdf, motors = source.urdf, source.motors
+    held = open_joints(urdf, source.closures)
+    if source.block is not None:
+        held.pop(source.block.platform_joint or "", None)
     if not held:
         return source
     _refuse_open_leg(urdf, held, motors, source)
+    shown = ", ".join(f"'{name}'" for name in list(held)[:_SHOWN])
+    shown += f" and {len(held) - _SHOWN} more" * (len(held) > _SHOWN)
+    note = f"the joints {shown} close no loop and are held as drawn."
+    if len(held) == 1:
+        note = f"the joint {shown} closes no loop and is held as drawn."
     robot = urdf.robot()
     for element in robot.findall("joint"):
         joint = held.get(element.get("name", ""))
@@ -309,24 +293,24 @@ def with_held_joints(source: Source) -> Source:
                 element.remove(part)
         element.set("type", "fixed")
         T = joint.T_parent_origin * _motion(joint, source.values.get(joint.name, 0.0))
-        element.append(etree.fromstring(origin_xml(T)))
-    file = source.file.model_copy(update={"name_mot": [m for m in motors if m not in held]})
+        element.append(etree.fromstring(origin_xml(*parts_of(T))))
     return replace(
         source,
-        file=file,
+        motors=tuple(motor for motor in motors if motor not in held),
         # The travel of sliders was asked for, or not, when the file was read.
         urdf=urdf.edited(robot),
-        notes=(*source.notes, _note(list(held))),
+        notes=(*source.notes, note),
         values={name: value for name, value in source.values.items() if name not in held},
     )
 
 
-def open_joints(urdf: Urdf, closures: Iterable[Sequence[str]]) -> dict[str, UrdfJoint]:
+def open_joints(urdf: Urdf, closures: Iterable[Closure]) -> dict[str, UrdfJoint]:
     """Return the joints that can move and are in no loop, by name."""
     in_loops = set[str]()
-    for pair in closures:
+    for closure in closures:
         first, second = (
-            {joint.name for joint in urdf.joints_above(urdf.link_of(frame))} for frame in pair
+            {joint.name for joint in urdf.joints_above(urdf.link_of(frame))}
+            for frame in closure.frames
         )
         in_loops |= first ^ second
     return {
@@ -347,17 +331,8 @@ def _refuse_open_leg(
     urdf: Urdf, held: Mapping[str, UrdfJoint], motors: Sequence[str], source: Source
 ) -> None:
     """Refuse a chain with a motor and a passive joint that ends without closing a loop."""
-
-    def beyond(joint: UrdfJoint) -> list[UrdfJoint]:
-        """Return a joint and all joints that it carries."""
-        carried, pending = list[UrdfJoint](), [joint]
-        while pending:
-            carried.append(pending.pop())
-            pending += urdf.below[carried[-1].child]
-        return carried
-
     for joint in held.values():
-        branch = [j for j in beyond(joint) if j.moves]
+        branch = [j for j in urdf.joints_below(joint) if j.moves]
         if any(j.name not in held for j in branch):
             continue  # it carries the mechanism
         driven = [j.name for j in branch if j.name in motors]
@@ -374,17 +349,9 @@ def _refuse_open_leg(
             )
 
 
-def _note(names: Sequence[str]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:_SHOWN])
-    more = f" and {len(names) - _SHOWN} more" * (len(names) > _SHOWN)
-    if len(names) == 1:
-        return f"the joint {shown} closes no loop and is held as drawn."
-    return f"the joints {shown}{more} close no loop and are held as drawn."
-
-
 def completed(source: Source) -> Source:
     """Return a mechanism without a block, completed with the closed poses and all travels."""
-    chain = _closed_chain(source)
+    chain = ClosedChain.of(source.urdf, source.closures)
     start = chain.neutral()
     for joint, value in source.values.items():
         start[chain.q_index(joint)] = value
@@ -412,7 +379,7 @@ def completed(source: Source) -> Source:
         return source
     drawn = {
         name: float(configuration[chain.q_index(name)])
-        for name in source.file.name_mot
+        for name in source.motors
         if name in urdf.joints and urdf.joints[name].type in ("prismatic", "revolute")
     }
     is_open = not sliders and off > _OPEN * size
@@ -424,12 +391,12 @@ def _at_drawn_motors(
 ) -> Array:
     """Return a closed configuration with the motors where the file draws them, if there is one."""
     moved = [source.urdf.joints[name].type in ("prismatic", "revolute")
-             for name in source.file.name_mot if name in source.urdf.joints]  # fmt: skip
-    if len(moved) < len(source.file.name_mot) or not all(moved):
+             for name in source.motors if name in source.urdf.joints]  # fmt: skip
+    if len(moved) < len(source.motors) or not all(moved):
         return closed
-    values = [chain.q_index(name) for name in source.file.name_mot]
+    values = [chain.q_index(name) for name in source.motors]
     rates = np.zeros((len(values), chain.nv))
-    rates[range(len(values)), [chain.v_index(name) for name in source.file.name_mot]] = 1.0
+    rates[range(len(values)), [chain.v_index(name) for name in source.motors]] = 1.0
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
@@ -448,11 +415,11 @@ def _levelled(chain: ClosedChain, configuration: Array, source: Source, unit: Ar
     """
     urdf = source.urdf
     try:
-        block = propose_block(source, source.file.name_mot)
+        block = propose_block(source, source.motors)
     except OutOfClass:
         return configuration  # refused later
     bodies = rigid_bodies(urdf, source.closures, block.platform_joint)
-    motors = source.file.name_mot
+    motors = source.motors
     chains = find_chains(bodies, urdf, block.base, block.platform, motors)
     A, B = (
         np.array(points) @ bodies.T_body_link[link][:3, :3]
@@ -546,17 +513,10 @@ def _solved(
 
 def is_drawn_closed(source: Source) -> bool:
     """Return whether the loops of a file are closed with all joints at zero, but for rounding."""
-    chain = _closed_chain(source)
+    chain = ClosedChain.of(source.urdf, source.closures)
     poses = source.urdf.poses.values()
     size = float(np.ptp([pose.translation for pose in poses], axis=0).max())
     return _loop_error(chain, chain.neutral()) <= _DRAWN_CLOSED * size
-
-
-def _closed_chain(source: Source) -> ClosedChain:
-    try:
-        return ClosedChain(source.urdf.text, source.closures)
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(source.urdf.path)) from error
 
 
 def _loop_error(chain: ClosedChain, configuration: Array) -> float:

@@ -22,12 +22,10 @@ from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
     machine_equations,
-    machine_equations_at,
 )
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import B_at, Machine, platform_pose, readings_at
 from legcal.machine.parameters import legs_in_links
-from legcal.machine.rods import actuator_index
 from legcal.machine.solver import Equations, Solved, poses_after, solve
 from legcal.machine.topology import level_rotation
 
@@ -51,11 +49,8 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
     It is the nearest pose that meets all constraints of legs and plane. Files state home with few
     digits; sliders absorb the rounding, but rods, revolute axes and universal joints do not.
 
-    Raises
-    ------
-    ModelError, DidNotConverge
-        If home is more than 1 % of a leg length away from any such pose; and as
-        :func:`home_at_mid_travel` and :func:`legcal.machine.closing.close_at`.
+    Raises ModelError or DidNotConverge if home is more than 1 % of a leg length away from any such
+    pose; and as :func:`home_at_mid_travel` and :func:`legcal.machine.closing.close_at`.
     """
     start = home_at_mid_travel(machine) if home is None else home
     projected, problem = project_pose(machine, start)
@@ -81,12 +76,8 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
     joints the one on the positive side of the base z. Lengths of legs without a motor follow,
     within their travel if possible.
 
-    Raises
-    ------
-    DidNotConverge
-        If there is no such pose.
-    ModelError
-        If rods on motors reach the platform on both sides of the base, so that home is ambiguous.
+    Raises DidNotConverge if there is no such pose. Raises ModelError if rods on motors reach the
+    platform on both sides of the base, so that home is ambiguous.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
     if readings is not None:
@@ -128,7 +119,7 @@ def home_at_mid_travel(machine: Machine, readings: Sequence[float] | None = None
         (other,) = at_readings([(centre + t, Rotation.from_matrix(R).as_rotvec())])
         sides = [_height(machine, T, centre) for T in (home, other) if T is not None]
         if len(sides) == 2 and np.prod(sides) < 0.0 and min(map(abs, sides)) > MIN_APART * reach:
-            poses = " and ".join(_in_yaml(T) for T in (home, other) if T is not None)
+            poses = " and ".join(in_yaml(T, 4) for T in (home, other) if T is not None)
             wording = machine.urdf.wording
             raise ModelError(
                 "the assembly at home is ambiguous",
@@ -146,11 +137,11 @@ def _height(machine: Machine, T: RigidTransform, centre: Array) -> float:
     return float(np.mean(B_at(machine, T.as_matrix()[None])[0, :, 2]) - centre[2])
 
 
-def _in_yaml(T: RigidTransform) -> str:
+def in_yaml(T: RigidTransform, digits: int = 6) -> str:
     """Return a pose in the notation of models."""
-    xyz, quat = T.translation, T.rotation.as_quat()
-    numbers = [", ".join(f"{x + 0.0:.4g}" for x in part.round(6)) for part in (xyz, quat)]
-    return f"{{xyz: [{numbers[0]}], quat_xyzw: [{numbers[1]}]}}"
+    parts = T.translation, T.rotation.as_quat(canonical=True)
+    xyz, quat = (", ".join(f"{x + 0.0:.{digits}g}" for x in part.round(6)) for part in parts)
+    return f"{{xyz: [{xyz}], quat_xyzw: [{quat}]}}"
 
 
 def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:
@@ -188,7 +179,7 @@ def _at_readings(
     unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
 
     def missed(poses: Array) -> PoseEquations:
-        return machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings[None])
+        return machine_equations(machine, poses, readings[None])
 
     def exact(poses: Array) -> tuple[Array, Array]:
         rows = missed(poses)
@@ -224,7 +215,7 @@ def _on_constraints(machine: Machine, poses: Array) -> tuple[Array, int]:
     near = [project_pose(machine, motion_of(T[:, :3], T[:, 3]), _FAR) for T in poses]
     held = np.array([problem is None for _, problem in near])
     poses = np.array([T.as_matrix()[:3] for T, _ in near])
-    equations = machine_equations(machine, poses[held, :, :3], poses[held, :, 3])
+    equations = machine_equations(machine, poses[held])
     constraints = equations.by_pose[:, ~equations.measured]
     n = constraints.shape[1]
     if n == 0 or not held.any():
@@ -258,32 +249,23 @@ def _unlikely(machine: Machine, T: RigidTransform) -> float:
 def check_home_travel(machine: Machine) -> None:
     """Check that a stated home is not far outside the travel of its motors.
 
-    Raises
-    ------
-    ModelError
-        If an actuated leg is outside its travel by more than the travel itself and by more than
-        1 % of its length, or a motor that carries rods by more than its travel.
+    Raises ModelError if an actuated leg is outside its travel by more than the travel itself and by
+    more than 1 % of its length, or a motor that carries rods by more than its travel.
     """
-    far: dict[int, float] = {}
-    q, actuators = readings_at(machine, machine.home), actuator_index(machine.legs)
+    far: dict[str, tuple[float, int]] = {}  # by motor, on which several rods may hang
+    q = readings_at(machine, machine.home)
     for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
-        if leg.actuator is not None:  # rods may share an actuator
-            is_far = actuators[j] not in {actuators[k] for k in far}
-        else:
-            allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j]))
-            is_far = leg.kind is LegKind.ACTUATED and excess > allowed
-        if is_far:
-            far[j] = excess
+        allowed = _MAX_OUTSIDE_OF_LEG * leg.length_at(float(q[j])) * (leg.actuator is None)
+        if leg.is_motor and excess > allowed:
+            far.setdefault(leg.motor_label, (excess, j))
     if not far:
         return
-    worst = max(far, key=lambda j: far[j])
+    _, worst = max(far.values(), key=lambda one: one[0])
     leg = machine.legs[worst]
-    others = ""
-    if len(far) > 1:
-        thing = "leg" if leg.actuator is None else "motor"
-        more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
-        others = f" ({len(far) - 1} more {more} as far off)"
+    thing = "leg" if leg.actuator is None else "motor"
+    more = f"{thing} is" if len(far) == 2 else f"{thing}s are"
+    others = f" ({len(far) - 1} more {more} as far off)" * (len(far) > 1)
     name, reading, travel = home_reading_in_words(leg, float(q[worst]))
     raise ModelError(
         "legcal.home could not be used",
@@ -312,7 +294,6 @@ def legs_outside(machine: Machine, share: float = 0.0) -> dict[int, float]:
     for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         excess = max(lower - float(q[j]), float(q[j]) - upper)
-        moves = leg.kind is not LegKind.CONSTANT or leg.actuator is not None
-        if moves and excess > share * (upper - lower):
+        if leg.has_value and excess > share * (upper - lower):
             excess_of[j] = excess
     return excess_of

@@ -14,7 +14,7 @@ from legcal.files.schema import Document, Number, SparseDocument, Triple
 from legcal.geometry.types import Array
 from legcal.machine.closing import LOOSE, dimensionless, project_pose, singularity
 from legcal.machine.files import LegcalBlock, motor_entries
-from legcal.machine.home import home_reading_in_words, legs_outside
+from legcal.machine.home import home_reading_in_words, in_yaml, legs_outside
 from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.shapes import bodies_of
@@ -189,11 +189,9 @@ def mechanism_notes(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]
         middle = "with all legs at mid-travel"
         if np.abs(away).max(initial=0.0) > _AT_MIDDLE:
             middle = "with all motors as near to mid-travel as possible"
-        xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
-        quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
-            f"{machine.urdf.wording.no_home}: a pose {middle} was taken, xyz "
-            f"[{xyz}], quat_xyzw [{quat}]; add it to the file if it is the right assembly."
+            f"{machine.urdf.wording.no_home}: a pose {middle} was taken, {in_yaml(machine.home)}; "
+            "add it to the file if it is the right assembly."
         )
     outside = legs_outside(machine)
     for name, reading, travel in dict.fromkeys(
@@ -274,12 +272,7 @@ def _good_home(machine: Machine, motion: Array) -> str:
             moved = RigidTransform.from_components(middle - rotation.apply(centre), rotation)
             pose, problem = project_pose(machine, moved)
             if problem is None and singularity(machine, pose) > _GOOD_SINGULARITY:
-                quaternion = pose.rotation.as_quat(canonical=True)
-                xyz, quat = (
-                    ", ".join(f"{x:.6g}" for x in np.round(values, 6) + 0.0)
-                    for values in (pose.translation, quaternion)
-                )
-                return f" (the nearest good one is xyz [{xyz}], quat_xyzw [{quat}])"
+                return f" (the nearest good one is {in_yaml(pose)})"
     return ""
 
 
@@ -335,16 +328,16 @@ def _motor_notes(machine: Machine) -> list[str]:
 
 def _spin_notes(machine: Machine) -> list[str]:
     """Return notes on idle spins: legs with an S joint at both ends, redundant revolutes."""
-    notes = []
+    notes, legs = [], machine.legs
     n_spinning = sum(
-        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
+        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in legs
     )
     if n_spinning:
-        legs, spin = "1 leg has", "spins about itself"
+        who = "1 leg has an S joint at both ends and spins about itself"
         if n_spinning > 1:
-            legs, spin = f"{n_spinning} legs have", "spin about themselves"
-        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
-    others = sum(leg.idle_spins for leg in machine.legs) - n_spinning
+            who = f"{n_spinning} legs have an S joint at both ends and spin about themselves"
+        notes.append(f"{who}; this is not counted as mobility.")
+    others = sum(leg.idle_spins for leg in legs) - n_spinning
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
         notes.append(

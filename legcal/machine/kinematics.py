@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, NotIdentifiable, Problem, UsageError
+from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.motions import motion_of, motions_of, product
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.closing import (
@@ -32,7 +32,7 @@ from legcal.machine.closing import (
 from legcal.machine.equations import (
     is_constrained,
     least_squares_equations,
-    machine_equations_at,
+    machine_equations,
     violated_constraint,
 )
 from legcal.machine.model import (
@@ -55,6 +55,7 @@ MAX_AWAY = 20.0  # of readings and poses from home [mean leg lengths]: the unit 
 MAX_TURN = 2.0 * np.pi  # of readings from home [rad]
 FEW_STEPS = 12  # largest number of Newton steps
 NEAR = 0.01  # largest distance of the pose at which a chain closes [leg lengths, rad]
+REACHED = 1e-9  # residual of a reached pose, in leg lengths
 REDUNDANT_STEPS = 40  # the same for redundant motors, where convergence is linear
 
 
@@ -182,10 +183,7 @@ def forward_kinematics_many(machine: Machine, q: Array) -> list[RigidTransform]:
 
     Readings are in m or rad. Each row is followed from the nearest solved row, or from home.
 
-    Raises
-    ------
-    NotIdentifiable, DidNotConverge, UsageError
-        As :func:`forward_kinematics`.
+    Raises NotIdentifiable, DidNotConverge, UsageError as :func:`forward_kinematics`.
     """
     poses = []
     for pose, failure in followed_poses(machine, q):
@@ -312,13 +310,11 @@ def _disagreement(
     if not conflicts:
         return None
     return DidNotConverge(
-        Problem(
-            f"the pose at the readings{which} could not be computed",
-            str(conflicts[0].cause(machine)),
-            "",
-            "check this reading, its encoder and the offset of the leg",
-            str(machine.yaml_path),
-        )
+        f"the pose at the readings{which} could not be computed",
+        str(conflicts[0].cause(machine)),
+        "",
+        "check this reading, its encoder and the offset of the leg",
+        machine.yaml_path,
     )
 
 
@@ -390,14 +386,12 @@ def _check_determined(machine: Machine) -> None:
     """Refuse a mechanism whose motors do not determine the pose."""
     if not machine.is_determined:
         raise NotIdentifiable(
-            Problem(
-                "the pose cannot be computed from readings",
-                f"mobility {machine.mobility} and {len(machine.motors)} motors that hold "
-                f"{machine.motor_rank} of these freedoms",
-                "motors that hold all",
-                "correct name_mot, or do not ask for poses of this mechanism",
-                str(machine.yaml_path),
-            )
+            "the pose cannot be computed from readings",
+            f"mobility {machine.mobility} and {len(machine.motors)} motors that hold "
+            f"{machine.motor_rank} of these freedoms",
+            "motors that hold all",
+            "correct name_mot, or do not ask for poses of this mechanism",
+            machine.yaml_path,
         )
 
 
@@ -450,11 +444,8 @@ def follow(
     redundant motors the least-squares pose is followed, and sliders are set to it. Motors with
     NaN readings are free; the others must determine the pose.
 
-    Raises
-    ------
-    DidNotConverge
-        If even the smallest steps do not contract or reach a singularity, or if joints of the chain
-        cannot be closed at the end.
+    Raises DidNotConverge if even the smallest steps do not contract or reach a singularity, or if
+    joints of the chain cannot be closed at the end.
     """
     given = np.isfinite(readings)
     is_redundant = machine.is_redundant and bool(given.all())
@@ -466,42 +457,48 @@ def follow(
     T = motion_of(pose[:, :3], pose[:, 3])
     if part < 1.0:
         if is_redundant:
-            failure = _disagreement(machine, _nearest(machine, T, readings), readings, which)
+            nearest, _ = poses_at_readings(machine, readings[None], T.as_matrix()[None, :3])
+            T = motion_of(nearest[0, :, :3], nearest[0, :, 3])
+            failure = _disagreement(machine, T, readings, which)
             if failure is not None:
                 raise failure
         raise DidNotConverge(
-            Problem(
-                f"the pose at the readings{which} could not be reached: at "
-                f"{100 * part:.1f} % of the way from the starting pose the "
-                "legs no longer close or the mechanism is singular, needed a regular path; check "
-                f"the readings and {machine.urdf.wording.home}.",
-                file=str(machine.yaml_path),
-            )
+            f"the pose at the readings{which} could not be reached: at "
+            f"{100 * part:.1f} % of the way from the starting pose the "
+            "legs no longer close or the mechanism is singular, needed a regular path; check "
+            f"the readings and {machine.urdf.wording.home}.",
+            file=machine.yaml_path,
         )
     sliders = {} if is_redundant else dict(zip(q_columns, readings[given].tolist(), strict=True))
     closed = _closed_at(machine, T, configuration, sliders, free)
     if closed is None:
         raise DidNotConverge(
-            Problem(
-                f"the pose at the readings{which} could not be reached",
-                "a platform pose at which the legs have the right lengths, but joints "
-                "that were not closed there",
-                "a closed chain",
-                "give the joints of the legs axes at right angles (of three revolutes, "
-                "and of a universal joint and its leg), which turn anywhere, or cut "
-                "spherical joints with 3d",
-                str(machine.yaml_path),
-            )
+            f"the pose at the readings{which} could not be reached",
+            "a platform pose at which the legs have the right lengths, but joints "
+            "that were not closed there",
+            "a closed chain",
+            "give the joints of the legs axes at right angles (of three revolutes, "
+            "and of a universal joint and its leg), which turn anywhere, or cut "
+            "spherical joints with 3d",
+            machine.yaml_path,
         )
     return closed
 
 
-def _nearest(machine: Machine, T: RigidTransform, readings: Array) -> RigidTransform:
-    """Return the pose near T_base_platform with the smallest residuals of readings (n_motors,)."""
-    equations = equations_of_readings(machine, readings[None])
-    tolerance = ROUNDING * machine.size
-    solution = solve(equations, poses_after, T.as_matrix()[None, :3], tolerance=tolerance)
-    return motion_of(solution.points[0, :, :3], solution.points[0, :, 3])
+def poses_at_readings(machine: Machine, readings: Array, near: Array) -> tuple[Array, BoolArray]:
+    """Return the poses (k, 3, 4) at readings of the motors, near others, and which were reached.
+
+    Where readings (k, n_motors) contradict each other it is the pose of least squares.
+    """
+    scale = machine.size
+    solution = solve(
+        equations_of_readings(machine, readings),
+        poses_after,
+        near,
+        tolerance=ROUNDING * scale,
+        unit=np.array([1.0 / scale] * 3 + [1.0] * 3),
+    )
+    return solution.points, solution.worst <= REACHED * scale
 
 
 def equations_of_readings(machine: Machine, readings: Array) -> Equations:
@@ -509,7 +506,7 @@ def equations_of_readings(machine: Machine, readings: Array) -> Equations:
     n_dependent = machine_ties(machine).n_dependent if machine.is_redundant else 0
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        rows = machine_equations_at(machine, poses[:, :, :3], poses[:, :, 3], readings)
+        rows = machine_equations(machine, poses, readings)
         if machine.is_redundant:
             return least_squares_equations(rows, n_dependent)
         return rows.values, rows.by_pose

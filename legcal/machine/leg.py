@@ -30,6 +30,7 @@ TRAVEL_MARGIN = 0.05  # tolerance of the travel, relative to it
 SIGMA_READING, SIGMA_LENGTH = 5e-6, 1.25e-4
 MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # plausible leg lengths [m]; others hint at a wrong unit
 MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # plausible radii, relative to the leg length
+PERPENDICULAR = 1e-3  # largest angular error of perpendicular and parallel axes [rad]
 MAX_LEGS = 32  # computing time grows with the cube of the number of legs
 
 
@@ -167,26 +168,6 @@ def cylinder_of_arm(arm: Arm) -> Cylinder:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """A connection of a leg, passed from base to platform."""
-
-    connection: Connection
-    near: int  # index of the body towards the base
-    far: int  # index of the body towards the platform
-    axis: Array  # (3,) unit axis in the joint frame
-
-    @property
-    def name(self) -> str:
-        """The joint, in words."""
-        return self.connection.joint or "the 3d closure"
-
-    def line(self, side: int) -> tuple[Array, Array]:
-        """Return a point [m] and the direction of the axis in the body of one side."""
-        matrix = self.connection.T_body_joint[side]
-        return matrix[:3, 3], matrix[:3, :3] @ self.axis
-
-
-@dataclass(frozen=True, eq=False)
 class Axis:
     """The axis of a revolute, or the centre of a sphere (no direction)."""
 
@@ -211,6 +192,26 @@ class Axis:
         """Return the point of the axis nearest to a point [m]."""
         return self.point + ((point - self.point) @ self.along) * self.along
 
+    def nearest(self, other: Axis) -> tuple[Array, Array] | None:
+        """Return the nearest points of two axes [m], None if they are parallel."""
+        normal = cross(self.along, other.along)
+        square = float(normal @ normal)
+        if square < PERPENDICULAR**2:
+            return None
+        between = other.point - self.point
+        here = float(cross(between, other.along) @ normal) / square
+        there = float(cross(between, self.along) @ normal) / square
+        return self.point + here * self.along, other.point + there * other.along
+
+    def gap(self, other: Axis) -> float:
+        """Return the distance of axes or spheres [m], infinite for parallel axes."""
+        if self.direction is None:
+            return other.distance(self.point)
+        if other.direction is None:
+            return self.distance(other.point)
+        ends = self.nearest(other)
+        return math.inf if ends is None else float(np.linalg.norm(ends[1] - ends[0]))
+
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
@@ -221,6 +222,12 @@ class Pivot:
     axes: tuple[Axis, ...]  # axis of R; for U the one fixed in base or platform, then the inner one
     spins: tuple[Axis, ...] = ()  # revolutes along the leg that are not part of it
     spare: int = 0  # freedoms beyond those of its type
+
+    def near(self, point: Array | None) -> Array:
+        """Return the centre, of an R the point of its axis nearest to a point (3,) [m]."""
+        if self.centre is not None:
+            return self.centre
+        return self.axes[0].point if point is None else self.axes[0].foot(point)
 
     @property
     def outer(self) -> Array | None:
@@ -237,17 +244,17 @@ class Pivot:
 class LegChain:
     """The joints of one leg, and its geometry with all of them at zero, in the base body."""
 
-    steps: tuple[Step, ...]  # from base to platform
+    steps: tuple[Connection, ...]  # passed from base to platform
     poses: tuple[Array, ...]  # (4, 4) of the bodies from base to platform
     n_lower: int  # number of joints below the slider, or the rod, with its actuator
-    slider: Step | None  # None for a leg of constant length
+    slider: Connection | None  # None for a leg of constant length
     base: Pivot
     platform: Pivot
     A: Array  # (3,) [m]
     B: Array  # (3,) [m]
     u: Array  # (3,) direction of the slider towards the platform; else from A to B
     idle_spins: int  # freedoms that only spin the leg about itself
-    actuator: Step | None = None  # the first step, if it is a motor that carries the rod
+    actuator: Connection | None = None  # the first step, if it is a motor that carries the rod
 
     @property
     def B_platform(self) -> Array:
@@ -257,7 +264,7 @@ class LegChain:
     @property
     def bodies(self) -> tuple[str, ...]:
         """The bodies of the leg, without base and platform."""
-        return tuple(step.connection.bodies[step.far] for step in self.steps[:-1])
+        return tuple(step.bodies[1] for step in self.steps[:-1])
 
     @property
     def is_joint(self) -> bool:
@@ -273,7 +280,7 @@ class LegChain:
     def motor(self) -> str | None:
         """The joint of the slider, or of the motor that carries the rod; None for other rods."""
         moving = self.slider or self.actuator
-        return None if moving is None else moving.connection.joint
+        return None if moving is None else moving.joint
 
     @property
     def reach(self) -> float:

@@ -20,9 +20,8 @@ from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
-from legcal.machine.chain import Bodies, ClosedChain, Closure, rigid_bodies
+from legcal.machine.chain import Bodies, ClosedChain, rigid_bodies
 from legcal.machine.classification import (
-    PERPENDICULAR,
     actuator_of,
     joint_tolerance,
     leg_of,
@@ -40,7 +39,7 @@ from legcal.machine.equations import (
     leg_equations,
     n_pose_constraints,
 )
-from legcal.machine.files import LegcalBlock, MechanismFile
+from legcal.machine.files import LegcalBlock
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, home_at_mid_travel
 from legcal.machine.inspection import mechanism_notes, proposal_notes
@@ -50,6 +49,7 @@ from legcal.machine.leg import (
     MAX_RADIUS,
     MIN_LENGTH,
     MIN_RADIUS,
+    PERPENDICULAR,
     EquationKind,
     JointType,
     LegChain,
@@ -58,7 +58,7 @@ from legcal.machine.leg import (
 from legcal.machine.model import B_at, Machine, joint_values, vectors_A_to_B
 from legcal.machine.origins import with_separate_origins
 from legcal.machine.parameters import geometries, n_frame_legs, parametrization_of
-from legcal.machine.rods import reading_of_rod, rod_mode
+from legcal.machine.rods import both_readings, rod_mode
 from legcal.machine.shapes import (
     at_visible_heights,
     occluders_of,
@@ -72,8 +72,7 @@ from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
-    VIRTUAL,
-    Normals,
+    NOT_CALIBRATED,
     any_joint,
     check_virtual_joint,
     distinct_joint,
@@ -84,13 +83,12 @@ from legcal.machine.topology import (
     propose_block,
     propose_frame,
 )
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import VIRTUAL, Urdf
 
 MAX_ORIGIN = 1e4  # largest joint origin [m]; beyond, floats do not resolve tolerances of joints
 MAX_TURN = 4.0 * np.pi  # largest limit of an arm [rad]; limits beyond are most likely in degrees
 _ROUNDING = 1e-9  # of home, which may lie on the floor [m]
-_METRES = "write all lengths in metres (are they millimetres?)"
-_NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
+_IN_SPACE = "a machine in space, or sliders along the legs", NOT_CALIBRATED
 _DEVIATION = {  # messages, with an angle [deg]
     EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
     EquationKind.PLATFORM_AXIS: "its revolute axis at the platform {} deg from perpendicular to it",
@@ -131,45 +129,44 @@ def load_mechanism(
     """
     source = read_source(model, base, platform)
     if without:
-        left = [name for name in source.file.name_mot if name not in without]
-        source = replace(source, file=source.file.model_copy(update={"name_mot": left}))
+        source = replace(source, motors=tuple(m for m in source.motors if m not in without))
     return _load(replace(source, leg_radius=leg_radius))
 
 
 def _load(source: Source) -> Machine:
-    file, urdf = source.file, source.urdf
+    urdf = source.urdf
     # Beyond, rounding would hide the relative position of joints.
     for joint in urdf.joints.values():
-        words = f"the origin of joint '{joint.name}' {{}} m away from its parent link"
+        words = f"the origin of joint '{joint.name}' {{}} away from its parent link"
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        _check_length(away, words, MAX_ORIGIN, urdf.path)
-    _check_names(file, urdf, source.path)
-    closures = sorted(  # in a fixed order, since sums depend on it
-        source.closures, key=lambda closure: (closure.frame_1, closure.frame_2, closure.kind)
-    )
+        _check_length(away, words, urdf.path, most=MAX_ORIGIN)
+    _check_names(source)
     # Base, platform and legs, stated or proposed; home from a drawing, if any.
-    if file.name_mot:
+    if source.motors:
         _check_plane_of_arms(urdf, source.path)  # before what could never make it a model is asked
     try:
-        block = file.legcal or propose_block(source, file.name_mot)
+        block = source.block or propose_block(source, source.motors)
         if block.home is None and source.poses is not None:
             T = source.poses[block.base].inv() * source.poses[block.platform]
             drawn_home = MotionEntry.model_validate(motion_to_xyz_quat(T))
             block = block.model_copy(update={"home": drawn_home})
-        machine = _assemble(source, block, closures)
+        # In a fixed order, since sums depend on it.
+        ordered = sorted(source.closures, key=lambda closure: (closure.frames, closure.kind))
+        source = replace(source, closures=tuple(ordered))
+        machine = _assemble(source, block)
     except OutOfClass:
         _check_plane_of_arms(urdf, source.path)
         raise
-    bodies = rigid_bodies(source.urdf, closures, block.platform_joint)
+    bodies = rigid_bodies(source.urdf, source.closures, block.platform_joint)
     drawn, round_parts = with_mesh_cylinders(
         source.urdf, bodies, machine.legs, machine.base, source.leg_radius
     )
     if round_parts or drawn is not source.urdf:
         source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
-        machine = _assemble(source, block, closures)
-    urdf, extended_closures = with_separate_origins(source.urdf, closures, machine)
+        machine = _assemble(source, block)
+    urdf, closures = with_separate_origins(source.urdf, source.closures, machine)
     if urdf is not source.urdf:
-        machine = _assemble(replace(source, urdf=urdf), block, extended_closures)
+        machine = _assemble(replace(source, urdf=urdf, closures=closures), block)
     # A closed home.
     given = machine.home if block.home is not None else None
     if given is not None and source.is_drawn_open and not machine.actuators:
@@ -181,7 +178,8 @@ def _load(source: Source) -> Machine:
     if given is None:
         _check_spread(machine)  # before a search for home in kilometres
         if machine.actuators:
-            q = _stated_or_middle(machine, block.home_readings or {})
+            stated = block.home_readings or {}
+            q = [stated.get(leg.motor_label, 0.5 * sum(leg.travel)) for leg in machine.legs]
             given = home_at_mid_travel(machine, q)
             machine = _in_modes(machine, given, q)
     else:
@@ -189,7 +187,7 @@ def _load(source: Source) -> Machine:
             q = _readings_at_home(machine, block.home_readings or {}, source.drawn)
             machine = _in_modes(machine, machine.home, q)
         _check_unit(machine)  # before lengths of hundreds of metres fail to close
-    if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
+    if source.block is not None and source.block.home is not None:  # a drawing may be anywhere
         check_home_travel(machine)
     try:
         pose, configuration = closed_home(machine, given)
@@ -209,23 +207,23 @@ def _load(source: Source) -> Machine:
     _check_equations(machine, configurations)
     _check_dependence(machine)
     _check_ties(machine)
-    proposed = proposal_notes(file.legcal, machine)
+    proposed = proposal_notes(source.block, machine)
     notes = mechanism_notes(machine, home_is_given=block.home is not None)
     return replace(machine, diagnostics=(*source.notes, *proposed, *notes))
 
 
-def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
+def _assemble(source: Source, block: LegcalBlock) -> Machine:
     """Return the mechanism, with its chain still open."""
-    file, urdf, yaml_path = source.file, source.urdf, source.path
+    urdf, closures, yaml_path = source.urdf, source.closures, source.path
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = _legs_in_order(
-        find_chains(bodies, urdf, block.base, block.platform, file.name_mot),
+        find_chains(bodies, urdf, block.base, block.platform, source.motors),
         bodies,
         urdf,
         block,
         yaml_path,
     )
-    _check_motors(file, chains, urdf, yaml_path)
+    _check_motors(source.motors, chains, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     _check_legs(chains, spatial=normals is None, path=yaml_path)
@@ -235,7 +233,10 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     shown = [solid.cylinder for solid in solids if solid.cylinder is not None]
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
-    chain = _closed_chain(urdf, closures, in_plane, block, chains)
+    stated = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
+    gains = {str(c.motor): stated.get(str(c.motor), 1.0) for c in chains if c.actuator is not None}
+    across = normals_of_closures(in_plane, closures, block, urdf)
+    chain = ClosedChain.of(urdf, closures, across, gains)
     home = None if block.home is None else block.home.motion()
     actuators = _actuators(chains, block, urdf, ends[0], yaml_path)
     legs = tuple(
@@ -244,7 +245,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
             leg_chain,
             ends,
             travel=_travel(leg_chain, urdf),
-            actuated=leg_chain.motor in file.name_mot,
+            actuated=leg_chain.motor in source.motors,
             spatial=normals is None,
             home=home,
             actuator=actuators.get(leg_chain.motor),
@@ -284,28 +285,9 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     return machine
 
 
-def _closed_chain(
-    urdf: Urdf,
-    closures: Sequence[Closure],
-    in_plane: Normals | None,
-    block: LegcalBlock,
-    chains: Sequence[LegChain],
-) -> ClosedChain:
-    """Return the tree with its closures and the gains of actuators."""
-    stated_gains = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
-    gains = {
-        str(c.motor): stated_gains.get(str(c.motor), 1.0) for c in chains if c.actuator is not None
-    }
-    try:
-        normals = normals_of_closures(in_plane, closures, block, urdf)
-        return ClosedChain(urdf.text, closures, normals, gains)
-    except ModelError as error:
-        raise error.told(lambda problem: problem.in_file(urdf.path)) from error
-
-
 def _actuators(
     chains: Sequence[LegChain], block: LegcalBlock, urdf: Urdf, T_body_base: Array, path: Path
-) -> dict[str | None, Actuator | None]:
+) -> dict[str | None, Actuator]:
     """Return the actuators by joint, with their numbers from the YAML."""
     stated = {
         chain.motor: actuator_of(
@@ -314,20 +296,21 @@ def _actuators(
         for chain in reversed(chains)  # its point is on the first leg
         if chain.actuator is not None
     }
-    problems = Problems(path)
-    motors = sorted(str(motor) for motor in stated)
+    problems, motors = Problems(path), sorted(str(motor) for motor in stated)
+    for key, named in (("motors", block.motors), ("home_readings", block.home_readings)):
+        for name in named or {}:
+            if name not in motors:
+                problems.add(
+                    f"legcal.{key}.{name} could not be used",
+                    "no motor of that name that carries rods",
+                    f"one of {', '.join(motors)}" if motors else "no entry",
+                    closest(name, motors) if motors else "remove it: sliders along legs carry none",
+                    name=f"legcal.{key}.{name}",
+                )
+    problems.raise_if_any()
     for name, entry in (block.motors or {}).items():
-        actuator, entry_name = stated.get(name), f"legcal.motors.{name}"
+        actuator, entry_name = stated[name], f"legcal.motors.{name}"
         refused = f"{entry_name} could not be used"
-        if actuator is None:
-            problems.add(
-                refused,
-                "no motor of that name that carries rods",
-                f"one of {', '.join(motors)}" if motors else "no entry",
-                closest(name, motors) if motors else "remove it: sliders along legs carry none",
-                name=entry_name,
-            )
-            continue
         try:
             pulses = Pulses.stated(entry.centre_us, entry.us_per_deg, turns=actuator.turns)
         except BadValue as bad:
@@ -354,26 +337,6 @@ def _in_modes(machine: Machine, T_base_platform: RigidTransform, q: Sequence[flo
     return replace(machine, legs=legs)
 
 
-def _check_home_readings(machine: Machine, given: Mapping[str, float]) -> None:
-    """Refuse readings at home of joints that are no actuators."""
-    joints, problems = sorted(a.joint for a in machine.actuators), Problems(machine.yaml_path)
-    for name in given:
-        if name not in joints:
-            problems.add(
-                f"legcal.home_readings.{name} could not be used",
-                "no actuator of that name",
-                f"one of {', '.join(joints)}",
-                closest(name, joints),
-            )
-    problems.raise_if_any()
-
-
-def _stated_or_middle(machine: Machine, given: Mapping[str, float]) -> list[float]:
-    """Return the readings of legs for a search for home: as *given*, else mid-travel."""
-    _check_home_readings(machine, given)
-    return [given.get(str(leg.prismatic), 0.5 * sum(leg.travel)) for leg in machine.legs]
-
-
 def _readings_at_home(
     machine: Machine, given: Mapping[str, float], drawn: Mapping[str, float]
 ) -> list[float]:
@@ -383,14 +346,13 @@ def _readings_at_home(
     the file is taken; without one they are refused.
     """
     path = machine.yaml_path
-    _check_home_readings(machine, given)
     B = B_at(machine, machine.home.as_matrix()[None])[0]
     q = [0.0] * machine.n_legs
     for j, leg in enumerate(machine.legs):
         if leg.actuator is None:
             continue
         joint = leg.actuator.joint
-        readings = [float(reading_of_rod(replace(leg, mode=m), B[j : j + 1])[0]) for m in (1, -1)]
+        readings = both_readings(leg, B[j])
         size, unit = SHOWN_IN[leg.reading_unit]
         choices = f"the readings {size * readings[0]:.1f} and {size * readings[1]:.1f} {unit}"
         inside = [bool(leg.in_travel(np.array([x]))[0]) for x in readings]
@@ -460,21 +422,21 @@ def _legs_in_order(
 
 
 def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
-    if any(step.connection.joint == joint for step in chain.steps):
+    if any(step.joint == joint for step in chain.steps):
         return True
     entry = urdf.joints[joint]
     return not entry.moves and bodies.body_of[entry.child] in chain.bodies
 
 
-def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    block = file.legcal
+def _check_names(source: Source) -> None:
+    block, urdf = source.block, source.urdf
     links, joints = set(urdf.links), set(urdf.joints)
     named: list[tuple[str, str, str, set[str]]] = [
-        *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(file.name_mot)),
+        *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(source.motors)),
         *(
             (f"closed_loop.{i}.{k}", frame, "frame (link or joint)", links | joints)
-            for i, pair in enumerate(file.closed_loop)
-            for k, frame in enumerate(pair)
+            for i, closure in enumerate(source.closures)
+            for k, frame in enumerate(closure.frames)
         ),
     ]
     if block is not None:
@@ -485,7 +447,7 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         ]
         if block.platform_joint is not None:
             named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
-    problems = Problems(path)
+    problems = Problems(source.path)
     for place, name, kind, candidates in named:
         if name not in candidates:
             problems.add(
@@ -493,11 +455,12 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
                 f"the {kind} '{name}', which is not in {urdf.path.name}",
                 remedy=closest(name, sorted(candidates)),
             )
-    for i, (frame_1, frame_2) in enumerate(file.closed_loop):
-        if frame_1 == frame_2:
+    for i, closure in enumerate(source.closures):
+        first, second = closure.frames
+        if first == second:
             place = f"closed_loop.{i} could not be used"
-            problems.add(place, f"'{frame_1}' twice", "two frames", "correct one of them")
-    _check_neighbours(file, urdf, problems)
+            problems.add(place, f"'{first}' twice", "two frames", "correct one of them")
+    _check_neighbours(source, problems)
     if block is not None and block.base == block.platform:
         problems.add(
             "legcal.platform could not be used",
@@ -508,14 +471,14 @@ def _check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     problems.raise_if_any()
 
 
-def _check_neighbours(file: MechanismFile, urdf: Urdf, problems: Problems) -> None:
+def _check_neighbours(source: Source, problems: Problems) -> None:
     """Note closures that name the frame of a neighbour instead of their own.
 
     Legs that meet in a point may share a frame: then no similar frame beside it is unused.
     """
-    places: dict[str, list[int]] = {}
-    for i, pair in enumerate(file.closed_loop):
-        for frame in set(pair):
+    urdf, places = source.urdf, dict[str, list[int]]()
+    for i, closure in enumerate(source.closures):
+        for frame in set(closure.frames):
             places.setdefault(frame, []).append(i)
     above = urdf.above
     parents = {joint.parent for joint in urdf.joints.values()}
@@ -542,43 +505,44 @@ def _check_neighbours(file: MechanismFile, urdf: Urdf, problems: Problems) -> No
 
 def _check_legs(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
     """Check the number of legs and, in a plane, that their type is supported."""
-    refused, n_d = "this mechanism is not supported", n_frame_legs(spatial=spatial)
-    if len(chains) < n_d:
-        raise OutOfClass(
-            refused,
-            f"{len(chains)} {'leg' if len(chains) == 1 else 'legs'} {_where(spatial=spatial)}",
+    n, n_d = len(chains), n_frame_legs(spatial=spatial)
+    holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
+    fixed = [any_joint(chain) for chain in chains if chain.platform.type is JointType.FIXED]
+    on_motors = any(chain.actuator is not None for chain in chains)
+    for is_so, found, needed, remedy in (
+        (
+            n < n_d,
+            f"{n} {'leg' if n == 1 else 'legs'} {_where(spatial=spatial)}",
             f"at least {n_d}, whose joints define the frames of base and platform",
-            _NOT_CALIBRATED,
-            path,
-        )
-    if len(chains) > MAX_LEGS:
-        raise OutOfClass(
-            refused,
-            f"{len(chains)} legs",
+            NOT_CALIBRATED,
+        ),
+        (
+            n > MAX_LEGS,
+            f"{n} legs",
             f"at most {MAX_LEGS}, since the work grows with their cube",
             "leave out passive legs",
-            path,
-        )
-    holding = [any_joint(chain) or "of a closure" for chain in chains if chain.is_joint]
-    if len(holding) > 1:
-        raise OutOfClass(
-            refused,
+        ),
+        (
+            len(holding) > 1,
             f"{len(holding)} joints directly between base and platform ({', '.join(holding)})",
             "one at most, which holds the platform",
             "check that each leg has its links between these joints",
-            path,
-        )
-    fixed = [chain for chain in chains if chain.platform.type is JointType.FIXED]
-    if fixed and not spatial:
-        raise OutOfClass(
-            f"the leg of joint '{any_joint(fixed[0])}' is not supported",
-            "it fixed to the platform of a planar mechanism",
+        ),
+        (
+            not spatial and fixed,
+            f"the leg of joint '{fixed[0] if fixed else ''}' fixed to the platform of a planar "
+            "mechanism",
             "a revolute joint there",
-            _NOT_CALIBRATED,
-            path,
-        )
-    if not spatial and any(chain.actuator is not None for chain in chains):
-        raise _plane_of_arms("whose joints at A move on carriages or arms", path)
+            NOT_CALIBRATED,
+        ),
+        (
+            not spatial and on_motors,
+            "a planar machine whose joints at A move on carriages or arms",
+            *_IN_SPACE,
+        ),
+    ):
+        if is_so:
+            raise OutOfClass("this mechanism is not supported", found, needed, remedy, path)
 
 
 def _where(*, spatial: bool) -> str:
@@ -592,56 +556,43 @@ def _check_plane_of_arms(urdf: Urdf, path: Path) -> None:
         return
     axes = [urdf.poses[joint.child].rotation.apply(joint.axis) for joint in moving]
     if all(parallel(axes[0], axis) for axis in axes):
-        raise _plane_of_arms(f"of arms: all its {len(axes)} axes are parallel", path)
+        found = f"a planar machine of arms: all its {len(axes)} axes are parallel"
+        raise OutOfClass("this mechanism is not supported", found, *_IN_SPACE, path)
 
 
-def _plane_of_arms(kind: str, path: Path) -> OutOfClass:
-    """Return the refusal of a planar machine that has no sliders along its legs."""
-    return OutOfClass(
-        "this mechanism is not supported",
-        f"a planar machine {kind}",
-        "a machine in space, or sliders along the legs",
-        _NOT_CALIBRATED,
-        path,
-    )
-
-
-def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
+def _check_motors(
+    motors: Sequence[str], chains: Sequence[LegChain], urdf: Urdf, path: Path
+) -> None:
     """Check that every motor is the slider of a leg, or carries rods."""
     moving = {chain.motor for chain in chains}
     problems = Problems(path)
-    for motor in file.name_mot:
+    for motor in motors:
         joint = urdf.joints[motor]
         lower, upper = joint.limits or (0.0, 0.0)
+        fault = None
         if motor not in moving and joint.type == "prismatic":
-            problems.add(
-                f"the motor '{motor}' is not supported",
-                "it on no leg",
-                "the slider of a leg",
-                "remove it from name_mot",
-            )
+            fault = "it on no leg", "the slider of a leg", "remove it from name_mot"
         elif motor not in moving:
-            problems.add(
-                f"the motor '{motor}' is not supported",
+            fault = (
                 f"a {joint.type} joint in name_mot that does not stand between the base and an "
                 "arm with rods",
                 "sliders of legs, or joints on the base that carry the joints of rods",
-                f"remove it from name_mot if it has no motor, otherwise {_NOT_CALIBRATED}",
+                f"remove it from name_mot if it has no motor, otherwise {NOT_CALIBRATED}",
             )
         elif joint.type == "continuous":
-            problems.add(
-                f"the motor '{motor}' could not be used",
+            fault = (
                 "a continuous joint",
                 "one with the limits of its readings",
                 "write its type as revolute, with <limit>",
             )
         elif joint.type == "revolute" and max(abs(lower), abs(upper)) > MAX_TURN:
-            problems.add(
-                f"the motor '{motor}' could not be used",
+            fault = (
                 f"the limits {lower:g} to {upper:g} rad",
                 "at most two turns either way",
                 "these look like degrees: write its limits, and its readings, in radian",
             )
+        if fault is not None:
+            problems.add(f"the motor '{motor}' could not be used", *fault)
     problems.raise_if_any(OutOfClass)
 
 
@@ -651,9 +602,9 @@ def _check_frames(machine: Machine) -> None:
     chosen = [machine.leg_names[j] for j in machine.frame_legs]
     refused, problems = "legcal.base_frame could not be used", Problems(machine.yaml_path)
     if len(chosen) != n_d:
-        where = _where(spatial=machine.spatial)
-        needed = f"{n_d} for a mechanism {where}"
-        problems.add(refused, f"{len(chosen)} legs", needed, f"name {n_d} legs")
+        needed = f"{n_d} for a mechanism {_where(spatial=machine.spatial)}"
+        found = f"{len(chosen)} legs ({', '.join(chosen)})"
+        problems.add(refused, found, needed, f"name {n_d} legs")
     problems.raise_if_any()
     for side in ("base", "platform"):
         try:
@@ -681,14 +632,16 @@ def _check_reach(machine: Machine) -> None:
     problems.raise_if_any()
 
 
-def _check_length(length: float, words: str, most: float, path: Path) -> None:
+def _check_length(
+    length: float, words: str, path: Path, least: float = 0.0, most: float = MAX_LENGTH
+) -> None:
     """Refuse a length [m] that is most likely in another unit, with *words* for it."""
-    if length > most:
+    if not least <= length <= most:
         raise ModelError(
             "the lengths could not be used",
-            words.format(f"{length:.4g}"),
-            f"at most {most:g} m",
-            _METRES,
+            words.format(f"{length:.4g} m"),
+            f"{least:g} to {most:g} m" if least else f"at most {most:g} m",
+            "write all lengths in metres (are they millimetres?)",
             path,
         )
 
@@ -697,7 +650,7 @@ def _check_spread(machine: Machine) -> None:
     """Check that the joints are within metres of each other, before the search for home."""
     for side, joints in (("base", machine.A_base), ("platform", machine.B_platform)):
         size = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        _check_length(size, f"the joints on the {side} {{}} m apart", MAX_LENGTH, machine.urdf_path)
+        _check_length(size, f"the joints on the {side} {{}} apart", machine.urdf_path)
 
 
 def _check_unit(machine: Machine) -> None:
@@ -705,25 +658,13 @@ def _check_unit(machine: Machine) -> None:
     path = machine.urdf_path
     lengths = np.linalg.norm(vectors_A_to_B(machine, machine.home), axis=1)
     fixed = np.array([leg.is_fixed_to_platform for leg in machine.legs])
-    odd = np.flatnonzero(~fixed & ((lengths < MIN_LENGTH) | (lengths > MAX_LENGTH)))
-    if len(odd):
-        raise ModelError(
-            "the lengths could not be used",
-            f"leg '{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home",
-            "1 mm to 20 m",
-            _METRES,
-            path,
-        )
+    for leg, length in zip(machine.legs, lengths.tolist(), strict=True):
+        if not leg.is_fixed_to_platform:
+            _check_length(length, f"leg '{leg.name}' {{}} long at home", path, MIN_LENGTH)
     for leg in machine.legs:
-        reach = leg.travel[1] - leg.travel[0]
-        if leg.is_motor and not leg.reads_angle and reach > MAX_LENGTH:
-            raise ModelError(
-                f"the travel of leg '{leg.name}' could not be used",
-                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m",
-                "at most 20 m",
-                "write the limits of its slider in metres (are they millimetres?)",
-                path,
-            )
+        if leg.is_motor and not leg.reads_angle:
+            reach = leg.travel[1] - leg.travel[0]
+            _check_length(reach, f"a travel of {{}} of leg '{leg.name}'", path)
     for leg, length in zip(machine.legs, np.where(fixed, lengths.max(), lengths), strict=True):
         seen = [(c.link, c.radius, f"along leg '{leg.name}'") for c in leg.cylinders]
         if leg.arm is not None:
@@ -769,7 +710,7 @@ def _check_ties(machine: Machine) -> None:
         if joints == {JointType.SPHERICAL}:
             remedy = (
                 "leave out redundant rods (between the same joints as another, a third one on a "
-                f"motor, those of a fourth arm), otherwise {_NOT_CALIBRATED}"
+                f"motor, those of a fourth arm), otherwise {NOT_CALIBRATED}"
             )
         raise OutOfClass(
             f"the mechanism '{machine.name}' is not supported",
@@ -803,7 +744,7 @@ def _check_across(machine: Machine) -> None:
         if gap > within or tilt > PERPENDICULAR:
             problems.add(
                 "the loops could not be closed",
-                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
+                f"{closure} {1e3 * gap:.3g} mm and "
                 f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move",
                 f"at most {1e3 * within:.2g} mm and {np.degrees(PERPENDICULAR):.2g} deg",
                 "correct the origins and axes along this leg",

@@ -8,7 +8,7 @@ of a body, constraint or geom type is refused, since it may be misspelt.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -22,21 +22,30 @@ from legcal.files.schema import closest
 from legcal.geometry.lines import cross
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
-from legcal.machine.files import MechanismFile
+from legcal.machine.chain import Closure
 from legcal.machine.spanning_tree import (
     EYE,
     FULL_TURN,
+    LinkFrame,
     Loop,
-    LoopKind,
     Source,
     UrdfBuilder,
     close_loops,
     mesh_xml,
     moving_groups,
     origin_xml,
+    parts_of,
     visual_xml,
 )
-from legcal.machine.urdf import MJCF, Urdf, XmlProblems, number_list, parse_urdf, parse_xml
+from legcal.machine.urdf import (
+    MJCF,
+    Urdf,
+    UrdfJointType,
+    XmlProblems,
+    number_list,
+    parse_urdf,
+    parse_xml,
+)
 
 WORLD = "world"
 MAX_PARTS = 5000
@@ -51,7 +60,6 @@ _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
 Attributes = Mapping[str, str]
 Defaults = dict[str, dict[str, str]]  # attributes of each element
-LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
 class BodyElement(NamedTuple):
@@ -89,14 +97,19 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
             "add them",
             path,
         )
-    frames, kinds = close_loops(loops, reader.tree, path)
+    closures = close_loops(loops, reader.tree, path)
     name = root.get("model", "").strip() or path.stem
     urdf = parse_urdf(path, reader.tree.robot(name), travel_needed=False)
-    urdf, dropped = _without_loose_bodies(urdf, frames, reader.tree, name)
+    urdf, dropped = _without_loose_bodies(urdf, closures, reader.tree, name)
     notes = (f"Free bodies that touch no loop were left out: {', '.join(dropped)}.",)
-    values = {joint: x for joint, x in reader.references.items() if joint in urdf.joints}
-    file = MechanismFile(closed_loop=frames, type=kinds, name_mot=motors)
-    return Source(path, file, replace(urdf, wording=MJCF), notes * bool(dropped), values)
+    return Source(
+        path,
+        replace(urdf, wording=MJCF),
+        closures,
+        motors,
+        notes=notes * bool(dropped),
+        values={joint: x for joint, x in reader.references.items() if joint in urdf.joints},
+    )
 
 
 class MjcfReader:
@@ -108,12 +121,12 @@ class MjcfReader:
 
     def __init__(self, root: etree._Element, problems: XmlProblems) -> None:
         self.root, self.problems = root, problems
-        self.tree = UrdfBuilder()
+        self._names: set[str] = set()  # taken names of links and joints
+        self.tree = UrdfBuilder(taken=self._names)
         self.poses: dict[str, RigidTransform] = {WORLD: EYE}  # pose of every body in the world
         self.references: dict[str, float] = {}  # values of joints in the file [rad] or [m]
         self._joints: dict[str, str] = {}  # type of every joint
         self.sites: dict[str, LinkFrame] = {}
-        self._names: set[str] = set()  # taken names of links and joints
         named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
         self._driven = frozenset(str(element.get("joint")) for element in named)
         self._defaults: dict[str, Defaults] = {"main": {}}
@@ -196,13 +209,17 @@ class MjcfReader:
         joints, bodies, visuals = self._contents(inside)
         at, T_at_body = part.body, T_parent_body
         if at == WORLD and self._is_free(joints):
-            self.tree.joint(self._unused(f"{name}_free"), "floating", at, name, T_at_body)
+            self.tree.joint(
+                self._unused(f"{name}_free"), "floating", (at, name), *parts_of(T_at_body)
+            )
             at, joints = name, []
         for i, joint in enumerate(joints):
             only, last = len(joints) == 1, i + 1 == len(joints)
             at, T_at_body = self._joint(joint, at, T_at_body, last=last, only=only)
         if at != name:
-            self.tree.joint(self._unused(f"{name}_fixed"), "fixed", at, name, T_at_body)
+            self.tree.joint(
+                self._unused(f"{name}_fixed"), "fixed", (at, name), *parts_of(T_at_body)
+            )
         self.tree.link(name, visuals)
         return bodies
 
@@ -237,7 +254,7 @@ class MjcfReader:
                     "frees a body that has other joints or is not on the world itself",
                     "a free joint stands alone in a body of <worldbody>",
                 )
-            self.tree.joint(name, "floating", at, part.body, T_at_body)
+            self.tree.joint(name, "floating", (at, part.body), *parts_of(T_at_body))
             return part.body, EYE
         if kind not in ("hinge", "slide", "ball"):
             self.problems.at(
@@ -251,7 +268,7 @@ class MjcfReader:
         child = part.body if last and centred else self._unused(f"{name}_link")
         if kind == "ball":
             axes = dict(zip("xyz", np.eye(3), strict=True))
-            self.tree.turns(name, at, child, T_at_body * T_body_joint, axes, self._names)
+            self.tree.turns(name, at, child, T_at_body * T_body_joint, axes)
         else:
             self._one_axis(part, attributes, name, kind, (at, child), T_at_body * T_body_joint)
         if child != part.body:
@@ -288,8 +305,9 @@ class MjcfReader:
                 ends = self._radians(limits[0]), self._radians(limits[1])
             limits = ends
         self.references[name] = zero
-        urdf_type = "prismatic" if kind == "slide" else "revolute"
-        self.tree.joint(name, urdf_type, *links, T_at_joint * to_zero, axis, limits)
+        origin = parts_of(T_at_joint * to_zero)
+        urdf_type: UrdfJointType = "prismatic" if kind == "slide" else "revolute"
+        self.tree.joint(name, urdf_type, links, *origin, axis, limits)
 
     def _range(self, element: etree._Element, attributes: Attributes) -> tuple[float, float] | None:
         """Return the limits of a joint, or None."""
@@ -331,7 +349,7 @@ class MjcfReader:
                 "write size, or fromto and size",
             )
             return ""
-        return visual_xml(origin_xml(part.T_body_frame * T), float(size[0]), length)
+        return visual_xml(origin_xml(*parts_of(part.T_body_frame * T)), float(size[0]), length)
 
     def _mesh(self, part: BodyElement, attributes: Attributes) -> str:
         """Return the ``<visual>`` of a mesh that MuJoCo shows (groups 0 to 2), else nothing."""
@@ -349,7 +367,7 @@ class MjcfReader:
         )
         T = part.T_body_frame * self._pose(part.element, attributes) * T_file_mesh.inv()
         file = str(Path(self._mesh_folder) / stated.get("file", ""))
-        return mesh_xml(origin_xml(T), file, np.ones(3) if scale is None else scale)
+        return mesh_xml(origin_xml(*parts_of(T)), file, np.ones(3) if scale is None else scale)
 
     def _between(
         self, element: etree._Element, attributes: Attributes
@@ -365,7 +383,7 @@ class MjcfReader:
 
     def _unused(self, name: str) -> str:
         """Return an unused name, and take it."""
-        unused = self.tree.unused(name, self._names)
+        unused = self.tree.unused(name)
         self._names.add(unused)
         return unused
 
@@ -392,14 +410,13 @@ class MjcfReader:
             ends = self._joined_sites(element) if by_site else self._joined_bodies(element)
             if ends is None or len(self.problems) > n_before:
                 continue
-            (link_1, T_1), (link_2, T_2) = ends
-            if link_1 == link_2:
-                self.problems.at(element, f"joins the body '{link_1}' to itself", "name two bodies")
+            if ends[0][0] == ends[1][0]:
+                found = f"joins the body '{ends[0][0]}' to itself"
+                self.problems.at(element, found, "name two bodies")
                 continue
             scale = self._numbers(element, attributes, "torquescale", (1,))
             is_point = element.tag == "connect" or (scale is not None and scale[0] == 0.0)
-            kind: LoopKind = "point" if is_point else "weld"
-            yield Loop(name, kind, (link_1, link_2), (T_1, T_2))
+            yield Loop(name, "3d" if is_point else "6d", ends)
 
     def _joined_sites(self, element: etree._Element) -> tuple[LinkFrame, LinkFrame] | None:
         sites = []
@@ -440,7 +457,7 @@ class MjcfReader:
             T_body1 = T_body1_body2 * T_body2
         return (names[0], T_body1), (names[1], T_body2)
 
-    def motors(self) -> list[str]:
+    def motors(self) -> tuple[str, ...]:
         """Return the joints with an encoder: driven joints, and measured slides."""
         motors: dict[str, None] = {}
         named = (*self.root.iterfind("actuator/*"), *self.root.iterfind("sensor/jointpos"))
@@ -471,7 +488,7 @@ class MjcfReader:
                 )
             elif kind == "slide" or element.tag != "jointpos":
                 motors[name] = None
-        return list(motors)
+        return tuple(motors)
 
     def _unknown(
         self, element: etree._Element, reference: str, name: str, candidates: Mapping[str, object]
@@ -639,13 +656,13 @@ def _span_space(axes: list[Array]) -> bool:
 
 
 def _without_loose_bodies(
-    urdf: Urdf, frames: list[list[str]], tree: UrdfBuilder, name: str
+    urdf: Urdf, closures: Sequence[Closure], tree: UrdfBuilder, name: str
 ) -> tuple[Urdf, list[str]]:
     """Return the tree without free bodies outside all closures, and the names of these."""
     moved = {j.child for j in urdf.joints.values() if j.moves and j.type != "floating"}
     loose = {
         link
-        for links, closed in moving_groups(urdf, frames)
+        for links, closed in moving_groups(urdf, closures)
         if not closed and moved.isdisjoint(links)
         for link in links
     }

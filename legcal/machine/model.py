@@ -356,10 +356,7 @@ MAX_ROUNDING = 1e-4  # of rotation matrices of callers, such as printed ones
 def pose_of(pose: Pose) -> RigidTransform:
     """Return a pose given as a transform of SciPy, an SE3 of Pinocchio or a matrix (4, 4) [m].
 
-    Raises
-    ------
-    UsageError
-        If it is no rigid motion.
+    Raises UsageError if it is no rigid motion.
     """
     if isinstance(pose, RigidTransform) and pose.single:
         return pose

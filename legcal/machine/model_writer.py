@@ -43,7 +43,7 @@ ROUNDING = 1e-15  # displacement that counts as none [mean leg lengths]
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
     """Return the complete YAML of a mechanism."""
-    closures = [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures]
+    closures = [(*c.frames, c.kind) for c in machine.chain.closures]
     motors = [str(machine.legs[j].prismatic) for j in machine.motors]
     return mechanism_yaml(closures, motors, _legcal_block(machine, urdf))
 
@@ -150,7 +150,7 @@ def write_calibrated_yaml(
     stated = (
         {} if is_xml(machine.yaml_path) else read_yaml(machine.yaml_path, FILE_KIND, ModelError)
     )
-    closures = {(c.frame_1, c.frame_2) for c in machine.chain.closures}
+    closures = {c.frames for c in machine.chain.closures}
     if (
         stated.get("legcal") is not None
         and not stated.get("joint_name")

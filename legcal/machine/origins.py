@@ -22,8 +22,8 @@ from legcal.geometry.motions import matrix_inverse, matrix_product
 from legcal.geometry.rotations import rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm
-from legcal.machine.chain import Bodies, Closure, rigid_bodies
-from legcal.machine.leg import Leg, LegChain, Step
+from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
+from legcal.machine.leg import Leg, LegChain
 from legcal.machine.model import Machine
 from legcal.machine.parameters import legs_in_links, twist_after
 from legcal.machine.urdf import Urdf, UrdfJoint, UrdfPatch, parse_urdf
@@ -34,6 +34,13 @@ _ROUNDING = 1e-14  # rotation that counts as none [rad]
 def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
     """Return the new origin of each joint with a number of a leg, and whether it is rotated."""
     handles = Handles(machine.urdf, machine.chain.closures, machine.platform_joint)
+    return _moved_origins(handles, machine, legs_in_links(machine, legs))
+
+
+def _moved_origins(
+    handles: Handles, machine: Machine, legs: Sequence[Leg]
+) -> dict[str, tuple[RigidTransform, bool]]:
+    """Return the same for legs in the links of base and platform."""
     origins: dict[str, tuple[RigidTransform, bool]] = {}
     moved = set[str]()  # motors of rods that are done
 
@@ -48,7 +55,7 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
         seen = seen.inv() if handle.is_inverse else seen
         origins[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
-    for leg, wanted in zip(machine.legs, legs_in_links(machine, legs), strict=True):
+    for leg, wanted in zip(machine.legs, legs, strict=True):
         chain = leg.urdf_chain
         at_base, at_platform = _ends(leg, wanted)
         grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
@@ -56,20 +63,19 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
             at_platform = _of_joint(leg, wanted, at_platform, grown[1])
         if chain.slider is not None:
             move(*_at_slider(handles, leg, chain, grown))
-        elif any(grown) and not chain.is_joint:
+        elif not chain.is_joint:
             move(*_in_rod(handles, leg, chain, grown))
         first, last = chain.steps[chain.actuator is not None], chain.steps[-1]
         base, platform = machine.base, machine.platform
         if chain.actuator is not None:
             carried = _carried(leg.actuator, wanted.actuator)
-            if carried.joint not in moved:
-                step, motion = chain.actuator, carried.motion
-                move(handles.of(step, step.near, base, leg.name), motion, base)
-                moved.add(carried.joint)
-            base = handles.link(chain.actuator, chain.actuator.far)
-            at_base = carried.onward(leg, wanted, handles.at_zero(chain, machine.base, base))
-        move(handles.of(first, first.near, base, leg.name), at_base, base)
-        move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
+            if leg.motor_label not in moved:
+                move(handles.of(chain.actuator, 0, base, leg.name), carried, base)
+                moved.add(leg.motor_label)
+            base = handles.link(chain.actuator, 1)
+            at_base = _onward(carried, leg, wanted, handles.at_zero(chain, machine.base, base))
+        move(handles.of(first, 0, base, leg.name), at_base, base)
+        move(handles.of(last, 1, platform, leg.name), at_platform, platform)
     return origins
 
 
@@ -82,7 +88,7 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
         if arm is None or other is None or chain.actuator is None:
             continue
         T_base_link = handles.at_zero(chain, machine.base, arm.link)
-        carried = _carried(leg.actuator, wanted.actuator).motion
+        carried = _carried(leg.actuator, wanted.actuator)
         before = arm.line.in_frame(T_base_link.inv().as_matrix())
         line = other.line.in_frame(carried.of(T_base_link).inv().as_matrix())
         along = (before.point - line.point) @ line.axis  # the position along the line is arbitrary
@@ -95,23 +101,19 @@ def moved_arms(machine: Machine, legs: Sequence[Leg]) -> list[tuple[Arm, RigidTr
 
 def with_separate_origins(
     urdf: Urdf, closures: Sequence[Closure], machine: Machine
-) -> tuple[Urdf, list[Closure]]:
+) -> tuple[Urdf, tuple[Closure, ...]]:
     """Return the tree of a machine and its closures with an origin for every number of a leg.
 
     Links are added as needed: between a joint and its child link, and for closure frames on links
     that carry other things. Our own layout needs none.
 
-    Raises
-    ------
-    OutOfClass
-        If a leg is welded several times between two of its joints.
+    Raises OutOfClass if a leg is welded several times between two of its joints.
     """
     changed = list(closures)
     while True:
         handles = Handles(urdf, changed, machine.platform_joint)
         try:
-            for leg in machine.legs:
-                _find_all(handles, leg, machine)
+            _moved_origins(handles, machine, machine.legs)
         except NoOriginError as missing:
             patch, names = UrdfPatch(urdf.content), {*urdf.links, *urdf.joints}
             if missing.joint is not None:
@@ -127,20 +129,7 @@ def with_separate_origins(
                 changed[missing.closure] = _with_frame(changed[missing.closure], frame, link)
             urdf = replace(parse_urdf(urdf.path, patch.content()), wording=urdf.wording)
         else:
-            return urdf, changed
-
-
-def _find_all(handles: Handles, leg: Leg, machine: Machine) -> None:
-    """Check that all origins of a leg can be found."""
-    chain = leg.urdf_chain
-    first, last = chain.steps[0], chain.steps[-1]
-    handles.of(first, first.near, machine.base, leg.name)
-    if chain.actuator is not None:
-        arm = handles.link(chain.actuator, chain.actuator.far)
-        handles.of(chain.steps[1], chain.steps[1].near, arm, leg.name)
-    handles.of(last, last.far, machine.platform, leg.name)
-    if chain.slider is None and not chain.is_joint:
-        _in_rod(handles, leg, chain, (0.0, 0.0))
+            return urdf, tuple(changed)
 
 
 def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
@@ -152,10 +141,8 @@ def _unused(name: str, taken: Set[str]) -> tuple[str, str]:
 
 def _with_frame(closure: Closure, old: str, new: str) -> Closure:
     """Return a closure with one of its frames renamed."""
-    frame_1, frame_2 = (
-        new if frame == old else frame for frame in (closure.frame_1, closure.frame_2)
-    )
-    return Closure(closure.kind, frame_1, frame_2)
+    first, second = (new if frame == old else frame for frame in closure.frames)
+    return Closure(closure.kind, (first, second))
 
 
 class Handle(NamedTuple):
@@ -184,26 +171,26 @@ class Handles:
         self._fixed = rigid_bodies(urdf, (), platform_joint)
         self.bodies: Bodies = rigid_bodies(urdf, closures, platform_joint)
 
-    def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
-        """Return the handle of a joint in a body."""
-        connection = step.connection
-        if connection.closure is not None:
-            return Handle(self._carrier(connection.closure, side), False)
-        joint = self._urdf.joints[str(connection.joint)]
-        if side == 0:
+    def of(self, step: Connection, side: int, body: str, leg: str) -> Handle:
+        """Return the handle of a joint in the near (0) or far body (1)."""
+        of_parent = side == 0 if step.is_forward else side == 1
+        if step.closure is not None:
+            return Handle(self._carrier(step.closure, 0 if of_parent else 1), False)
+        joint = self._urdf.joints[str(step.joint)]
+        if of_parent:
             return Handle(joint, False)
         if self._fixed.body_of[joint.child] == self._fixed.body_of[body]:
             return Handle(self._onward(joint, body), True)
         return self._weld(joint, body, leg)
 
-    def link(self, step: Step, side: int) -> str:
-        """Return the link on one side of a joint."""
-        connection = step.connection
-        if connection.closure is not None:
-            closure = self._closures[connection.closure]
-            return self._urdf.link_of((closure.frame_1, closure.frame_2)[side])
-        joint = self._urdf.joints[str(connection.joint)]
-        return (joint.parent, joint.child)[side]
+    def link(self, step: Connection, side: int) -> str:
+        """Return the link on the near (0) or far side (1) of a joint."""
+        if step.closure is not None:
+            links = [self._urdf.link_of(frame) for frame in self._closures[step.closure].frames]
+        else:
+            joint = self._urdf.joints[str(step.joint)]
+            links = [joint.parent, joint.child]
+        return links[side if step.is_forward else 1 - side]
 
     def at_zero(self, chain: LegChain, base: str, link: str) -> RigidTransform:
         """Return the pose in the base link of the link behind a motor, at reading zero."""
@@ -224,8 +211,7 @@ class Handles:
         ours, theirs = self._fixed.body_of[body], self._fixed.body_of[joint.child]
         problem: NoOriginError | None = None
         for i, closure in enumerate(self._closures):
-            frames = closure.frame_1, closure.frame_2
-            on = [self._fixed.body_of[self._urdf.link_of(frame)] for frame in frames]
+            on = [self._fixed.body_of[self._urdf.link_of(frame)] for frame in closure.frames]
             if closure.kind == "6d" and set(on) == {ours, theirs}:
                 for wanted in (ours, theirs):
                     try:
@@ -246,7 +232,7 @@ class Handles:
 
     def _carrier(self, closure: int, side: int) -> UrdfJoint:
         """Return the fixed joint under a closure frame, which must carry nothing else."""
-        frame = (self._closures[closure].frame_1, self._closures[closure].frame_2)[side]
+        frame = self._closures[closure].frames[side]
         link = self._urdf.link_of(frame)
         above = self._urdf.above.get(link)
         if above is not None and not above.moves and self._carries_only(link, None, closures=1):
@@ -256,7 +242,7 @@ class Handles:
     def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
         """Return whether a link carries at most one joint, and this number of closure frames."""
         joints = self._urdf.below[link]
-        frames = [f for c in self._closures for f in (c.frame_1, c.frame_2)]
+        frames = [frame for closure in self._closures for frame in closure.frames]
         uses = sum(self._urdf.link_of(frame) == link for frame in frames)
         return joints == ([] if below is None else [below]) and uses == closures
 
@@ -290,31 +276,24 @@ class Motion:
         return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
 
 
-class _Carried(NamedTuple):
-    """The motion of the motor of a rod in the base link, with its link at reading zero."""
-
-    joint: str
-    motion: Motion
-
-    def onward(self, leg: Leg, wanted: Leg, T_base_arm: RigidTransform) -> Motion:
-        """Return the motion of the joint at A in the arm, after the motion of the motor."""
-        before = self.motion.of(RigidTransform.from_translation(leg.A))
-        axis = leg.base_axis
-        if axis is not None and self.motion.turn is not None:
-            axis = np.asarray(self.motion.turn.apply(axis))
-        A = np.asarray(before.translation)
-        onward = Motion(wanted.A - A, A, _turn(axis, wanted.base_axis))
-        return onward.seen_from(self.motion.of(T_base_arm).inv())
-
-
-def _carried(actuator: Actuator | None, wanted: Actuator | None) -> _Carried:
-    """Return the motion of a motor: its axis onto another, and its point if it turns."""
+def _carried(actuator: Actuator | None, wanted: Actuator | None) -> Motion:
+    """Return the motion of a motor in the base link: its axis, and its point if it turns."""
     if actuator is None or wanted is None:
         raise ValueError("a rod that hangs on a motor has its numbers")
     turn = _turn(actuator.axis, wanted.axis, directed=True)
     shift = wanted.point - actuator.point if actuator.turns else np.zeros(3)
     along = shift @ wanted.axis  # the position along the axis is arbitrary
-    return _Carried(actuator.joint, Motion(shift - along * wanted.axis, actuator.point, turn))
+    return Motion(shift - along * wanted.axis, actuator.point, turn)
+
+
+def _onward(carried: Motion, leg: Leg, wanted: Leg, T_base_arm: RigidTransform) -> Motion:
+    """Return the motion of the joint at A in the arm at reading zero, after that of its motor."""
+    A = np.asarray(carried.of(RigidTransform.from_translation(leg.A)).translation)
+    axis = leg.base_axis
+    if axis is not None and carried.turn is not None:
+        axis = np.asarray(carried.turn.apply(axis))
+    onward = Motion(wanted.A - A, A, _turn(axis, wanted.base_axis))
+    return onward.seen_from(carried.of(T_base_arm).inv())
 
 
 def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
@@ -378,12 +357,13 @@ def _at_slider(
     slider = chain.slider
     if slider is None:
         raise ValueError("a rod has no slider")
-    body = slider.connection.bodies[0]  # body of the parent of the joint
-    if slider.near == 0:
+    side = 0 if slider.is_forward else 1  # of the parent of the joint
+    body = slider.bodies[side]
+    if slider.is_forward:
         point, along = chain.line_in(chain.n_lower, chain.A)
     else:
         point, along = chain.line_in(chain.n_upper, chain.B)
-    handle = handles.of(slider, 0, body, leg.name)._replace(is_inverse=slider.near != 0)
+    handle = handles.of(slider, side, body, leg.name)._replace(is_inverse=not slider.is_forward)
     return handle, _screw(leg.sign * along, point, grown), body
 
 
@@ -394,9 +374,9 @@ def _in_rod(
     below, above = chain.steps[chain.n_lower - 1], chain.steps[chain.n_lower]
     body = chain.bodies[chain.n_lower - 1]
     try:
-        handle = handles.of(above, above.near, handles.link(below, below.far), leg.name)
+        handle = handles.of(above, 0, handles.link(below, 1), leg.name)
     except NoOriginError:
-        handle = handles.of(below, below.far, handles.link(above, above.near), leg.name)
+        handle = handles.of(below, 1, handles.link(above, 0), leg.name)
         handle = handle._replace(is_inverse=not handle.is_inverse)
     point, along = chain.line_in(chain.n_lower, chain.A)
     return handle, _screw(along, point, grown), body

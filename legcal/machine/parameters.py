@@ -38,12 +38,16 @@ _BLOCKS = (
     *(range(3), range(3, 6), (6,), (7, 8), (9, 10), (11,)),
     *((12, 13), (14, 15), (16,), (17, 18), (19, 20)),  # those of its actuator
 )
-_LOCAL_NAMES = (
+# By column: names after the leg or its motor, and units.
+_NAMES = (
     *(f"{side}.{axis}" for side in ("base", "platform") for axis in "xyz"),
     "offset",
     *(f"{side}_axis.{angle}" for side in ("base", "platform") for angle in (1, 2)),
     "twist",
+    *("axis.1", "axis.2", "axis_point.1", "axis_point.2", "gain"),
+    *("arm_axis.1", "arm_axis.2", "arm_point.1", "arm_point.2"),
 )
+_UNITS = (*["m"] * 7, *["rad"] * 5, "rad", "rad", "m", "m", "", "rad", "rad", "m", "m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,56 +94,27 @@ def parametrize(
         if j not in frame_legs and leg.is_fixed_to_platform and leg.platform_axis is not None:
             # B is arbitrary on the line
             free[j, columns.B.start + int(np.argmax(np.abs(leg.platform_axis)))] = False
-    parameters: list[tuple[str, str]] = []
+    number, units = dict[str, int](), dict[str, str]()
     place = np.full(free.shape, -1, dtype=np.intp)
     for block in _BLOCKS:
         for j, leg in enumerate(legs):
             for column in block:
                 if not free[j, column]:
                     continue
-                if column < columns.OWN:
-                    name, unit = f"{names[j]}.{_local_name(leg, column)}", _unit(column)
-                else:
-                    name, unit = _name_of_actuator(leg, column)
-                    shared = next((i for i, (n, _) in enumerate(parameters) if n == name), None)
-                    if shared is not None:
-                        place[j, column] = shared
-                        continue
-                place[j, column] = len(parameters)
-                parameters.append((name, unit))
-    return Parametrization(tuple(n for n, _ in parameters), tuple(u for _, u in parameters), place)
+                name = _name(names[j], leg, column)
+                place[j, column] = number.setdefault(name, len(number))  # motors are shared
+                units[name] = _UNITS[column]
+    return Parametrization(tuple(number), tuple(units.values()), place)
 
 
-def _local_name(leg: Leg, column: int) -> str:
-    """Return the name of a number of the leg itself."""
-    is_length = column == LegColumns.LENGTH and leg.kind is LegKind.CONSTANT
-    return "length" if is_length else _LOCAL_NAMES[column]
-
-
-def _unit(column: int) -> str:
-    """Return the unit of a number."""
-    return "m" if column <= LegColumns.LENGTH else "rad"
-
-
-def _name_of_actuator(leg: Leg, column: int) -> tuple[str, str]:
-    """Return the name and the unit of a number of the actuator of a leg."""
-    actuator = leg.actuator
-    if actuator is None:
-        raise ValueError("a leg that hangs on no actuator has no numbers of one")
-    if column == ActuatorColumns.GAIN:
-        return f"{actuator.joint}.gain", ""
-    axis = "axis" if actuator.turns else "direction"
-    vector, columns, unit = next(
-        (vector, columns, unit)
-        for vector, columns, unit in (
-            (axis, ActuatorColumns.AXIS, "rad"),
-            ("axis_point", ActuatorColumns.POINT, "m"),
-            ("arm_axis", ActuatorColumns.ARM_AXIS, "rad"),
-            ("arm_point", ActuatorColumns.ARM_POINT, "m"),
-        )
-        if columns.start <= column < columns.stop
-    )
-    return f"{actuator.joint}.{vector}.{column - columns.start + 1}", unit
+def _name(leg_name: str, leg: Leg, column: int) -> str:
+    """Return the name of a number of a leg, or of its actuator."""
+    name = _NAMES[column]
+    if column >= LegColumns.OWN:
+        moves = name if leg.reads_angle else name.replace("axis", "direction")
+        return f"{leg.motor_label}.{moves}"
+    is_length = name == "offset" and leg.kind is LegKind.CONSTANT
+    return f"{leg_name}.{'length' if is_length else name}"
 
 
 def is_held_by_default(name: str) -> bool:
@@ -504,6 +479,14 @@ def sparse_basis(basis: Array) -> Array:
 
 
 _MAX_GROUPS = 4  # groups of joints named in one direction
+_OF_ACTUATOR = {
+    "direction": ("direction", "directions"),
+    "axis": ("axis", "axes"),
+    "axis_point": ("place of the axis", "places of the axes"),
+    "arm_axis": ("direction of the arm", "directions of the arms"),
+    "arm_point": ("place of the arm", "places of the arms"),
+    "gain": ("gain", "gains"),
+}
 _NOUN = {
     "base": ("base joint", "base joints"),
     "platform": ("platform joint", "platform joints"),
@@ -515,16 +498,9 @@ _NOUN = {
     "radius": ("radius of leg", "radii of legs"),
     "board": ("size of the board on", "sizes of the boards on"),
     "": ("camera", "cameras"),
+    **{kind: (f"{what} of", f"{several} of") for kind, (what, several) in _OF_ACTUATOR.items()},
 }
 _BOARDS = {"board.scale": "the base", "platform_board.scale": "the platform"}
-_NOUN_OF_ACTUATOR = {
-    "direction": ("direction of", "directions of"),
-    "axis": ("axis of", "axes of"),
-    "axis_point": ("place of the axis of", "places of the axes of"),
-    "arm_axis": ("direction of the arm of", "directions of the arms of"),
-    "arm_point": ("place of the arm of", "places of the arms of"),
-    "gain": ("gain of", "gains of"),
-}
 
 
 def list_in_words(words: Sequence[str]) -> str:
@@ -568,14 +544,14 @@ def parameters_in_words(parameters: Sequence[str], leg_names: Sequence[str]) -> 
     groups: dict[tuple[str, str], list[str]] = {}
     for (kind, owner), letters in coordinates.items():
         axes = list_in_words(sorted(letters))
-        if kind == "radius" or kind in _NOUN_OF_ACTUATOR:  # tube and rod, two angles
+        if kind == "radius" or kind in _OF_ACTUATOR:  # tube and rod, two angles
             axes = ""
         elif kind.endswith("_axis"):
             axes = f"angle{'s' * (len(letters) > 1)} {axes}"
         groups.setdefault((kind, axes), []).append(owner)
     phrases = []
     for (kind, axes), owners in groups.items():
-        noun = (_NOUN | _NOUN_OF_ACTUATOR)[kind][len(owners) > 1]
+        noun = _NOUN[kind][len(owners) > 1]
         labels = leg_labels(leg_names)
         legs = [labels[name] for name in leg_names if name in owners]
         ordered = [*legs, *(owner for owner in owners if owner not in leg_names)]
@@ -597,6 +573,6 @@ def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
     parameter = ParameterId.parse(name)
     if parameter.owner in leg_names and parameter.kind in _NOUN:
         return parameter.owner, parameter.kind, parameter.component
-    if parameter.kind in _NOUN_OF_ACTUATOR:
+    if parameter.kind in _OF_ACTUATOR:
         return parameter.owner, parameter.kind, ""
     return parameter.owner, "", parameter.kind

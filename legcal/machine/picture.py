@@ -192,7 +192,7 @@ def draw_machine(
             _frame(canvas, name, on_paper(T.apply(tips)), names)
         shown = [(m, on_paper(m.points)) for m in marks if is_plan or not m.only_plan]
         _draw_marks(canvas, shown, names)
-    step = _round_length(100.0 / scale)
+    step = round_length(100.0 / scale)
     canvas.segment((12.0, foot), (12.0 + step * scale, foot), BASE_COLOUR, 2.0)
     canvas.text(18.0 + step * scale, foot + 4.0, f"{1e3 * step:g} mm")
     for k, text in enumerate(legend, 1):
@@ -296,7 +296,7 @@ def _legend(machine: Machine, width: float) -> list[str]:
             for line in wrap(text, most)]  # fmt: skip
 
 
-def _round_length(length: float) -> float:
+def round_length(length: float) -> float:
     """Return the largest length of 1, 2 or 5 times a power of ten that is not longer."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))

@@ -6,6 +6,7 @@ See :mod:`legcal.machine.actuator` for how A moves with the reading of its actua
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -156,6 +157,11 @@ def reading_of_rod(leg: Leg, B: Array) -> Array:
     q = angle / actuator.gain
     turn = 2.0 * np.pi / actuator.gain
     return np.asarray(q - turn * np.round((q - middle) / turn))
+
+
+def both_readings(leg: Leg, B: Array) -> list[float]:
+    """Return the two readings at which a rod reaches a point B (3,) in the base frame."""
+    return [float(reading_of_rod(replace(leg, mode=mode), B[None])[0]) for mode in (1, -1)]
 
 
 def rod_mode(leg: Leg, q: float, B: Array) -> int:

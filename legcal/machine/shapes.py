@@ -35,11 +35,11 @@ from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_of, m
 from legcal.geometry.rotations import nearest_rotation, rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator, Arm, Line
-from legcal.machine.chain import Bodies
+from legcal.machine.chain import Bodies, Connection
 from legcal.machine.classification import joint_tolerance
-from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain, Step
+from legcal.machine.leg import Cover, Cylinder, JointType, Leg, LegChain
 from legcal.machine.meshes import first_hits, mesh_file, mesh_of_file, ray_caster, read_mesh
-from legcal.machine.spanning_tree import origin_xml, visual_xml
+from legcal.machine.spanning_tree import origin_xml, parts_of, visual_xml
 from legcal.machine.urdf import Urdf, number_list, origins_of
 
 PARALLEL = 1e-6
@@ -178,14 +178,12 @@ def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
     """Return the side (A or B) of each body on the axis of the leg, with u from A to B."""
     halves: dict[str, Half] = {}
 
-    def turns(body: int, side: Literal["base", "platform"], point: Array, step: Step) -> bool:
+    def turns(body: int, side: Literal["base", "platform"], point: Array, step: Connection) -> bool:
         """Take a body, and return whether the joint behind it is a revolute about the leg."""
         at, u = chain.line_in(body, point)
         halves[chain.bodies[body - 1]] = side, at, leg.sign * u
-        axis = step.line(step.far if side == "base" else step.near)[1]
-        return step.connection.type == "revolute" and bool(
-            np.linalg.norm(cross(axis, u)) < PARALLEL
-        )
+        axis = step.line(int(side == "base"))[1]
+        return step.type == "revolute" and bool(np.linalg.norm(cross(axis, u)) < PARALLEL)
 
     for k in reversed(range(min(chain.n_lower, len(chain.bodies)))):
         if not turns(k + 1, "base", chain.A, chain.steps[k]):
@@ -194,7 +192,7 @@ def halves_of_leg(leg: Leg, chain: LegChain) -> dict[str, Half]:
         return halves
     if leg.is_fixed_to_platform:
         last, (B, u) = chain.steps[-1], chain.line_in(-1, chain.B)
-        halves[last.connection.bodies[last.far]] = "platform", B, leg.sign * u
+        halves[last.bodies[1]] = "platform", B, leg.sign * u
     for k in range(chain.n_upper, len(chain.steps)):
         if not turns(k, "platform", chain.B, chain.steps[k]):
             break
@@ -256,7 +254,7 @@ def with_mesh_cylinders(
 
     With a *radius* [m] each leg without a cylinder of its own gets one of it.
     """
-    axes, parts_of = _axes(legs, bodies, base), _RoundParts(urdf.path, coaxial_tolerance(legs))
+    axes = _axes(legs, bodies, base)
     added: dict[str, list[str]] = {}
     parts: dict[tuple[str, str, float], list[str]] = {}  # legs by mesh, diameter, length
     for link in urdf.robot().findall("link"):
@@ -265,7 +263,7 @@ def with_mesh_cylinders(
             found = [
                 (part, visual)
                 for visual in link.findall("visual")
-                if (part := parts_of.about(visual, bodies.T_body_link[name], axis))
+                if (part := _round_part(urdf.path, visual, bodies.T_body_link[name], axis))
             ]
             if not found:
                 continue
@@ -350,49 +348,25 @@ def _drawn(bodies: Bodies, link: str, axis: Axis, radius: float) -> str:
     middle = axis.origin + 0.5 * (axis.start + axis.end) * axis.along
     turn = rotation_between(np.array([0.0, 0.0, 1.0]), axis.along).as_matrix()
     T = matrix_product(matrix_inverse(bodies.T_body_link[link]), matrix_of(turn, middle))
-    at = origin_xml(RigidTransform.from_matrix(T))
+    at = origin_xml(*parts_of(RigidTransform.from_matrix(T)))
     return visual_xml(at, float(radius), float(axis.end - axis.start))
 
 
-@dataclass(frozen=True, eq=False)
-class _RoundParts:
-    """The cylinders of mesh files; a mesh that occurs several times is cut once.
-
-    Axes that are the same in the frame of the file, up to *within* [m], have the same cylinder.
-    """
-
-    urdf_path: Path
-    within: float
-    # Both ends of an axis, the position of the first on it, and the cylinder, by mesh.
-    known: dict[int, list[tuple[Array, float, tuple[float, float, float] | None]]] = field(
-        default_factory=dict
-    )
-
-    def about(
-        self, visual: etree._Element, T_body_link: Array, axis: Axis
-    ) -> tuple[float, float, float] | None:
-        """Return radius, start and end [m] of the longest cylinder about an axis, or None."""
-        mesh = visual.find("geometry/mesh")
-        if mesh is None or mesh_file(self.urdf_path, mesh.get("filename", "")) is None:
-            return None
-        try:
-            corners, triangles = mesh_of_file(self.urdf_path, visual)
-        except ValueError:  # pictures state the reason
-            return None
-        T = matrix_inverse(matrix_product(T_body_link, origins_of([visual])[0]))
-        origin, along = matrix_applied(T, axis.origin), T[:3, :3] @ axis.along
-        turn = rotation_between(along, np.array([0.0, 0.0, 1.0])).as_matrix()
-        seen = (corners - origin) @ turn.T
-        low = max(axis.start, float(seen[:, 2].min()))
-        high = min(axis.end, float(seen[:, 2].max()))
-        ends = origin + np.array([[low], [high]]) * along
-        fits = self.known.setdefault(id(corners), [])
-        for there, start, part in fits:
-            if np.abs(ends - there).max() <= self.within:
-                shift = low - start
-                return None if part is None else (part[0], part[1] + shift, part[2] + shift)
-        fits.append((ends, low, cylinder_about_z(seen, triangles, low, high)))
-        return fits[-1][2]
+def _round_part(
+    urdf_path: Path, visual: etree._Element, T_body_link: Array, axis: Axis
+) -> tuple[float, float, float] | None:
+    """Return radius, start and end [m] of the longest cylinder of a mesh about an axis, or None."""
+    mesh = visual.find("geometry/mesh")
+    if mesh is None or mesh_file(urdf_path, mesh.get("filename", "")) is None:
+        return None
+    try:
+        corners, triangles = mesh_of_file(urdf_path, visual)
+    except ValueError:  # pictures state the reason
+        return None
+    T = matrix_inverse(matrix_product(T_body_link, origins_of([visual])[0]))
+    turn = rotation_between(T[:3, :3] @ axis.along, np.array([0.0, 0.0, 1.0])).as_matrix()
+    seen = (corners - matrix_applied(T, axis.origin)) @ turn.T
+    return cylinder_about_z(seen, triangles, axis.start, axis.end)
 
 
 def cylinder_about_z(
@@ -602,6 +576,12 @@ class Occluder:
         return np.unique(np.round(planes, 12), axis=0)
 
     @property
+    def is_flat(self) -> bool:
+        """Whether it has no volume."""
+        middle = self.corners.mean(axis=0)
+        return bool(np.linalg.svd(self.corners - middle, compute_uv=False)[-1] <= EMPTY)
+
+    @property
     def leg(self) -> int:
         """The leg that carries it, or -1."""
         return self.carrier.leg if isinstance(self.carrier, LegHalf) else -1
@@ -807,7 +787,7 @@ def occluders_of(
     """Return the occluders of a file: all visuals that are not measured and can be placed."""
     base, platform = ends
     places = _places(legs, bodies, base, platform, normals)
-    occluders = []
+    occluders = list[Occluder]()
     for solid in shown:
         body = bodies.body_of[solid.link]
         if body not in places:
@@ -821,8 +801,8 @@ def occluders_of(
             prismatic = prismatic_part(corners, solid.triangles)
             if prismatic is not None and _surrounds(whole, prismatic):
                 parts.append(Occluder(solid.link, carrier, prismatic))
-        occluders += [swept for swept in map(_swept, parts) if not _is_flat(swept)]
-    return tuple(occluders)
+        occluders += map(_swept, parts)
+    return tuple(occluder for occluder in occluders if not occluder.is_flat)
 
 
 def _surrounds(mesh: Occluder, prismatic: Array) -> bool:
@@ -830,12 +810,6 @@ def _surrounds(mesh: Occluder, prismatic: Array) -> bool:
     low, high = prismatic[:, 2].min(), prismatic[:, 2].max()
     closed = sum(max(0.0, min(b, high) - max(a, low)) for a, b in _enclosed(mesh, 0.0))
     return bool(closed > 0.5 * (high - low))
-
-
-def _is_flat(occluder: Occluder) -> bool:
-    corners = occluder.corners
-    extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
-    return bool(extent[-1] <= EMPTY)
 
 
 def _swept(occluder: Occluder) -> Occluder:
@@ -934,9 +908,9 @@ def _roll(
 def _turns_leg(chain: LegChain, i: int) -> bool:
     """Return whether a joint of a leg is a revolute about it, or a sphere."""
     step = chain.steps[i]
-    if step.connection.type != "revolute":
-        return step.connection.type == "sphere"
-    axis = chain.poses[i][:3, :3] @ step.line(step.near)[1]
+    if step.type != "revolute":
+        return step.type == "sphere"
+    axis = chain.poses[i][:3, :3] @ step.line(0)[1]
     return bool(np.linalg.norm(cross(axis, chain.u)) < ALONG)
 
 

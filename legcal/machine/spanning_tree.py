@@ -6,12 +6,12 @@ a ``6d`` pair.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from math import pi
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -21,12 +21,13 @@ from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.geometry.rotations import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.chain import Closure
-from legcal.machine.files import MAX_LOOPS, ClosureKind, MechanismFile
+from legcal.machine.chain import Closure, ClosureKind
+from legcal.machine.files import MAX_LOOPS, LegcalBlock
 from legcal.machine.urdf import (
     LOOP_TAGS,
     URDF_LOOPS,
     Urdf,
+    UrdfJointType,
     XmlProblems,
     checked_tree,
     number_list,
@@ -39,8 +40,10 @@ class Source:
     """A mechanism as read from one of the formats."""
 
     path: Path  # file with the loops, for messages
-    file: MechanismFile  # closures, motors and the ``legcal`` block
     urdf: Urdf  # the tree
+    closures: tuple[Closure, ...]  # in the order of the file
+    motors: tuple[str, ...]  # joints that have an encoder
+    block: LegcalBlock | None = None
     notes: tuple[str, ...] = ()  # notes on the conversion, one sentence each
     values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
@@ -50,15 +53,10 @@ class Source:
     platform: str | None = None
     leg_radius: float | None = None  # stated radius of legs without a cylinder [m]
 
-    @property
-    def closures(self) -> list[Closure]:
-        """The closures in the order of the file."""
-        pairs = zip(self.file.closed_loop, self.file.type, strict=True)
-        return [Closure(kind, *ends) for ends, kind in pairs]
-
 
 FULL_TURN = 2.0 * pi
 EYE = RigidTransform.identity()
+ZERO, UNTURNED = np.zeros(3), np.eye(3)
 
 
 @dataclass
@@ -67,10 +65,11 @@ class UrdfBuilder:
 
     links: dict[str, str] = field(default_factory=dict)  # lines of all links, by name
     joints: dict[str, str] = field(default_factory=dict)  # lines of all joints, by name
+    taken: set[str] = field(default_factory=set)  # names of others
 
-    def unused(self, name: str, others: Set[str] = frozenset()) -> str:
+    def unused(self, name: str) -> str:
         """Return a name unused by links and joints: the given one, or it with a number."""
-        taken = self.links.keys() | self.joints.keys() | others
+        taken = self.links.keys() | self.joints.keys() | self.taken
         number, unused = 1, name
         while unused in taken:
             number += 1
@@ -85,35 +84,21 @@ class UrdfBuilder:
     def joint(
         self,
         name: str,
-        kind: str,
-        parent: str,
-        child: str,
-        T_parent_origin: RigidTransform = EYE,
+        kind: UrdfJointType,
+        links: tuple[str, str],  # parent and child
+        xyz: Array = ZERO,
+        rotation: Array = UNTURNED,
         axis: Array | None = None,
         limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
     ) -> None:
-        """Add a joint; ``axis`` and ``limits`` [rad or m] apply to moving joints."""
-        moving = "" if axis is None else axis_xml(axis) + limit_xml(limits)
-        xyz, rotation = np.asarray(T_parent_origin.translation), T_parent_origin.rotation
-        self.connect(name, kind, (parent, child), xyz, rotation.as_matrix(), moving)
-
-    def connect(
-        self,
-        name: str,
-        kind: str,
-        links: tuple[str, str],
-        xyz: Array | None = None,
-        rotation: Array | None = None,
-        moving: str = "",
-    ) -> None:
-        """Connect two links, with XML for axis and limits; frames coincide without numbers."""
+        """Add a joint; ``limits`` [rad or m] apply to one with an axis."""
         parent, child = (_quoted(link) for link in links)
-        at = origin_xml_at(
-            np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation
-        )
+        moving = "" if axis is None else f'<axis xyz="{_numbers(axis)}"/>'
+        if axis is not None and kind in ("revolute", "prismatic"):
+            moving += _limit_xml(limits)
         self.joints[name] = (
             f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
-            f"<child link={child}/>{at}{moving}</joint>"
+            f"<child link={child}/>{origin_xml(xyz, rotation)}{moving}</joint>"
         )
 
     def turns(
@@ -123,43 +108,41 @@ class UrdfBuilder:
         child: str,
         T_parent_origin: RigidTransform,
         axes: Mapping[str, Array],
-        taken: Set[str] = frozenset(),
     ) -> None:
         """Add a ball or universal joint as revolutes, by their letters, with links between them."""
         last = [*axes][-1]
         for letter, axis in axes.items():
-            after = child if letter == last else self.unused(f"{name}_{letter}_link", taken)
+            after = child if letter == last else self.unused(f"{name}_{letter}_link")
             if after != child:
                 self.link(after)
-            joint = self.unused(f"{name}_{letter}", taken)
-            self.joint(joint, "revolute", parent, after, T_parent_origin, axis)
+            joint = self.unused(f"{name}_{letter}")
+            self.joint(joint, "revolute", (parent, after), *parts_of(T_parent_origin), axis)
             parent, T_parent_origin = after, EYE
 
-    def body(self) -> str:
-        """Return the lines of all links and joints."""
-        return "\n".join([*self.links.values(), *self.joints.values()])
+    def elements(self) -> list[etree._Element]:
+        """Return all links and joints, each on a line of its own."""
+        elements = [
+            etree.fromstring(line) for line in (*self.links.values(), *self.joints.values())
+        ]
+        for element in elements:
+            element.tail = "\n"
+        return elements
 
     def robot(self, name: str) -> bytes:
         """Return the whole URDF."""
         head = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name={_quoted(name)}>\n'
-        return f"{head}{self.body()}\n</robot>\n".encode()
+        lines = "\n".join([*self.links.values(), *self.joints.values()])
+        return f"{head}{lines}\n</robot>\n".encode()
 
 
-def origin_xml(T_parent_origin: RigidTransform) -> str:
-    """Return the ``<origin>`` of a rigid motion [m, rad]."""
-    return origin_xml_at(
-        np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix()
-    )
+def parts_of(T: RigidTransform) -> tuple[Array, Array]:
+    """Return translation (3,) [m] and rotation matrix of a motion."""
+    return np.asarray(T.translation), T.rotation.as_matrix()
 
 
-def origin_xml_at(xyz: Array, rotation: Array) -> str:
+def origin_xml(xyz: Array, rotation: Array) -> str:
     """Return the ``<origin>`` at a point [m] with a rotation matrix."""
     return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(roll_pitch_yaw(rotation))}"/>'
-
-
-def axis_xml(axis: Array) -> str:
-    """Return the ``<axis>`` of a joint."""
-    return f'<axis xyz="{_numbers(axis)}"/>'
 
 
 def visual_xml(at: str, radius: float, length: float) -> str:
@@ -179,7 +162,7 @@ def box_xml(at: str, sizes: Array) -> str:
     return f'<visual>{at}<geometry><box size="{_numbers(sizes)}"/></geometry></visual>'
 
 
-def limit_xml(limits: tuple[float, float] | None) -> str:
+def _limit_xml(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
     ends = ""
     if limits is not None:
@@ -199,9 +182,9 @@ def _quoted(text: str) -> str:
 
 def check_one_mechanism(source: Source) -> None:
     """Check that a file holds one mechanism: all loops share a body other than the ground."""
-    groups = moving_groups(source.urdf, source.file.closed_loop)
+    groups = moving_groups(source.urdf, source.closures)
     closed = [links for links, is_closed in groups if is_closed]
-    block = source.file.legcal  # a platform on the ground is refused later
+    block = source.block  # a platform on the ground is refused later
     if len(closed) > 1 and (block is None or any(block.platform in links for links in closed)):
         names = ", ".join(f"'{links[0]}'" for links in closed[:4])
         raise OutOfClass(
@@ -213,7 +196,7 @@ def check_one_mechanism(source: Source) -> None:
         )
 
 
-def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[list[str], bool]]:
+def moving_groups(urdf: Urdf, closures: Iterable[Closure]) -> list[tuple[list[str], bool]]:
     """Return the groups of connected links, without those on the ground, and whether loops close.
 
     The links of each are in the order of the file.
@@ -221,7 +204,7 @@ def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[l
     fixed = [(j.parent, j.child) for j in urdf.joints.values() if not j.moves]
     on_ground = connected(urdf.links, fixed)[urdf.root]
     pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
-    ends = [(urdf.link_of(first), urdf.link_of(second)) for first, second in closures]
+    ends = [tuple(map(urdf.link_of, closure.frames)) for closure in closures]
     moving = [pair for pair in (*pairs, *ends) if on_ground.isdisjoint(pair)]
     groups = connected(urdf.links, [*fixed, *moving])
     closed = {link for pair in ends for link in pair}
@@ -243,23 +226,19 @@ def connected(names: Iterable[str], pairs: Iterable[Sequence[str]]) -> dict[str,
     return groups
 
 
-LoopKind = Literal["point", "weld"]
+LinkFrame = tuple[str, RigidTransform]  # a frame in a link
 
 
-@dataclass(frozen=True, eq=False)
-class Loop:
+class Loop(NamedTuple):
     """A joint between two links that closes a loop of the tree."""
 
     name: str  # prefix of new links and joints
-    kind: LoopKind  # coincidence of both frames
-    links: tuple[str, str]  # the two links
-    T_link_frame: tuple[RigidTransform, RigidTransform]  # frame of the joint in either link
+    kind: ClosureKind
+    frames: tuple[LinkFrame, LinkFrame]  # of the joint in either link
 
 
-def close_loops(
-    loops: Sequence[Loop], text: UrdfBuilder, path: Path
-) -> tuple[list[list[str]], list[ClosureKind]]:
-    """Add the frames of all loops to a tree; return their pairs and kinds for the mechanism."""
+def close_loops(loops: Sequence[Loop], text: UrdfBuilder, path: Path) -> tuple[Closure, ...]:
+    """Add the frames of all loops to a tree, and return their closures."""
     if len(loops) > MAX_LOOPS:
         raise ModelError(
             "the loops could not be closed",
@@ -268,29 +247,27 @@ def close_loops(
             "give one mechanism",
             path,
         )
-    pairs, kinds = list[list[str]](), list[ClosureKind]()
+    closures = []
     for loop in loops:
         ends = []
-        for number, (link, T_link_frame) in enumerate(
-            zip(loop.links, loop.T_link_frame, strict=True), start=1
-        ):
-            frame = text.unused(f"{loop.name}_{number}")
-            text.link(frame)
-            text.joint(text.unused(f"{frame}_frame"), "fixed", link, frame, T_link_frame)
-            ends.append(frame)
-        pairs.append(ends)
-        kinds.append("3d" if loop.kind == "point" else "6d")
-    return pairs, kinds
+        for number, (link, T_link_frame) in enumerate(loop.frames, start=1):
+            ends.append(text.unused(f"{loop.name}_{number}"))
+            text.link(ends[-1])
+            text.joint(
+                text.unused(f"{ends[-1]}_frame"), "fixed", (link, ends[-1]), *parts_of(T_link_frame)
+            )
+        closures.append(Closure(loop.kind, (ends[0], ends[1])))
+    return tuple(closures)
 
 
 _CLOSING = re.compile(r"closing_(.+)_([12])")
-KINDS: dict[str, LoopKind] = {
-    **dict.fromkeys(("spherical", "ball", "point"), "point"),
-    **dict.fromkeys(("fixed", "weld"), "weld"),
+KINDS: dict[str, ClosureKind] = {
+    **dict.fromkeys(("spherical", "ball", "point"), "3d"),
+    **dict.fromkeys(("fixed", "weld"), "6d"),
 }
 
 
-def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
+def closing_frames(robot: etree._Element, path: Path) -> tuple[Closure, ...]:
     """Return the pairs of links ``closing_NAME_1`` and ``closing_NAME_2`` of onshape-to-robot."""
     ends: dict[str, dict[str, str]] = {}
     for element in robot.findall("link"):
@@ -308,7 +285,7 @@ def closing_frames(robot: etree._Element, path: Path) -> list[list[str]]:
                 f"remove '{link}'",
                 path,
             )
-    return [[numbers["1"], numbers["2"]] for numbers in ends.values()]
+    return tuple(Closure("3d", (numbers["1"], numbers["2"])) for numbers in ends.values())
 
 
 def read_loop_source(path: Path, content: bytes) -> Source:
@@ -326,24 +303,17 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     problems.raise_if_any()
     for element in elements:
         robot.remove(element)
-    text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
-    pairs, kinds = close_loops(loops, text, path)
-    for line in filter(None, text.body().split("\n")):
-        robot.append(etree.fromstring(line))
-        robot[-1].tail = "\n"
+    text = UrdfBuilder(taken={*bare.links, *bare.joints})
+    closures = close_loops(loops, text, path)
+    robot.extend(text.elements())
     named = closing_frames(robot, path)
     if named:
-        kinds.extend("3d" for _ in named)
         notes.append(
             f"The {len(named)} pairs of frames closing_..._1 and closing_..._2 were taken as ball "
             "joints."
         )
-    file = MechanismFile(
-        closed_loop=[*pairs, *named],
-        type=kinds,
-        name_mot=motors,
-    )
-    return Source(path, file, replace(bare, wording=URDF_LOOPS).edited(robot), tuple(notes))
+    urdf = replace(bare, wording=URDF_LOOPS).edited(robot)
+    return Source(path, urdf, (*closures, *named), tuple(motors), notes=tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems) -> list[Loop]:
@@ -365,14 +335,13 @@ def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: XmlProblems
         ends = _ends(element, urdf, problems)
         if len(problems) > n_before or ends is None:
             continue
-        (link_1, T_1), (link_2, T_2) = ends
-        loops.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2)))
+        loops.append(Loop(name, KINDS[kind], ends))
     return loops
 
 
 def _ends(
     element: etree._Element, urdf: Urdf, problems: XmlProblems
-) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
+) -> tuple[LinkFrame, LinkFrame] | None:
     """Return the links of a loop and its frame in each, or None after noting problems."""
     sides = [part for part in element if part.tag in ("link1", "link2")]
     origins: list[etree._Element | None] = [

@@ -225,7 +225,7 @@ def is_tied(legs: Sequence[Leg], ties: Ties, parametrization: Parametrization) -
     place = parametrization.place
     moved = on_ties(moved_legs(legs, place, step), legs, ties, place, unit)
     there = _postures_near(moved, ties.n_dependent, home, _TEST_POSES, 1)
-    missed = np.abs(_constraints(moved, there).values).max()
+    missed = np.abs(posture_constraints(moved, *there).values).max()
     return bool(missed < _CLOSED * length)
 
 
@@ -239,27 +239,17 @@ def ties_in_words(machine: Machine) -> str | None:
     tied = sparse_basis(independent(rows, by_step(rows, parametrization.place) * scale)[1])
     is_alone = np.sum(np.abs(tied) > SHOWN, axis=1) == 1
     alone = [parametrization.names[i] for i in np.argmax(np.abs(tied[is_alone]), axis=1)]
-    words = [f"{_named(alone, machine)} do not change"] if alone else []
+    words = [f"{parameters_in_words(alone, machine.leg_names)} do not change"] if alone else []
     together = np.flatnonzero(np.any(np.abs(tied[~is_alone]) > SHOWN, axis=0))
     names = [parametrization.names[i] for i in together]
     if names:
-        words.append(f"{_named(names, machine)} change only together")
+        words.append(f"{parameters_in_words(names, machine.leg_names)} change only together")
     n = n_pose_constraints(machine.legs)
     return (
         f"The machine is overconstrained: {ties.n_dependent} of the {n} constraints of its joints "
         f"follow{'s' * (ties.n_dependent == 1)} from the others. To keep this so, "
         f"{len(tied)} combinations of its parameters are tied: {'; '.join(words)}."
     )
-
-
-def _named(parameters: Sequence[str], machine: Machine) -> str:
-    """Return parameters in words."""
-    return parameters_in_words(parameters, machine.leg_names)
-
-
-def _constraints(legs: Sequence[Leg], at: _Postures, *, by_local: bool = False) -> PoseEquations:
-    """Return the constraints at postures."""
-    return posture_constraints(legs, at.R, at.t, at.q, by_local=by_local)
 
 
 def _slopes(legs: Sequence[Leg], equations: PoseEquations, home: Array) -> tuple[Array, Array]:
@@ -276,7 +266,7 @@ def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
     if dependent == 0:
         return 0
     # If only home is special, the constraints are independent nearby.
-    around = _constraints(legs, _postures_near(legs, dependent, home, _TEST_POSES, 2))
+    around = posture_constraints(legs, *_postures_near(legs, dependent, home, _TEST_POSES, 2))
     singular = np.linalg.svd(_slopes(legs, around, home)[0], compute_uv=False)
     rank = np.sum(singular > least * singular[:, :1], axis=1)
     return len(around.leg) - int(rank.max())
@@ -285,7 +275,7 @@ def _n_dependent(legs: Sequence[Leg], home: Array, least: float = _RANK) -> int:
 def _n_dependent_at(legs: Sequence[Leg], home: Array, least: float) -> int:
     """Return the number of dependent constraints at one pose (3, 4)."""
     R, t = home[None, :, :3], home[None, :, 3]
-    here = _constraints(legs, _Postures(R, t, readings_of_rods(legs, R, t)))
+    here = posture_constraints(legs, R, t, readings_of_rods(legs, R, t))
     if len(here.leg) < 2:
         return 0
     singular_values = np.linalg.svd(_slopes(legs, here, home)[0][0], compute_uv=False)
@@ -298,7 +288,7 @@ def _postures_near(
     """Return n postures around home, home first, at which the independent constraints hold."""
     R, t = home[None, :, :3], home[None, :, 3]
     at = _Postures(R, t, readings_of_rods(legs, R, t))
-    slopes, unit = _slopes(legs, _constraints(legs, at), home)
+    slopes, unit = _slopes(legs, posture_constraints(legs, *at), home)
     step = _REACH * np.random.default_rng(seed).uniform(-1.0, 1.0, (n, len(unit)))
     if at.q.shape[1]:  # motors follow the platform, along its freedoms
         left = np.linalg.svd(slopes[0])[2][slopes.shape[1] - n_dependent :]
@@ -318,7 +308,7 @@ def _closed(
     """
     home = np.concatenate([at.R[0], at.t[0][:, None]], axis=1)
     for _ in range(_STEPS):
-        equations = _constraints(legs, at, by_local=True)
+        equations = posture_constraints(legs, *at, by_local=True)
         slopes, unit = _slopes(legs, equations, home)
         left, singular, right = np.linalg.svd(slopes)
         rank = left.shape[1] - n_dependent

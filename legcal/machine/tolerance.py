@@ -18,7 +18,7 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 from legcal.errors import BadValue
 from legcal.files.quantity import Quantity, read_value
 from legcal.files.schema import FileSchema, describe
-from legcal.machine.leg import Leg, ParameterId
+from legcal.machine.leg import AXES, Leg, ParameterId
 
 MachineKind = Literal["printed", "machined", "bought"]
 
@@ -186,20 +186,20 @@ class Tolerance:
         joints, axes, lengths, zeros, turn, _ = (
             float(getattr(full, one.name) or 0.0) for one in fields(full)
         )
+        of_kind = {
+            **dict.fromkeys(("base", "platform", "axis_point", "arm_point"), joints),
+            **dict.fromkeys((*AXES, "twist", "direction", "axis", "arm_axis"), axes),
+            "length": lengths,
+            "offset": zeros,
+        }
         for name in names:
             number = ParameterId.parse(name)
             kind, leg = number.kind, legs.get(number.owner)
             if kind == "base" and leg is not None and leg.actuator is not None:
                 moved = float(np.linalg.norm(leg.actuator.motion(leg.A, np.zeros(1)).by_q))
                 found[name] = float(np.hypot(joints, moved * (turn if leg.reads_angle else zeros)))
-            elif kind in ("base", "platform", "axis_point", "arm_point"):
-                found[name] = joints
-            elif kind in ("base_axis", "platform_axis", "twist", "direction", "axis", "arm_axis"):
-                found[name] = axes
-            elif kind == "length":
-                found[name] = lengths
-            elif kind == "offset":
-                found[name] = zeros
+            elif kind in of_kind:
+                found[name] = of_kind[kind]
         return found
 
 

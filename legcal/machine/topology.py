@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.errors import OutOfClass, Problem
+from legcal.errors import OutOfClass
 from legcal.files.schema import is_plain_name
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
@@ -25,19 +25,18 @@ from legcal.machine.classification import (
     classify_leg,
     is_actuator,
     joint_tolerance,
-    nearest,
     off_square,
     parallel,
     undirected,
 )
 from legcal.machine.files import LegcalBlock
-from legcal.machine.leg import Axis, LegChain, Step
+from legcal.machine.leg import Axis, LegChain
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.spanning_tree import Source, connected
-from legcal.machine.urdf import Urdf
+from legcal.machine.urdf import VIRTUAL, Urdf
 
 Normals = tuple[Array, Array]
-VIRTUAL = ("floating", "planar")
+NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 TIE = 1e-6  # difference of equally large triangles, relative to the largest
 
 
@@ -80,18 +79,18 @@ def _joints_on(bodies: Bodies, body: str) -> list[Array]:
 
 def _paths(
     bodies: Bodies, urdf: Urdf, base: str, platform: str, motors: Sequence[str], within: float
-) -> list[list[Step]]:
+) -> list[list[Connection]]:
     """Return the joints of every leg from base to platform."""
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
         _refuse_unsupported(connection, urdf, base, platform)
         for body in connection.bodies:
             at.setdefault(body, []).append(connection)
-    begun: list[tuple[str, list[Step], Connection]] = []
+    begun: list[tuple[str, list[Connection], Connection]] = []
     used = set[int]()
     for first in at.get(base, []):
-        step = _step(first, first.bodies.index(base), urdf)
-        body = first.bodies[step.far]
+        step = first.from_body(base)
+        body = step.bodies[1]
         if body not in (base, platform) and is_actuator(step, motors) and len(at[body]) > 2:
             used.add(id(first))
             begun += [(body, [step], onward) for onward in at[body] if onward is not first]
@@ -101,28 +100,21 @@ def _paths(
     for body, steps, connection in begun:
         while True:
             used.add(id(connection))
-            near = connection.bodies.index(body)
-            steps.append(_step(connection, near, urdf))
-            body = connection.bodies[1 - near]
+            steps.append(connection.from_body(body))
+            body = steps[-1].bodies[1]
             if body == platform:
                 break
             if len(steps) > MAX_JOINTS_OF_LEG:
                 raise OutOfClass(
                     "this is not a platform on legs",
-                    f"a leg of more than {MAX_JOINTS_OF_LEG} joints from "
-                    f"{_name(steps[0].connection)}",
+                    f"a leg of more than {MAX_JOINTS_OF_LEG} joints from {_name(steps[0])}",
                     "joint, slider, joint",
                     "give the mechanism alone",
                     urdf.path,
                 )
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
-                problem = None
-                if len(onward) > 1 and not _is_an_arm(steps, within):
-                    problem = _several_bodies(bodies, urdf, steps, body, (base, platform))
-                raise OutOfClass(
-                    problem or _not_a_chain(urdf, steps, body, base, len(onward), motors, within)
-                )
+                raise _no_chain(bodies, urdf, steps, body, (base, platform), motors, within)
             connection = onward[0]
         paths.append(steps)
     stray = [c for c in bodies.connections if id(c) not in used]
@@ -142,18 +134,17 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
 
     Without *motors* all revolute joints on the base may be motors of arms.
     """
-    urdf, closures, path = source.urdf, source.closures, source.path
-    ends = source.base, source.platform
-    bodies = rigid_bodies(urdf, closures, None)
+    urdf, bodies = source.urdf, rigid_bodies(source.urdf, source.closures, None)
     root, problems = bodies.body_of[urdf.root], list[OutOfClass]()
     blocks = dict[str, LegcalBlock]()
     bases = [root, *_joined_bodies(bodies, urdf, root)]
-    if ends[0] is not None:
-        bases = [bodies.body_of[ends[0]]]
+    if source.base is not None:
+        bases = [bodies.body_of[source.base]]
     for base in bases:
-        on_base = motors_on(bodies, base) if motors is None else motors
         try:
-            blocks[base] = _block_on(base, urdf, closures, on_base, path, ends)
+            blocks[base] = _block_on(
+                base, source, motors_on(bodies, base) if motors is None else motors
+            )
         except OutOfClass as error:
             problems.append(error)
         if root in blocks:
@@ -165,7 +156,7 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
             f"legs between several pairs of links, with the base {pairs}",
             "one",
             urdf.wording.state_ends,
-            path,
+            source.path,
         )
     if not blocks:
         raise problems[0]
@@ -174,7 +165,7 @@ def propose_block(source: Source, motors: Sequence[str] | None) -> LegcalBlock:
 
 def _joined_bodies(bodies: Bodies, urdf: Urdf, root: str) -> list[str]:
     """Return the bodies other than the root on which several chains end, in the file's order."""
-    ends = [body for c in _without_virtual(bodies, urdf) for body in c.bodies]
+    ends = [body for c in bodies.connections if not c.is_virtual for body in c.bodies]
     order = dict.fromkeys(bodies.body_of[link] for link in urdf.links)
     return [body for body in order if body != root and ends.count(body) > 2]
 
@@ -188,58 +179,48 @@ def motors_on(bodies: Bodies, base: str) -> list[str]:
     ]
 
 
-def _block_on(
-    base: str,
-    urdf: Urdf,
-    closures: Sequence[Closure],
-    motors: Sequence[str],
-    path: Path,
-    ends: tuple[str | None, str | None],
-) -> LegcalBlock:
+def _block_on(base: str, source: Source, motors: Sequence[str]) -> LegcalBlock:
     """Return the default block ``legcal`` with a body as the base."""
-    virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
+    urdf, closures = source.urdf, source.closures
     bodies = rigid_bodies(urdf, closures, None)
-    real = replace(bodies, connections=_without_virtual(bodies, urdf))
-    carried = [bodies.body_of[j.child] for j in virtual]
-    root = bodies.body_of[urdf.root]
-    base_link = ends[0] or urdf.root
-    if ends[0] is None and (base != root or not _is_used(urdf, closures, urdf.root)):
+    root, base_link = bodies.body_of[urdf.root], source.base or urdf.root
+    if source.base is None and (base != root or not _is_used(urdf, closures, urdf.root)):
         base_link = _main_link(urdf, closures, bodies, base)
-    if ends[1] is None:
-        platform = _platform_body(real, base, base_link, carried, urdf, path, motors)
+    if source.platform is None:
+        platform = _platform_body(bodies, base, base_link, source, motors)
     else:
-        platform = bodies.body_of[ends[1]]
-    carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
-        base, platform}]  # fmt: skip
-    joint = carrier[0].name if carrier else None
-    link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
-    link = ends[1] or link
+        platform = bodies.body_of[source.platform]
+    carrier = next(
+        (c for c in bodies.connections if c.is_virtual and {*c.bodies} == {base, platform}), None
+    )
+    joint = None if carrier is None else carrier.joint
+    link = source.platform or (
+        _main_link(urdf, closures, bodies, platform) if joint is None else urdf.joints[joint].child
+    )
     bodies = rigid_bodies(urdf, closures, joint)
     chains = in_order(find_chains(bodies, urdf, base_link, link, motors), motors, urdf)
     needed = n_frame_legs(spatial=plane_of_motion(chains) is None)
-    if len(chains) < needed and base != root and ends[0] is None:
+    if len(chains) < needed and base != root and source.base is None:
         raise OutOfClass(
             "this is not a platform on legs",
             f"{len(chains)} legs on link '{base_link}'",
             f"at least {needed}",
             urdf.wording.state_ends,
-            path,
+            source.path,
         )
     joints = [distinct_joint(chain) for chain in chains]
-    names = _leg_names(joints)
-    block = LegcalBlock(
+    return LegcalBlock(
         version=1,
         base=base_link,
         platform=link,
         platform_joint=joint,
-        legs=dict(zip(names, joints, strict=True)),
+        legs=dict(zip(_leg_names(joints), joints, strict=True)),
     )
-    return block.model_copy(update={"base_frame": propose_frame(names, chains)})
 
 
 def _is_used(urdf: Urdf, closures: Sequence[Closure], link: str) -> bool:
     """Return whether a moving joint or a closure is on a link itself."""
-    ends = {urdf.link_of(frame) for c in closures for frame in (c.frame_1, c.frame_2)}
+    ends = {urdf.link_of(frame) for c in closures for frame in c.frames}
     return link in ends or any(
         j.moves and link in (j.parent, j.child) for j in urdf.joints.values()
     )
@@ -290,13 +271,13 @@ def distinct_joint(chain: LegChain) -> str:
     """Return a joint that identifies a single leg: on an actuator not the motor."""
     if chain.actuator is None:
         return any_joint(chain)
-    named = [s.connection.joint for s in chain.steps[1:] if s.connection.joint]
+    named = [s.joint for s in chain.steps[1:] if s.joint]
     return named[0] if named else any_joint(chain)
 
 
 def any_joint(chain: LegChain) -> str:
     """Return a joint that identifies a leg: its slider, or its first joint."""
-    named = [s.connection.joint for s in chain.steps if s.connection.joint]
+    named = [s.joint for s in chain.steps if s.joint]
     return chain.motor or (named[0] if named else "")
 
 
@@ -340,7 +321,7 @@ def normals_of_closures(
     floats = virtual is not None and virtual.type == "floating"
     normals: list[Array | None] = []
     for closure in closures:
-        link = urdf.link_of(closure.frame_1)
+        link = urdf.link_of(closure.frames[0])
         root, normal = (block.base, in_link_frames[0])
         if floats and virtual in urdf.joints_above(link):
             root, normal = (block.platform, in_link_frames[1])
@@ -354,11 +335,8 @@ def check_virtual_joint(
 ) -> None:
     """Check the virtual joint, if any: it carries the platform from the base as the legs let it.
 
-    Raises
-    ------
-    OutOfClass
-        If it is neither floating nor planar, connects other bodies, or moves in another plane than
-        the legs.
+    Raises OutOfClass if it is neither floating nor planar, connects other bodies, or moves in
+    another plane than the legs.
     """
     if block.platform_joint is None:
         return
@@ -406,147 +384,102 @@ def check_virtual_joint(
     raise OutOfClass(start, *problem, path)
 
 
-def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
-    """Return a connection passed from one of its bodies to the other."""
-    axis = urdf.joints[connection.joint].axis if connection.joint else np.zeros(3)
-    return Step(connection, near, 1 - near, axis)
-
-
 def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform: str) -> None:
     """Refuse joints that are not part of any leg."""
-    if connection.joint is not None and urdf.joints[connection.joint].type in (
-        "floating",
-        "planar",
-    ):
-        raise OutOfClass(
-            "this mechanism is not supported",
-            f"the {urdf.joints[connection.joint].type} joint '{connection.joint}' inside it",
+    if connection.is_virtual:
+        problem = (
+            f"the {connection.type} joint '{connection.joint}' inside it",
             "at most the virtual one that carries the platform",
             "name that one in legcal.platform_joint",
-            urdf.path,
         )
-    if connection.bodies[0] == connection.bodies[1]:
-        raise OutOfClass(
-            "this mechanism is not supported",
+    elif connection.bodies[0] == connection.bodies[1]:
+        problem = (
             f"{_name(connection)} between two links that are rigidly connected",
             "a joint that can move",
             "remove it",
-            urdf.path,
         )
-    if set(connection.bodies) == {base, platform} and connection.type == "prismatic":
-        raise OutOfClass(
-            "this mechanism is not supported",
+    elif set(connection.bodies) == {base, platform} and connection.type == "prismatic":
+        problem = (
             f"{_name(connection)} directly between base and platform",
             "legs",
             "name it in legcal.platform_joint if it is the virtual joint that carries the platform",
-            urdf.path,
         )
+    else:
+        return
+    raise OutOfClass("this mechanism is not supported", *problem, urdf.path)
 
 
-def _several_bodies(
-    bodies: Bodies, urdf: Urdf, steps: Sequence[Step], body: str, ends: tuple[str, str]
-) -> Problem | None:
-    """Return the problem of a body in a loop inside a leg, or in a platform of several bodies.
-
-    From the body, without passing base or platform, a loop inside a leg leads to the base by one
-    joint, a part of the platform by the joints of several legs.
-    """
-    base, platform = ends
-    names = [name for c in bodies.connections for name in c.bodies]
-    inside = [c.bodies for c in bodies.connections if {*c.bodies}.isdisjoint(ends)]
-    group = connected(names, inside)[body]
-    on_base, on_platform = (
-        [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
-        for end in (base, platform)
-    )
-    if len(on_platform) != 1:
-        return None
-    if len(on_base) == 1:
-        return Problem(
-            "this machine is not supported",
-            f"a loop inside the leg that starts with {_name(steps[0].connection)}, "
-            f"closed at link '{body}'",
-            "chains without loops that end on the platform itself",
-            "if these are the rods of a parallelogram on an arm or a carriage, close "
-            "each on the platform as a leg of its own, otherwise this machine cannot "
-            "be calibrated with legcal",
-            str(urdf.path),
-        )
-    if len(on_base) > 1:
-        joint = on_platform[0]
-        return Problem(
-            "this machine is not supported",
-            "a platform of several bodies (as of an H4 or I4), because legs end on "
-            f"link '{body}', which {_name(joint)} connects to the platform",
-            "legs that end on one rigid platform",
-            f"make {_name(joint)} fixed if it does not move, otherwise this machine "
-            "cannot be calibrated with legcal",
-            str(urdf.path),
-        )
-    return None
-
-
-def _not_a_chain(
+def _no_chain(
+    bodies: Bodies,
     urdf: Urdf,
-    steps: list[Step],
+    steps: list[Connection],
     body: str,
-    base: str,
-    n_onward: int,
+    ends: tuple[str, str],
     motors: Sequence[str],
     within: float,
-) -> Problem:
-    """Return the problem of a leg, given by its first joints, that is not a chain."""
-    needed, remedy = "one unbranched chain from base to platform for each leg", ""
-    first, last = steps[0].connection, steps[-1].connection
-    driven = last.joint in motors or (first.joint in motors and _is_an_arm(steps, within))
-    if body != base and n_onward > 1 and len(steps) > 1 and driven:
-        return Problem(
-            f"the leg that starts with {_name(first)} is not supported",
-            f"{n_onward} rods on link '{body}', which {_name(last)} connects to the moving link "
-            "before it",
-            "rods on the link that one motor on the base moves",
-            "make joints of this leg fixed that do not move; arms on arms cannot be calibrated "
-            "with legcal",
-            str(urdf.path),
-        )
-    if body == base:
-        course = "returns to the base"
+) -> OutOfClass:
+    """Return the refusal of a leg that is no chain, given by its joints to the *body* in question.
+
+    From a body without passing base or platform, a loop inside a leg leads to the base by one
+    joint, a part of a platform of several bodies by the joints of several legs.
+    """
+    first, last = _name(steps[0]), _name(steps[-1])
+    n_onward = sum(body in c.bodies for c in bodies.connections) - 1
+    needed = "one unbranched chain from base to platform for each leg"
+    remedy = f"check {urdf.wording.closures}, or {urdf.wording.correct_ends}"
+    inside = [c.bodies for c in bodies.connections if {*c.bodies}.isdisjoint(ends)]
+    group = connected([name for c in bodies.connections for name in c.bodies], inside)[body]
+    on_base, on_platform = (
+        [c for c in bodies.connections if end in c.bodies and not group.isdisjoint(c.bodies)]
+        for end in ends
+    )
+    is_arm = _is_an_arm(steps, within)
+    driven = steps[-1].joint in motors or (steps[0].joint in motors and is_arm)
+    if body == ends[0]:
+        found = f"a chain that starts with {first} and returns to the base"
     elif n_onward == 0:
-        course = f"ends at link '{body}' without reaching the platform"
-    elif n_onward > 1 and _is_an_arm(steps, within):
-        course = (
-            f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        found = f"a chain from {first} that ends at link '{body}' without reaching the platform"
+    elif n_onward > 1 and not is_arm and len(on_platform) == len(on_base) == 1:
+        found = f"a loop inside the leg that starts with {first}, closed at link '{body}'"
+        remedy = (
+            "if these are the rods of a parallelogram on an arm or a carriage, close each on the "
+            f"platform as a leg of its own, otherwise {NOT_CALIBRATED}"
+        )
+    elif n_onward > 1 and not is_arm and len(on_platform) == 1:
+        joint = _name(on_platform[0])
+        found = (
+            "a platform of several bodies (as of an H4 or I4), because legs end on link "
+            f"'{body}', which {joint} connects to the platform"
+        )
+        needed = "legs that end on one rigid platform"
+        remedy = f"make {joint} fixed if it does not move, otherwise {NOT_CALIBRATED}"
+    elif n_onward > 1 and len(steps) > 1 and driven:
+        found = f"{n_onward} rods on link '{body}', which {last} connects to the moving link before"
+        needed = "rods on the link that one motor on the base moves"
+        remedy = f"make joints of this leg fixed that do not move, otherwise {NOT_CALIBRATED}"
+    elif n_onward > 1 and is_arm:
+        found = (
+            f"a chain that starts with {first} and carries {n_onward} rods on the moving link "
+            f"'{body}', so that the joints at A move"
         )
         needed = (
             "joints whose centres are fixed in the base, or a motor in name_mot that moves this "
             "link itself"
         )
-        remedy = f"name {_name(first)} in name_mot if a motor turns it, otherwise "
+        remedy = f"name {first} in name_mot if a motor turns it, otherwise {remedy}"
     else:
-        course = f"shares link '{body}' with another leg or branches there"
-    return Problem(
-        "this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {course}",
-        "",
-        needed,
-        f"{remedy}check {urdf.wording.closures}, or {urdf.wording.correct_ends}",
-        str(urdf.path),
-    )
+        found = f"a chain from {first} that shares link '{body}' with another leg or branches there"
+    return OutOfClass("this is not a platform on separate legs", found, needed, remedy, urdf.path)
 
 
-def _is_an_arm(steps: list[Step], within: float) -> bool:
+def _is_an_arm(steps: list[Connection], within: float) -> bool:
     """Return whether joints form an arm whose end moves: one revolute, or several apart."""
-    if any(step.connection.type != "revolute" for step in steps):
+    if any(step.type != "revolute" for step in steps):
         return False
-    if len(steps) == 1:
-        return True
-    for lower, upper in pairwise(steps):
-        near, far = nearest(
-            Axis(lower.name, *lower.line(lower.far)), Axis(upper.name, *upper.line(upper.near))
-        )
-        if near is None or far is None or float(np.linalg.norm(far - near)) > within:
-            return True
-    return False
+    return len(steps) == 1 or any(
+        Axis(lower.name, *lower.line(1)).gap(Axis(upper.name, *upper.line(0))) > within
+        for lower, upper in pairwise(steps)
+    )
 
 
 def _name(connection: Connection) -> str:
@@ -566,24 +499,13 @@ def _normals(chain: LegChain) -> Normals | None:
     return v, chain.poses[-1][:3, :3].T @ v
 
 
-def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
-    """Return the connections that are joints of legs."""
-    return tuple(
-        c for c in bodies.connections if c.joint is None or urdf.joints[c.joint].type not in VIRTUAL
-    )
-
-
 def _platform_body(
-    bodies: Bodies,
-    base: str,
-    base_link: str,
-    carried: Sequence[str],
-    urdf: Urdf,
-    path: Path,
-    motors: Sequence[str],
+    bodies: Bodies, base: str, base_link: str, source: Source, motors: Sequence[str]
 ) -> str:
     """Return the body where the legs end: every chain from the base to it is a supported leg."""
-    at: dict[str, list[str]] = {}
+    urdf, path, at = source.urdf, source.path, dict[str, list[str]]()
+    carried = {c.bodies[1] for c in bodies.connections if c.is_virtual}
+    bodies = replace(bodies, connections=tuple(c for c in bodies.connections if not c.is_virtual))
     for connection in bodies.connections:
         for here, there in (connection.bodies, connection.bodies[::-1]):
             at.setdefault(here, []).append(there)
@@ -626,7 +548,7 @@ def _platform_body(
         "one closed chain in which no link is a platform on legs, because on "
         "each side of any link more than a slider or a rod moves the joint at A",
         "legs of type joint, slider or rod, joint",
-        "this machine cannot be calibrated with legcal",
+        NOT_CALIBRATED,
         path,
     )
 
@@ -639,7 +561,7 @@ def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: st
         if joint.parent in uses:
             uses[joint.parent] += 1
     for closure in closures:
-        for frame in (closure.frame_1, closure.frame_2):
+        for frame in closure.frames:
             if urdf.link_of(frame) in uses:
                 uses[urdf.link_of(frame)] += 1
     return max(links, key=lambda link: uses[link])

@@ -141,18 +141,13 @@ def check_numbers(element: etree._Element, problems: XmlProblems) -> None:
                 if part.tag == "cylinder":
                     problems.at(element, f"has a <cylinder> without {attribute}", "write it [m]")
                 continue
-            numbers = number_list(text, count)
+            numbers, needed = number_list(text, count), "more than zero"
             if numbers is None:
                 needed = "a finite number" if count == 1 else f"{count} finite numbers"
+            if numbers is None or (positive and min(numbers) <= 0.0):
                 problems.at(
                     element,
                     f'has <{part.tag} {attribute}="{_short(text)}">, needed {needed}',
-                    "correct the value",
-                )
-            elif positive and min(numbers) <= 0.0:
-                problems.at(
-                    element,
-                    f'has <{part.tag} {attribute}="{_short(text)}">, needed more than zero',
                     "correct the value",
                 )
 
@@ -194,7 +189,6 @@ def check_tree(
             continue
         parent_joint[child] = joint.get("name", "")
         children.setdefault(ends["parent"], []).append(child)
-    roots = [e for e in links if e.get("name", "") not in parent_joint]
     if not links:
         problems.add(
             "the URDF could not be used",
@@ -203,32 +197,33 @@ def check_tree(
             "expand it with xacro first if it is a xacro file",
         )
         return ""
+    roots = [e.get("name", "") for e in links if e.get("name", "") not in parent_joint]
     if len(roots) > 1:
-        named = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
         problems.add(
             "the URDF could not be used",
-            f"{len(roots)} links without a parent ({named})",
+            f"{len(roots)} links without a parent ({_quoted(roots)})",
             "one",
             "join them with joints, a platform by a floating one",
         )
-    root = roots[0].get("name", "") if roots else ""
-    reached: set[str] = set()
-    pending = [e.get("name", "") for e in roots]
+    pending, reached = [*roots], set[str]()
     while pending:
-        link = pending.pop()
-        if link not in reached:
+        if (link := pending.pop()) not in reached:
             reached.add(link)
             pending.extend(children.get(link, ()))
     cyclic = [e.get("name", "") for e in links if e.get("name", "") not in reached]
     if cyclic:
-        named = ", ".join(repr(name) for name in cyclic[:6])
         problems.add(
-            f"the URDF could not be used: the links {named} hang from each other in a cycle",
-            "",
+            "the URDF could not be used",
+            f"the links {_quoted(cyclic)}, which hang from each other in a cycle",
             "a tree",
             "cut the loop and close it in closed_loop of the mechanism YAML",
         )
-    return root
+    return roots[0] if roots else ""
+
+
+def _quoted(names: Sequence[str]) -> str:
+    """Return the first names in words."""
+    return ", ".join(f"'{name}'" for name in names[:6])
 
 
 def _check_names(elements: list[etree._Element], problems: XmlProblems) -> None:
@@ -295,6 +290,7 @@ MJCF = replace(_DRAWING, closures="<equality>", root="<worldbody>")
 
 UrdfJointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar")
+VIRTUAL = ("floating", "planar")  # joints that only say where the platform is
 LOOP_TAGS = ("loop_joint", "constraint")
 
 
@@ -369,6 +365,14 @@ class Urdf:
             joints.append(self.above[link])
             link = joints[-1].parent
         return joints
+
+    def joints_below(self, joint: UrdfJoint) -> list[UrdfJoint]:
+        """Return a joint and all joints that it carries."""
+        carried, pending = list[UrdfJoint](), [joint]
+        while pending:
+            carried.append(pending.pop())
+            pending += self.below[carried[-1].child]
+        return carried
 
     def robot(self) -> etree._Element:
         """Return the ``<robot>`` element, which may be changed for :meth:`edited`."""
@@ -552,14 +556,12 @@ def _limits(
     if bounds[0] is None or bounds[1] is None:
         return None
     lower, upper = bounds[0][0], bounds[1][0]
+    stated = f"has the limits {lower:g} to {upper:g}"
     if lower > upper:
-        problems.at(element, f"has the limits {lower:g} to {upper:g}", "give the lower one first")
+        problems.at(element, stated, "give the lower one first")
     elif kind == "prismatic" and lower == upper:
-        problems.at(
-            element,
-            f"has the limits {lower:g} to {upper:g}, which leave it no travel",
-            "write the travel of its motor as lower and upper [m]",
-        )
+        remedy = "write the travel of its motor as lower and upper [m]"
+        problems.at(element, f"{stated}, which leave it no travel", remedy)
     return lower, upper
 
 

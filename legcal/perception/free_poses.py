@@ -191,7 +191,7 @@ def _constrained(machine: Machine, poses: Array, size: float) -> tuple[Array, Bo
         return poses, np.ones(len(poses), dtype=np.bool_)
 
     def constraints(poses: Array) -> tuple[Array, Array]:
-        solved = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+        solved = machine_equations(machine, poses)
         return solved.values[:, ~solved.measured], solved.by_pose[:, ~solved.measured]
 
     unit = np.array([1.0 / size] * 3 + [1.0] * 3)
@@ -458,7 +458,7 @@ def _line_rows(
 def _model_rows(scene: _Scene, poses: Array, k: IntArray) -> tuple[Array, Array]:
     """Return whitened residuals (n, m) of readings, constraints and travel, and derivatives."""
     machine = scene.machine
-    equations = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
+    equations = machine_equations(machine, poses)
     wanted = np.zeros_like(equations.values)
     measured = equations.measured
     wanted[:, measured] = (machine.sign * scene.q[k])[:, equations.leg[measured]]

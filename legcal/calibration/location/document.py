@@ -376,7 +376,7 @@ def _joint_of_tool(machine: Machine) -> str:
     """Return the fixed joint between the platform and a tool link without children."""
     urdf = machine.urdf
     joint = next((joint for joint in urdf.joints.values() if joint.child == _TOOL), None)
-    frames = {name for c in machine.chain.closures for name in (c.frame_1, c.frame_2)}
+    frames = {name for c in machine.chain.closures for name in c.frames}
     carries = any(other.parent == _TOOL for other in urdf.joints.values())
     if (
         joint is not None
