@@ -95,6 +95,16 @@ def test_an_exact_focal_length_may_be_off_by_what_the_images_leave_of_it() -> No
     assert EXACT_CAMERAS not in fitted(session(), moved(0.0 * SIGMA)).sensitivities
 
 
+def test_noise_does_not_lengthen_a_focal_length(tmp_path: Path) -> None:
+    # Distances in pixels must not shrink with a longer focal length: 700 of them would gain by it.
+    simulated(tmp_path / "s", "3-rps", views=3, poses=8, sigma_px=1.5, seed=1)
+    vague = {f"c1.{name}": (1290.3, 60.0) for name in ("fx", "fy")}
+    found = calibrate(tmp_path / "s", priors=vague, use_cache=False).solution
+    true, sigma = 1290.3, found.estimates.sigma[found.estimates.names.index("c1.fx")]
+    assert sigma < 12.0
+    assert abs(found.cameras[0].K[0, 0] - true) < 3.0 * sigma
+
+
 def said_of_cameras(found: Solution) -> list[str]:
     return [note for note in found.notes if "agree" in note]
 

@@ -373,24 +373,21 @@ def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
     return replace(camera, K=K, distortion=distortion)
 
 
-def undistort_with_derivatives(
-    camera: Camera,
-    pixels: Array,  # (..., 2) pixels
-    names: Sequence[str],
-    near: Array,  # (..., 2) points of the sensor plane near the solutions
-) -> tuple[Array, Array]:
-    """Return the points of the sensor plane at pixels, and their derivatives by intrinsics.
+def undistort_near(camera: Camera, pixels: Array, near: Array) -> tuple[Array, Array]:
+    """Return the points (..., 2) of the sensor plane at pixels, and derivatives of pixels there.
 
-    These are (..., 2) and (..., 2, n_names). A pixel is constant, so that
-    d(u, v)/d(x, y) d(x, y) + d(u, v)/d(intrinsic) = 0.
+    *near* are points (..., 2) near the solutions; the derivatives are (..., 2, 2).
     """
-    flat = pixels.reshape(-1, 2)
-    if len(flat) == 0:  # OpenCV refuses to project nothing
-        return pixels, np.zeros((*pixels.shape, len(names)))
-    xy = _undistorted(camera, flat, near.reshape(-1, 2))
-    _, by_point, moved = _with_derivatives(camera, xy, names)
-    by_intrinsics = -_solved(by_point, moved)
-    return xy.reshape(pixels.shape), by_intrinsics.reshape(*pixels.shape, len(names))
+    xy = _undistorted(camera, pixels.reshape(-1, 2), near.reshape(-1, 2)).reshape(pixels.shape)
+    return xy, camera.pixels_per_unit(xy)
+
+
+def pixels_by_intrinsics(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
+    """Return the derivatives (..., 2, n_names) of the pixels of points (..., 2) by intrinsics."""
+    if not xy.size:  # OpenCV refuses to project nothing
+        return np.zeros((*xy.shape, len(names)))
+    by_intrinsics = _with_derivatives(camera, xy.reshape(-1, 2), names)[2]
+    return by_intrinsics.reshape(*xy.shape, len(names))
 
 
 def _undistorted(camera: Camera, pixels: Array, near: Array) -> Array:

@@ -32,7 +32,13 @@ from legcal.machine.actuator import ActuatorColumns, JointMotion
 from legcal.machine.leg import LINKS, LegColumns, LegKind, Link
 from legcal.machine.rods import actuator_index, first_rods
 from legcal.vision.board import FixedBoard
-from legcal.vision.camera import Camera, intrinsic_names, shared_cameras, undistort_with_derivatives
+from legcal.vision.camera import (
+    Camera,
+    intrinsic_names,
+    pixels_by_intrinsics,
+    shared_cameras,
+    undistort_near,
+)
 from legcal.vision.cylinder import EPSILON
 
 _SAME_GAMMA = 1e-6  # relative difference of equal gammas
@@ -129,7 +135,7 @@ class ObservedOutlines:
     # (n, 2, 2) points of the measured outline at both ends of its segment, on the sensor plane
     feet: Array
     pixels: Array  # (n, 2, 2) the same points in the image [px]
-    lens: Array  # (n, 2, 2, 2) J^-1 at these points, J the derivative of pixels there [1/px]
+    lens: Array  # (n, 2, 2, 2) derivatives of pixels at these points [px]
     epsilon: Array  # (n,) +1 or -1 of eq (5)
     covariance: Array  # (n, 2, 2) claimed covariance of the offsets at both ends [px^2]
     # (n,) derivative of the outline's position by the logarithm of the camera's gamma, positive
@@ -191,8 +197,8 @@ class ObservedOutlines:
 
     def through(self, cameras: Sequence[Camera]) -> ObservedOutlines:
         """Project the same pixels onto the sensor planes of other cameras."""
-        feet, by_xy = _through_lenses(cameras, self.view, self.pixels)
-        return replace(self, feet=feet, lens=_inverses(by_xy))
+        feet, lens = _through_lenses(cameras, self.view, self.pixels)
+        return replace(self, feet=feet, lens=lens)
 
     def offsets(self, keys: tuple[str, ...], state: State) -> Array:
         """Return the distance of both ends from the predicted outline, (n, 2) [px]."""
@@ -208,9 +214,8 @@ class ObservedOutlines:
 
     def by_intrinsics(self, wanted: tuple[str, ...], keys: tuple[str, ...], state: State) -> Array:
         """Return derivatives (n, 2, n_wanted) of the offsets by intrinsics of their views."""
-        by_xy = self._predicted(keys, state)[3]
-        slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
-        return np.asarray(np.einsum("nqck,cqn->nqk", slopes, by_xy))
+        r, _, _, at = self._predicted(keys, state)
+        return _distances_by_intrinsics(state.cameras, wanted, self.view, r, *at).T
 
     def _corrected(self, r: Array, state: State) -> Array:
         """Subtract the common-mode biases from offsets (2, n); return (n, 2)."""
@@ -221,27 +226,31 @@ class ObservedOutlines:
 
     def _predicted(
         self, keys: tuple[str, ...], state: State
-    ) -> tuple[Array, Array, _EndsInCamera, Array]:
+    ) -> tuple[Array, Array, _EndsInCamera, tuple[Array, Array, Array]]:
         """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and leg ends.
 
-        The fourth are the derivatives (2, 2, n) by the points on the sensor plane.
+        The fourth are what :func:`_distances_by_intrinsics` takes: the points on the sensor plane,
+        J^-T there, and the derivatives (2, 2, n) by these points.
         """
 
-        def predicted() -> tuple[Array, Array, _EndsInCamera, Array]:
+        def predicted() -> tuple[Array, Array, _EndsInCamera, tuple[Array, Array, Array]]:
             ends = _ends_in_camera(state, self.leg, self.view, self.pose, self.on_arm)
-            xy, by_key = np.ascontiguousarray(self.feet.T), None
+            xy, lens = np.ascontiguousarray(self.feet.T), self._lens
             if keys:
-                moved, slopes = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
-                xy, by_key = np.ascontiguousarray(moved.T), slopes.transpose(3, 2, 1, 0)
+                points, J = _on_sensor(self, state.cameras)
+                xy, lens = np.ascontiguousarray(points.T), _transposed_inverses(J)
             radius = state.radii[self.radius]
-            r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, self._lens)
-            if by_key is not None:
-                slope = np.concatenate([slope, np.einsum("kcqn,cqn->kqn", by_key, by_xy)])
-            return r, slope, ends, by_xy
+            r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, lens)
+            at = xy, lens, by_xy
+            if keys:
+                by_key = _distances_by_intrinsics(state.cameras, keys, self.view, r, *at)
+                slope = np.concatenate([slope, by_key])
+            return r, slope, ends, at
 
         inputs = self.radius, self.feet, self.lens, self.epsilon
         poses = state.camera_pose, state.platform_pose
-        prediction: tuple[Array, Array, _EndsInCamera, Array] = self.memory.of(
+        prediction: tuple[Array, Array, _EndsInCamera, tuple[Array, Array, Array]]
+        prediction = self.memory.of(
             predicted, keys, *inputs, state.legs, state.radii, state.cameras, *poses
         )
         return prediction
@@ -249,7 +258,7 @@ class ObservedOutlines:
     @cached_property
     def _lens(self) -> Array:
         """Inverse transposed derivatives of pixels by row, column and end, (2, 2, 2, n)."""
-        return np.ascontiguousarray(self.lens.transpose(3, 2, 1, 0))
+        return _transposed_inverses(self.lens)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor, whitened by the claimed covariances."""
@@ -302,7 +311,7 @@ def observed_outlines(
         normal = h[..., :2]
         value = np.sum(normal * xy, axis=-1, keepdims=True) + h[..., 2:]
         feet[of_view] = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
-        lens[of_view] = _inverses(camera.pixels_per_unit(feet[of_view]))
+        lens[of_view] = camera.pixels_per_unit(feet[of_view])
         pixels[of_view] = camera.distort(feet[of_view])
     return ObservedOutlines(
         index,
@@ -390,11 +399,11 @@ def _through_lenses(
     return xy, by_xy
 
 
-def _inverses(M: Array) -> Array:
-    """Invert matrices (..., 2, 2)."""
-    (a, b), (c, d) = np.moveaxis(M, (-2, -1), (0, 1))
-    adjoint = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
-    return np.asarray(adjoint / (a * d - b * c)[..., None, None])
+def _transposed_inverses(J: Array) -> Array:
+    """Return J^-T of matrices (n, ..., 2, 2) by row and column, (2, 2, ..., n)."""
+    (a, b), (c, d) = np.moveaxis(J, (-2, -1), (0, 1))
+    adjoint = np.stack([np.stack([d, -c]), np.stack([-b, a])]) / (a * d - b * c)
+    return np.ascontiguousarray(np.moveaxis(adjoint, 2, -1))
 
 
 def _mixed_gammas(moved: Array, gamma: Array, view: IntArray, cameras: Sequence[str]) -> list[str]:
@@ -443,7 +452,7 @@ class ObservedEdges:
     body: IntArray  # (n,) in ``bodies``
     feet: Array  # (n, 2, 2) both ends on the sensor plane
     pixels: Array  # (n, 2, 2) the same in the image [px]
-    lens: Array  # (n, 2, 2) J^-T at the second end, J the derivative of pixels there [1/px]
+    lens: Array  # (n, 2, 2, 2) derivatives of pixels at these points [px]
     # (n,) standard deviation of the offset of the second end from a line through the first [px]
     sigma: Array
     line: IntArray  # (n,) numbers of the lines of bodies that they are
@@ -461,12 +470,16 @@ class ObservedEdges:
         length = np.sqrt(np.einsum("in,in->n", D, D))
         u = D / length
         along = u + np.einsum("ijn,nj->in", ends.R_camera, lean)
-        xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
-        r, by_along, by_xy = edge_offsets(along, xy.T, self.lens.transpose(1, 2, 0))
+        points, J = _on_sensor(self, state.cameras) if keys else (self.feet, self.lens)
+        xy, lens = points.T, _transposed_inverses(J)
+        r, by_along, by_xy = edge_offsets(along, xy, lens[:, :, 1])
         by_B = (by_along - np.einsum("in,in->n", by_along, u) * u) / length
         by_lean = np.einsum("ijn,in->jn", ends.R_camera, by_along)
-        by_key = np.einsum("cpn,npck->kn", by_xy, by_intrinsics)
-        slope = np.concatenate([-by_B, by_B, by_lean, by_key])
+        slope = np.concatenate([-by_B, by_B, by_lean])
+        if keys:  # the line begins at the first end, as it was measured
+            at = np.stack([np.zeros_like(r), r]), xy, lens, by_xy
+            by_key = _distances_by_intrinsics(state.cameras, keys, self.view, *at)
+            slope = np.concatenate([slope, by_key.sum(axis=1)])
 
         def chain(slope: Array) -> tuple[Array, Array]:
             kept, by_pose = ends.chain(slope)
@@ -518,7 +531,7 @@ def observed_edges(
     bodies = tuple(sorted(set(keys)))
     body = np.array([bodies.index(key) for key in keys], dtype=np.intp)
     view = measurements.view[row]
-    feet, by_xy = _through_lenses(cameras, view, pixels)
+    feet, lens = _through_lenses(cameras, view, pixels)
     difference = np.array([-1.0, 1.0])
     variance = np.einsum("i,nij,j->n", difference, covariance, difference)
     return ObservedEdges(
@@ -529,7 +542,7 @@ def observed_edges(
         body,
         feet,
         pixels,
-        np.swapaxes(_inverses(by_xy[:, 1]), 1, 2),
+        lens,
         np.sqrt(variance),
         edges.edge[index],
         bodies,
@@ -732,15 +745,15 @@ class ObservedCorners:
             turned_on_link = _matvec(R_link, on_link)
             in_base_frame = turned_on_link + state.platform_pose.t[self.pose]
         turned = _matvec(R_camera, in_base_frame)
-        xy, by_intrinsics = _on_sensor(state.cameras, keys, self.view, self.feet, self.pixels)
+        xy, lens = _on_sensor(self, state.cameras) if keys else (self.feet, self.lens)
         in_camera = turned + state.camera_pose.t[self.view]
         depth = in_camera[:, 2:]
         projected = in_camera[:, :2] / depth
-        lens = self.lens
         by_projected = lens / depth[:, None]
         by_depth = -by_projected @ projected[..., None]
         r = (lens @ (projected - xy)[..., None])[..., 0]
-        slope = np.concatenate([by_projected, by_depth, -lens], axis=-1)
+        by_intrinsics = _pixels_by_intrinsics(state.cameras, keys, self.view, projected)
+        slope = np.concatenate([by_projected, by_depth, by_intrinsics], axis=-1)
 
         def chain(slope: Array) -> tuple[Array, Array]:
             in_camera = slope[..., :3]
@@ -757,7 +770,7 @@ class ObservedCorners:
                 cross(scaled_arm[:, None], in_link),
                 in_link,
                 in_link @ arm[..., None],
-                slope[..., 3:] @ by_intrinsics,
+                slope[..., 3:],
             ]
             return np.concatenate(J, axis=-1), by_pose
 
@@ -765,8 +778,8 @@ class ObservedCorners:
 
     def by_intrinsics(self, wanted: tuple[str, ...], state: State) -> Array:
         """Return derivatives (n, 2, n_wanted) of the residuals by intrinsics of their views."""
-        slopes = _on_sensor(state.cameras, wanted, self.view, self.feet, self.pixels)[1]
-        return np.asarray(-self.lens @ slopes)
+        off = np.linalg.solve(self.lens, self.rows((), state).r[..., None])[..., 0]
+        return _pixels_by_intrinsics(state.cameras, wanted, self.view, self.feet + off)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor; a board on the platform depends on its poses."""
@@ -923,23 +936,54 @@ def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Ar
 
 
 def _on_sensor(
-    cameras: Sequence[Camera], keys: tuple[str, ...], view: IntArray, feet: Array, pixels: Array
+    seen: ObservedOutlines | ObservedEdges | ObservedCorners, cameras: Sequence[Camera]
 ) -> tuple[Array, Array]:
-    """Undistort pixels (n, ..., 2), with derivatives (n, ..., 2, n_keys) by intrinsics.
-
-    Without estimated intrinsics the points are *feet*.
-    """
-    xy, slopes = feet.copy(), np.zeros((*pixels.shape, len(keys)))
-    for v in np.unique(view) if keys else ():
-        camera, of_view = cameras[v], view == v
-        present = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
-        by_intrinsics = np.zeros((*pixels[of_view].shape, len(keys)))
-        names = [keys[k] for k in present]
-        xy[of_view], by_intrinsics[..., present] = undistort_with_derivatives(
-            camera, pixels[of_view], names, feet[of_view]
+    """Return measured points on the sensor planes of cameras, and derivatives of pixels there."""
+    xy, lens = seen.feet.copy(), seen.lens.copy()
+    for v in np.unique(seen.view).tolist():
+        of_view = seen.view == v
+        xy[of_view], lens[of_view] = undistort_near(
+            cameras[v], seen.pixels[of_view], seen.feet[of_view]
         )
-        slopes[of_view] = by_intrinsics
-    return xy, slopes
+    return xy, lens
+
+
+def _pixels_by_intrinsics(
+    cameras: Sequence[Camera], keys: tuple[str, ...], view: IntArray, xy: Array
+) -> Array:
+    """Return derivatives (n, ..., 2, n_keys) of pixels of points (n, ..., 2) by intrinsics."""
+    by_intrinsics = np.zeros((*xy.shape, len(keys)))
+    for v in np.unique(view).tolist() if keys else ():
+        of_view, names = view == v, intrinsic_names(cameras[v])
+        present = [k for k, key in enumerate(keys) if key in names]
+        moved = np.zeros((*xy[of_view].shape, len(keys)))
+        moved[..., present] = pixels_by_intrinsics(
+            cameras[v], xy[of_view], [keys[k] for k in present]
+        )
+        by_intrinsics[of_view] = moved
+    return by_intrinsics
+
+
+def _distances_by_intrinsics(
+    cameras: Sequence[Camera],
+    keys: tuple[str, ...],
+    view: IntArray,
+    r: Array,
+    xy: Array,
+    lens: Array,
+    by_xy: Array,
+) -> Array:
+    """Return derivatives (n_keys, 2, n) of distances of points from lines by intrinsics.
+
+    *r* (2, n) are the distances [px] of both points xy (2, 2, n), *lens* is J^-T there, *by_xy* are
+    their derivatives by xy. A distance grows by what an intrinsic moves the nearest point of the
+    line: at the measured point instead, distances would shrink with a longer focal length, so that
+    noise alone would lengthen it.
+    """
+    normal = np.einsum("ijen,jen->ien", lens, by_xy)
+    nearest = xy - r * np.einsum("ijen,ien->jen", lens, normal)
+    moved = _pixels_by_intrinsics(cameras, keys, view, nearest.T)
+    return np.asarray(-np.einsum("ien,neik->ken", normal, moved))
 
 
 @dataclass(frozen=True, eq=False)
