@@ -395,18 +395,11 @@ def _undistorted(camera: Camera, pixels: Array, near: Array) -> Array:
     xy = near
     for _ in range(_NEWTON_STEPS if camera.has_distortion else 0):
         projected, by_point, _ = _with_derivatives(camera, xy, ())
-        step = _solved(by_point, (pixels - projected)[..., None])[..., 0]
+        step = np.linalg.solve(by_point, (pixels - projected)[..., None])[..., 0]
         xy = xy + step
         if np.abs(step).max() < _SMALL_STEP:
             return np.asarray(xy)
     return camera.undistort(pixels)
-
-
-def _solved(M: Array, right: Array) -> Array:
-    """Return M^-1 right (n, 2, k) of matrices (n, 2, 2)."""
-    (a, b), (c, d) = M.transpose(1, 2, 0)
-    first, second = right.transpose(1, 2, 0) / (a * d - b * c)
-    return np.stack([d * first - b * second, a * second - c * first], axis=1).T
 
 
 def splined(camera: Camera) -> Camera:
