@@ -37,7 +37,6 @@ from legcal.data.corners import found_corners
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
 from legcal.errors import NotIdentifiable
-from legcal.geometry.motions import motion_of
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.parameters import parametrization_of, parametrize
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
@@ -258,35 +257,6 @@ def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
     assert is_scale_open(with_arms)
     radii = {f"leg{j}.radius.arm{a}_link": Prior(0.008, 1e-5) for j, a in ((1, 1), (3, 2), (5, 3))}
     assert not is_scale_open(replace(with_arms, choices=Choices(priors=radii)))
-
-
-def larger(leg: Leg, size: float) -> Leg:
-    cylinders = tuple(
-        replace(c, radius=size * c.radius, start=size * c.start, end=size * c.end)
-        for c in leg.cylinders
-    )
-    return replace(leg, A=size * leg.A, B=size * leg.B, q0=size * leg.q0, cylinders=cylinders)
-
-
-def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None:
-    """A thousand times as large and as far, before the same cameras: relative figures stay."""
-    session, size = planned_session(model("3-rps"), [range(3)] * 3, 3), 1e3
-    assert session.home is not None
-    other = replace(
-        session,
-        legs=tuple(larger(leg, size) for leg in session.legs),
-        home=motion_of(session.home.rotation.as_matrix(), size * session.home.translation),
-        t=size * session.t,
-        t_reached=size * session.t_reached,
-        cameras=tuple(
-            replace(view, T_base_camera=motion_of(T.rotation.as_matrix(), size * T.translation))
-            for view, T in zip(session.cameras, session.places, strict=True)
-        ),
-        sigma_q=size * session.sigma_q,
-    )
-    found = [Analysis(each) for each in (session, other)]
-    singular = [np.linalg.svd(each.information, compute_uv=False) for each in found]
-    np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["planar", pytest.param("revolute", marks=pytest.mark.system)])

@@ -24,12 +24,11 @@ from fit_sessions import (
 )
 from thinned import thinned
 
-from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.calibration.joint_fit.problem import FitProblem, build_fit
+from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings, Start, State
+from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings, State
 from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
@@ -240,20 +239,6 @@ def test_errors_agree_with_the_covariance(session: MachineSession) -> None:
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.08)
 
 
-def test_the_result_is_reproduced_and_outlines_in_another_order_change_nothing(
-    session: MachineSession,
-) -> None:
-    rng = np.random.default_rng(5)
-    noisy = session.noisy(rng)
-    shuffled = noisy.outlines.choose(rng.permutation(len(noisy.outlines)))
-    found, again, other = (
-        session.errors(replace(noisy, outlines=o).fit().legs)
-        for o in (noisy.outlines, noisy.outlines, shuffled)
-    )
-    np.testing.assert_array_equal(again, found)
-    np.testing.assert_allclose(other, found, rtol=0, atol=1e-12)
-
-
 def test_the_better_start_wins_and_between_equal_ones_the_first(
     session: MachineSession,
 ) -> None:
@@ -378,17 +363,3 @@ def test_a_start_far_away_is_refused(session: MachineSession) -> None:
     assert len(refused.value.problems) == 1
     with pytest.raises(DidNotConverge, match="needs at least one"):
         session.fit([])
-
-
-def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
-    session: MachineSession, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    starts = [replace(session.truth, label=label) for label in ("second", "first", "third")]
-    costs = {"first": 1.0, "second": 2.0, "third": 3.0}
-    unwatched = fit._first_minimum
-
-    def with_cost(problem: FitProblem, start: Start) -> object:
-        return replace(unwatched(problem, start), cost=costs[start.label])
-
-    monkeypatch.setattr(fit, "_first_minimum", with_cost)
-    assert session.fit(starts).start == "first"

@@ -10,11 +10,9 @@ from dense_fit import jacobian, residuals
 from fit_sessions import (
     PINHOLE,
     MachineSession,
-    corners_of,
     disturbed_start,
     irregular_hexapod,
     machine_session,
-    with_board,
 )
 
 from legcal.calibration.estimate import (
@@ -139,16 +137,6 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
     assert session.off(found.legs) < 1e-9
 
 
-def test_errors_of_corners_are_found_in_their_residuals() -> None:
-    session = machine_session("hexapod")
-    corners, claimed = corners_of(session, seed=4), []
-    for factor in (0.2, 5.0):
-        said = replace(corners, sigma_px=factor * corners.sigma_px)
-        seen, start = with_board(session, said)
-        claimed.append(session.noisy(3).fit(start, board=seen).estimates.sigma)
-    np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
-
-
 def biases_of(session: MachineSession) -> EdgeBiases:
     """Return all biases that the outlines of a session may share."""
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
@@ -241,16 +229,6 @@ def test_polished_rods_are_known_less_well_though_no_residual_shows_it() -> None
     assert polished.quality.shared_px[PLACES[0]] == pytest.approx(0.2, rel=0.05)
     sigma, less = (np.sqrt(np.diag(one.kinematic.covariance)) for one in (polished, matte))
     assert np.median(sigma / less) > 2.0
-
-
-def test_independent_errors_are_hardly_taken_for_shared_ones(session: MachineSession) -> None:
-    shared = list[float]()
-    for seed in range(3):
-        found = session.noisy(100 + seed).fit()
-        shared.append(max(map(abs, found.posterior.biases.values()), default=0.0))
-        assert found.quality.noise.bias_px == found.quality.noise.tilt_px == 0.0
-    assert shared.count(0.0) >= 2  # one set in twenty seems to have some
-    assert max(shared) < 0.02  # [px], where points of edges scatter by 0.05 px
 
 
 def _fit_in_rounds(session: MachineSession, n_rounds: int) -> Solution:

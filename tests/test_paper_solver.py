@@ -19,47 +19,11 @@ from legcal.paper.equations import axis_frames, closure_of_leg, end_of_leg, leg_
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 
 
-def _line(outlier: float) -> LeastSquares:
-    """Return points near a line; of every second one y is known ten times as well."""
-    x, error, t_i, y_i = (ca.SX.sym(name, n) for name, n in zip("xety", (2, 1, 1, 1), strict=True))
-    residual = ca.Function("line", [x, error, t_i, y_i], [x[0] + x[1] * t_i - (y_i + error)])
-    t = np.linspace(0.0, 1.0, 21)
-    y = 1.0 + 2.0 * t + SIGMA * np.cos(40.0 * t)
-    y[4] += outlier
-    covariance = (SIGMA**2)[:, None, None]
-    term = Term(residual, np.tile([0, 1], (len(t), 1)), (t, y), covariance)
-    return LeastSquares("A line", (term,), np.array([50.0, -3.0]))
-
-
-SIGMA = 1e-3 * np.where(np.arange(21) % 2, 1.0, 10.0)
-
-
 def _problem(name: str, x: ca.SX, residuals: ca.SX, start: list[float]) -> LeastSquares:
     function = ca.Function("all", [x, ca.SX.sym("error", 0)], [residuals])
     return LeastSquares(
         name, (Term(function, np.arange(len(start))[None, :], ()),), np.array(start)
     )
-
-
-def test_a_linear_problem_is_solved_exactly_with_weights_of_one_and_of_covariances() -> None:
-    problem = _line(0.0)
-    A, b = problem.jacobian(np.zeros(2)).toarray(), -problem.residuals(np.zeros(2))
-    for weighted in (False, True):
-        root = 1.0 / SIGMA if weighted else np.ones(21)
-        if weighted:  # no outlier: weights are nearly those of the covariances
-            chi = root * np.abs(A @ solve_least_squares(problem, weighted=True).x - b)
-            root = root / np.sqrt(1.0 + (chi / (4.0 * np.median(chi))) ** 2)
-        expected = np.linalg.lstsq(root[:, None] * A, root * b, rcond=None)[0]
-        solution = solve_least_squares(problem, weighted=weighted)
-        np.testing.assert_allclose(solution.x, expected, rtol=1e-4 if weighted else 1e-12)
-    C = solution.covariances(np.array([[0, 1]]))[0]
-    np.testing.assert_allclose(C, np.linalg.inv((root**2 * A.T) @ A), rtol=1e-2)
-
-
-def test_an_outlier_loses_its_weight() -> None:
-    clean, wrong = (solve_least_squares(_line(y), weighted=True).x for y in (0.0, 0.1))
-    plain = solve_least_squares(_line(0.1)).x
-    assert np.abs(wrong - clean).max() < 0.02 * np.abs(plain - clean).max()
 
 
 def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:

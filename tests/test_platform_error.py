@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import written_with
+from layouts import Layout, write_machine
+from machines import of_types, written_with
 
 from legcal import Machine, evaluate, load_mechanism, random_configurations
 from legcal.calibration.joint_fit.platform import (
@@ -48,11 +49,15 @@ def _motions(nominal: Machine, other: Machine, q: Array) -> Array:
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", ["3-rpr", "hexapod-rod"])
+REDUNDANT = of_types(["RS", "RS", "SS", "SS", "SS"], ["actuated"] * 4 + ["constant"])
+
+
+@pytest.mark.parametrize("name", ["3-rpr", "hexapod-rod", "3-rps", "tricept", "3-upu-tilted", ""])
 def test_predicted_errors_are_those_of_written_models_in_pinocchio(
     name: str, tmp_path: Path
 ) -> None:
-    nominal = load_mechanism(name)
+    """Also of a machine with a motor too many, whose poses are those of least squares."""
+    nominal = load_mechanism(name or write_machine(tmp_path, REDUNDANT, Layout()))
     parametrization = parametrization_of(nominal, twists=True)
     rng = np.random.default_rng(4)
     drawn = random_configurations(nominal, 3, rng)
@@ -63,7 +68,9 @@ def test_predicted_errors_are_those_of_written_models_in_pinocchio(
     squares = np.zeros((3, 6))
     for k, column in enumerate(root.T):
         other = changed(nominal, parametrization, column, tmp_path / str(k))
-        squares += _motions(nominal, other, drawn.readings) ** 2
+        moved = _motions(nominal, other, drawn.readings)
+        np.testing.assert_allclose(J @ column, moved, atol=3e-3 * np.abs(moved).max())
+        squares += moved**2
     np.testing.assert_allclose(predicted.displacement, np.sqrt(squares[:, 3:].sum(1)), rtol=3e-3)
     np.testing.assert_allclose(predicted.rotation, np.sqrt(squares[:, :3].sum(1)), rtol=3e-3)
     assert predicted.displacement.min() > 1e-6
