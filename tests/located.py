@@ -13,7 +13,6 @@ from legcal import Machine, ToolPoses, inverse_kinematics, load_mechanism, rando
 from legcal.calibration.location.frames import PosePairs, predicted, transforms
 from legcal.geometry.rotations import rotation_matrices
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations
 
 SIGMA_POSITION = 0.02e-3
 SIGMA_ANGLE = float(np.radians(0.01))
@@ -24,11 +23,6 @@ TOOL = RigidTransform.from_components([0.03, -0.02, 0.11], Rotation.from_rotvec(
 @cache
 def shipped(name: str) -> Machine:
     return load_mechanism(name)
-
-
-@cache
-def workspace_poses(name: str, n: int, seed: int = 1) -> Configurations:
-    return random_configurations(shipped(name), n, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +58,7 @@ def located(
     """Return a machine at BASE with a tool at TOOL, measured at poses of the workspace or these."""
     machine, chance = shipped(name), np.random.default_rng(seed)
     if platform is None:
-        drawn = workspace_poses(name, n, seed)
+        drawn = random_configurations(machine, n, seed)
         q, platform = drawn.readings, drawn.poses
     else:
         q = np.array([inverse_kinematics(machine, T) for T in platform])
