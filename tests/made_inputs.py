@@ -18,6 +18,7 @@ from simulated import simulated
 from legcal.machine.loader import load_mechanism
 
 ROOT = Path(__file__).resolve().parents[1]
+REDUNDANT = ROOT / "tests/data/recorded/redundant"
 
 
 @cache
@@ -92,6 +93,7 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "plain": _plain,
     "model": lambda folder: copied_model(folder, "hexapod"),
     "motors": _with_motors,
+    "redundant": lambda folder: shutil.copytree(REDUNDANT, folder, dirs_exist_ok=True),
     "tables": _tables,
     "tool-poses": lambda folder: write_poses(folder / "hexapod.csv", located("hexapod", 24)),
     "result": _result,

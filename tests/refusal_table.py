@@ -27,6 +27,7 @@ from edits import (
     cell,
     cut,
     doubled,
+    each_row,
     header,
     kept,
     keyed,
@@ -513,8 +514,19 @@ def _tables() -> Iterable[Refusal]:
             ("'up'", "'none'", "'0'", "'x'", "'y'", "row 1", "row 4"),
         ),
         ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
+        (
+            "leg-rejected",
+            each_row(o, lambda row: row["leg"] == "leg3" and row.update(verdict="rejected")),
+            ("no image has a usable outline of leg3", "list the visible legs of each"),
+        ),
     ]
     yield from _cases("outlines", CALIBRATE, outlines, "3-rpr-outlines")
+    wrong = cell("measurements.csv", 2, leg2_prismatic="0.12")
+    named = "readings of view c1, image p02", "from the value given by the other motors"
+    yield from _cases("reading", CALIBRATE, [("of-four", wrong, named)], "redundant")
+    short = cell("measurements.csv", 4, **{f"leg{j}_prismatic": "0.0001" for j in (1, 2, 3)})
+    named = "readings of view c1, image p04 could not be used", "needed at most"
+    yield from _cases("reading", CALIBRATE, [("out-of-reach", short, named)], "3-rpr-outlines")
 
     c = "corners.csv"
     line = f"{CORNER_COLUMNS}\n"

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from csv_rows import read_rows, write_rows
 from fit_sessions import MachineSession, machine_session
 from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
 from machines import (
@@ -23,10 +22,8 @@ from machines import (
 from outline_sessions import made
 from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform
-from simulated import settings
 from thinned import thinned
 
-import legcal
 from legcal import (
     Follower,
     Machine,
@@ -37,7 +34,6 @@ from legcal import (
     inverse_kinematics,
     load_mechanism,
     random_configurations,
-    simulate,
 )
 from legcal.calibration.joint_fit.variables import start_from
 from legcal.calibration.session_changes import session_tests
@@ -350,32 +346,3 @@ def test_a_slip_of_a_redundant_machine_is_named_with_its_moment(tmp_path: Path) 
     assert first.amount == pytest.approx(slip, rel=0.05)
     names = np.array(row_names(slipped))
     assert first.between == (names[~later][-1], names[later][0])
-
-
-@pytest.mark.system
-def test_a_redundant_machine_calibrates_and_a_wrong_reading_is_refused(tmp_path: Path) -> None:
-    machine, folder = made("4-rpr", tmp_path), tmp_path / "dataset"
-    simulate(machine.yaml_path, folder, settings(poses=6, shared_poses=True))
-    calibration = legcal.calibrate(folder, output=tmp_path / "result")
-    judged = calibration.solution.quality.redundant_readings
-    assert judged is not None
-    assert 0.0 < judged.rms_expected < 1.0
-    assert judged.rms == pytest.approx(judged.rms_expected, rel=0.5)
-    truth = next((folder / "truth/models").glob("*.yaml"))
-    before, after = (
-        legcal.evaluate(path, truth, dataset=folder).displacement
-        for path in (machine.yaml_path, tmp_path / "result/calibrated.yaml")
-    )
-    assert calibration.platform is not None
-    assert calibration.platform.workspace is not None
-    sigma = calibration.platform.sigma.mean_displacement
-    assert after.mean() < 3.0 * sigma < 0.1 * before.mean()
-    table = folder / "measurements.csv"
-    rows, column = read_rows(table), str(machine.legs[1].prismatic)
-    wrong = "0.12" if float(rows[0][column]) < 0.06 else "0.0"
-    of_pose = [row | {column: wrong} if row["pose"] == rows[0]["pose"] else row for row in rows]
-    write_rows(table, of_pose)
-    with pytest.raises(
-        DatasetError, match=r"readings of view .* from the value given by the other motors"
-    ):
-        legcal.calibrate(folder, output=tmp_path / "refused")
