@@ -64,20 +64,18 @@ def by_differences(
     return np.array(columns).T / (2.0 * STEP)
 
 
-def violations(problem: FitProblem, state: State) -> Array:
-    """Return the residuals of joints, constant lengths and the plane at all poses [m or rad]."""
-    found = posture_constraints(state.legs, *state.platform_pose).values.ravel()
-    if problem.legs.spatial:
-        return found
-    pose = state.platform_pose
-    plane = np.stack([pose.R[:, 2, 0], pose.R[:, 2, 1], pose.t[:, 2]], axis=1)
-    return np.concatenate([found, plane.ravel()])
-
-
 def allowed(problem: FitProblem, state: State) -> Array:
     """Return an orthonormal basis (size, f) of the steps that constraints and holds leave."""
+
+    def violations(state: State) -> Array:
+        """Return the residuals of joints, constant lengths and the plane at all poses [m, rad]."""
+        pose = state.platform_pose
+        found = posture_constraints(state.legs, *pose).values.ravel()
+        plane = np.stack([pose.R[:, 2, 0], pose.R[:, 2, 1], pose.t[:, 2]], axis=1)
+        return found if problem.legs.spatial else np.concatenate([found, plane.ravel()])
+
     eye = np.eye(problem.size)
-    C = by_differences(problem, state, lambda s: violations(problem, s), eye)
+    C = by_differences(problem, state, violations, eye)
     held = np.zeros((len(problem.held_directions), problem.size))
     held[:, : problem.held_directions.shape[1]] = problem.held_directions
     C = np.concatenate([C, held])

@@ -712,7 +712,14 @@ def _models() -> Iterable[Refusal]:
             text("result.json", '{"legcal_result": 1, "mach'))  # fmt: skip
     of_inputs: dict[str, Rows] = {
         "model": [
-            ("urdf-alone", ("/arm.urdf", _alone), ("arm.urdf",)),
+            (
+                "urdf-alone",
+                (
+                    "/arm.urdf",
+                    lambda folder: (folder / "urdf/hexapod.urdf").rename(folder / "arm.urdf"),
+                ),
+                ("arm.urdf",),
+            ),
             ("written", "/models/hexapod.yaml --write {in}", ("hexapod.yaml",)),
         ],
         "tables": [
@@ -1126,10 +1133,6 @@ def _exports() -> Iterable[Refusal]:
         ("itself", "json -o {in}/result/result.json --force", ("which is exported",)),
     ]
     yield from _cases("export", "export {in}/result --to", of_result, "result")
-
-
-def _alone(folder: Path) -> None:
-    (folder / "urdf/hexapod.urdf").rename(folder / "arm.urdf")
 
 
 def _without_visuals(folder: Path) -> None:

@@ -52,12 +52,6 @@ def planar(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]
     return folder, calibrate(folder, output=folder.parent / "result")
 
 
-@pytest.fixture(scope="module")
-def hexapod(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Outlines of a hexapod, whose poses two views share."""
-    return _simulated(tmp_path_factory.mktemp("hexapod"), "hexapod", shared_poses=True).folder
-
-
 # Invariance.
 
 
@@ -211,9 +205,10 @@ def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
     ],
 )
 def test_images_that_cannot_do_it_are_refused_in_one_sentence(
-    hexapod: Path, tmp_path: Path, shown: str, named: str
+    tmp_path: Path, shown: str, named: str
 ) -> None:
-    folder, leg_of = Path(shutil.copytree(hexapod, tmp_path / "set")), dict[tuple[str, str], str]()
+    folder = _simulated(tmp_path, "hexapod", shared_poses=True).folder
+    leg_of = dict[tuple[str, str], str]()
 
     def is_kept(row: Row) -> bool:
         if shown == "one pose":

@@ -213,11 +213,6 @@ def shifted(seen: BoardImages) -> BoardImages:
     return replace(seen, px=seen.px + np.array([12.0, 5.0]))
 
 
-def stretched(seen: BoardImages) -> BoardImages:
-    """Return corners of photographs that were made higher."""
-    return replace(seen, px=seen.px * [1.0, 1.04] - [0.0, 10.0])
-
-
 def mirrored(seen: BoardImages) -> BoardImages:
     """Return corners of photographs that were mirrored, numbered as those of a board are."""
     px = np.where([True, False], SIZE.width - 1.0 - seen.px, seen.px)
@@ -379,7 +374,8 @@ def test_a_board_that_is_not_as_stated_is_named_and_what_to_add() -> None:
     bent = fitted(seen_corners(TRUTH, 12, 2, sheet=np.array([9e-3, 0.0, 0.0, 0.0])))
     assert "bent by 9 mm" in " ".join(warnings(bent))
     seen = seen_corners(TRUTH, 12, 4)
-    assert "along y" in " ".join(warnings(fitted(stretched(seen))))
+    higher = replace(seen, px=seen.px * [1.0, 1.04] - [0.0, 10.0])
+    assert "along y" in " ".join(warnings(fitted(higher)))
     part = shown_in(seen, np.all(seen.px < 300.0, axis=1))
     said = " ".join(warnings(fitted(part)))
     missing = said.split("bring the board to ")[1].split(" of the image")[0].split(", ")

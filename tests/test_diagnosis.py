@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from edits import cell
-from hexapod_example import spoiled
 from simulated import settings, simulated
 from thinned import thinned
 
@@ -26,24 +25,6 @@ from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
 from legcal.workers import in_turn
-
-
-@pytest.mark.system  # fifty mistakes are tried
-def test_a_fit_with_exchanged_columns_is_not_trusted_and_they_are_named(tmp_path: Path) -> None:
-    session = spoiled(tmp_path / "set", 5, ("c1", "c2"))
-    one, other = "leg2_prismatic", "leg3_prismatic"
-    for row in session.rows:
-        row[one], row[other] = row[other], row[one]
-    calibration = calibrate(session.write())
-    (found,) = calibration.diagnosis
-    assert found.what == "columns leg2_prismatic and leg3_prismatic appear to be swapped"
-    assert found.images_after == found.images == 10
-    assert not calibration.verdict.trustworthy
-    assert found.sentence in calibration.verdict.sentence
-    assert "known to" in calibration.verdict.sentence
-    assert calibration.notes[0] == found.sentence
-    block = calibration.result.document()["diagnosis"]
-    assert [one["kind"] for one in block] == ["columns exchanged"]
 
 
 def test_every_mistake_can_be_tried_on_a_machine_with_a_passive_leg(tmp_path: Path) -> None:
@@ -290,6 +271,12 @@ def test_a_fit_that_leaves_out_exchanged_legs_names_them_and_accuses_no_reading(
     fitted = calibrate(_misnamed(d, {0: 1, 1: 0}))
     assert [doubt.code for doubt in fitted.doubts] == ["mistake"]
     assert "leg1 and leg2 appear to be exchanged in view c2" in fitted.doubts[0].what
+    (found,) = fitted.diagnosis
+    assert not fitted.verdict.trustworthy
+    assert found.sentence in fitted.verdict.sentence
+    assert "known to" in fitted.verdict.sentence
+    assert fitted.notes[0] == found.sentence
+    assert [one["kind"] for one in fitted.result.document()["diagnosis"]] == [found.kind]
     assert calibrate(d).diagnosis == ()
 
 

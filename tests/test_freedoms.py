@@ -244,19 +244,18 @@ def reading_residuals(machine: Machine, T_base_platform: RigidTransform, q: Arra
     return residuals
 
 
-def _concurrent() -> MachineSpec:
-    """Return a planar platform whose three motors turn about one point; a fourth leg is passive."""
-    B, z = ring([0, 100, 220, 300], 0.12), np.array([0.0, 0.0, 1.0])
-    A = np.array([[-0.4, 0.1, 0.0]] * 3 + [[0.1, -0.5, 0.0]])
-    kinds = ["actuated"] * 3 + ["passive"]
-    legs = [LegSpec("RR", a, b, k, z, z) for a, b, k in zip(A, B, kinds, strict=True)]
-    return MachineSpec(tuple(legs), RigidTransform.identity(), frame_legs=(0, 3), normal=z)
-
-
 def test_motors_as_many_as_freedoms_that_hold_fewer_do_not_determine_the_pose(
     tmp_path: Path,
 ) -> None:
-    machine = load_mechanism(write_machine(tmp_path, _concurrent(), Layout()))
+    """Three motors of a planar platform turn about one point; a fourth leg is passive."""
+    B, z = ring([0, 100, 220, 300], 0.12), np.array([0.0, 0.0, 1.0])
+    base = np.array([[-0.4, 0.1, 0.0]] * 3 + [[0.1, -0.5, 0.0]])
+    legs = [
+        LegSpec("RR", a, b, k, z, z)
+        for a, b, k in zip(base, B, ["actuated"] * 3 + ["passive"], strict=True)
+    ]
+    spec = MachineSpec(tuple(legs), RigidTransform.identity(), frame_legs=(0, 3), normal=z)
+    machine = load_mechanism(write_machine(tmp_path, spec, Layout()))
     assert machine.mobility == len(machine.motors) == 3
     assert any("motors 3, which hold only 2" in note for note in machine.diagnostics)
     with pytest.raises(NotIdentifiable, match="3 motors that hold 2 of these freedoms"):

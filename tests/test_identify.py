@@ -37,7 +37,7 @@ from legcal.data.corners import found_corners
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
 from legcal.errors import NotIdentifiable
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import LegKind
 from legcal.machine.parameters import parametrization_of, parametrize
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.paper.four_steps import run_steps
@@ -132,17 +132,6 @@ def test_two_directions_fail_for_a_leg_that_never_turns() -> None:
     assert (condition.ok, condition.legs) == (False, (3,))
 
 
-def legs_of(types: str, passive: tuple[int, ...] = ()) -> list[Leg]:
-    """Return legs of types such as ``SS UU RS U``, some of them passive."""
-    rng = np.random.default_rng(1)
-    kinds = [LegKind.PASSIVE if j in passive else LegKind.ACTUATED for j in range(9)]
-    R, t = np.eye(3), np.array([0.0, 0.0, 2.0])
-    return [
-        closed_leg(joints, R, t, rng, kind)
-        for joints, kind in zip(types.split(), kinds, strict=False)
-    ]
-
-
 @pytest.mark.parametrize(
     ("types", "passive", "views", "failing"),
     [
@@ -163,8 +152,12 @@ def legs_of(types: str, passive: tuple[int, ...] = ()) -> list[Leg]:
 def test_three_legs_at_once_where_18_and_19_need_them(
     types: str, passive: tuple[int, ...], views: list[set[int]], failing: tuple[int, ...]
 ) -> None:
-    planar = types.startswith("RR")
-    condition = three_legs_at_once(views, legs_of(types, passive), spatial=not planar)
+    rng, R, t = np.random.default_rng(1), np.eye(3), np.array([0.0, 0.0, 2.0])
+    legs = [
+        closed_leg(joints, R, t, rng, LegKind.PASSIVE if j in passive else LegKind.ACTUATED)
+        for j, joints in enumerate(types.split())
+    ]
+    condition = three_legs_at_once(views, legs, spatial=not types.startswith("RR"))
     assert (condition.ok, condition.legs) == (not failing, failing)
 
 
@@ -349,12 +342,6 @@ def two_images() -> Dataset:
     return dataset_at(example(), np.array([0, 15]))
 
 
-def said(found: Identifiability) -> str:
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(identify_table(found))
-    return " ".join(console.export_text().split())
-
-
 @pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(("images", "ranks"), [(6, (30, 30)), (1, (26, 30))])
 def test_a_board_raises_the_rank_and_takes_the_place_of_a_condition(
@@ -374,7 +361,10 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     assert found.full.rank == 30
     assert found.paper.ok
     assert found.board
-    assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(identify_table(found))
+    said = " ".join(console.export_text().split())
+    assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said
 
 
 @pytest.mark.usefixtures("without_remedies")

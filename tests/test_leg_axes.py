@@ -18,15 +18,6 @@ from legcal.vision.cylinder import direction_of_angles
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 
 
-def _coordinates(axes: LegAxes, reference: LegAxes) -> Array:
-    """Return (alpha1, alpha2, beta1, beta2) of axes in the bases of others, (n, 4)."""
-    u = axes.u / np.sum(axes.u * reference.u, axis=1, keepdims=True)
-    along = np.sum(reference.u * (reference.M - axes.M), axis=1, keepdims=True)
-    alpha = np.einsum("nia,na->ni", reference.basis, u)
-    beta = np.einsum("nia,na->ni", reference.basis, axes.M + along * u - reference.M)
-    return np.concatenate([alpha, beta], axis=1)
-
-
 def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     session = machine_session("hexapod", n_poses=2, camera=LENS)
     o = session.outlines  # of which the first edges are known twice as well
@@ -36,8 +27,12 @@ def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     root = np.linalg.cholesky(exact.covariance)
     normalised = []
     for seed in range(150):
-        axes = session.noisy(seed).axes
-        normalised.append(np.linalg.solve(root, _coordinates(axes, exact)[..., None])[..., 0])
+        axes = session.noisy(seed).axes  # and (alpha1, alpha2, beta1, beta2) in the exact bases
+        u = axes.u / np.sum(axes.u * exact.u, axis=1, keepdims=True)
+        along = np.sum(exact.u * (exact.M - axes.M), axis=1, keepdims=True)
+        away = np.stack([u, axes.M + along * u - exact.M], axis=1)
+        coordinates = np.einsum("nia,nka->nki", exact.basis, away).reshape(-1, 4, 1)
+        normalised.append(np.linalg.solve(root, coordinates)[..., 0])
     samples = np.concatenate(normalised)
     assert np.allclose(samples.mean(axis=0), 0.0, atol=0.08)
     assert np.allclose(np.cov(samples.T), np.eye(4), atol=0.1)
