@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.dataset import load_dataset
-from legcal.data.outlines import Outlines, no_outlines
+from legcal.data.outlines import no_outlines
 from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import DETECTOR_VERSION, Photographs, measure_photographs
 from legcal.perception.placement import Placement
@@ -55,18 +55,14 @@ def measured() -> dict[str, list[Any]]:
         "with care": measure_photographs(photographs, rough, no_progress),
         "near a fit": measure_photographs(photographs, near, no_progress),
     }
-    return {name: _listed(outlines) for name, outlines in tables.items()}
-
-
-def _listed(outlines: Outlines) -> list[Any]:
-    """Return what is compared of each outline: its key, what is wrong, ends [px], covariance."""
-    return [
-        [*key, reason.reason, *np.nan_to_num(ends, nan=-1.0).ravel().round(5).tolist(),
-         *np.nan_to_num(C[[0, 0, 1], [0, 1, 1]], nan=-1.0).round(8).tolist()]
-        for key, reason, ends, C in zip(
-            outlines.row_keys(), outlines.reason, outlines.ends, outlines.covariance, strict=True
-        )
-    ]  # fmt: skip
+    return {
+        name: [  # key, what is wrong, ends [px], covariance
+            [*key, why.reason, *np.nan_to_num(ends, nan=-1.0).ravel().round(5).tolist(),
+             *np.nan_to_num(C[[0, 0, 1], [0, 1, 1]], nan=-1.0).round(8).tolist()]
+            for key, why, ends, C in zip(o.row_keys(), o.reason, o.ends, o.covariance, strict=True)
+        ]
+        for name, o in tables.items()
+    }  # fmt: skip
 
 
 def test_values_change_only_with_the_version() -> None:

@@ -8,11 +8,7 @@ from legcal.geometry.types import Array
 from legcal.perception.blocks import Blocks
 from legcal.perception.limb import MATTE_DIRECTIONS, powers, profile_functions
 from legcal.perception.pooled_fit import fit_pooled
-from legcal.perception.profiles import (
-    Edge,
-    Samples,
-    to_light,
-)
+from legcal.perception.profiles import Edge, Samples, to_light
 from legcal.perception.subpixel_edges import limb_shifts
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import Band

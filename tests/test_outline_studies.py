@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 from bound import BoundStudy, errors_of
 from outline_bound import Bound, bound_of
-from outline_sessions import (
-    MACHINES,
-    Noise,
-    design_of,
-    draw_session,
-    one_fit,
-)
+from outline_sessions import MACHINES, Noise, design_of, draw_session, one_fit
 from outline_study import Found
 from thinned import thinned
 

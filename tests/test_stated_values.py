@@ -5,13 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from fit_sessions import (
-    BOARD_SCALE,
-    MachineSession,
-    corners_of,
-    machine_session,
-    with_board,
-)
+from fit_sessions import BOARD_SCALE, MachineSession, corners_of, machine_session, with_board
 
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior

@@ -27,11 +27,7 @@ from legcal.geometry.types import Array
 from legcal.machine.equations import pose_equations
 from legcal.machine.home import home_of_legs
 from legcal.machine.leg import EquationKind, Leg, LegKind
-from legcal.machine.model_writer import (
-    check_closes,
-    write_calibrated_yaml,
-    write_urdf,
-)
+from legcal.machine.model_writer import check_closes, write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import (
     geometries,
     moved_legs,
