@@ -323,7 +323,6 @@ def disturbed_start(
 def irregular_hexapod(
     n_poses: int = 15,
     *,
-    camera: Camera = PINHOLE,
     legs_seen: int = 4,
     sigma_px: float = 0.1,
     n_views: int = 3,
@@ -335,7 +334,7 @@ def irregular_hexapod(
     have errors that do not depend on each other.
     """
     session = machine_session(
-        NONCOPLANAR, n_views=n_views, n_poses=n_poses, camera=camera, distance=2.5, repeats=repeats
+        NONCOPLANAR, n_views=n_views, n_poses=n_poses, camera=PINHOLE, distance=2.5, repeats=repeats
     )
     A = np.array([leg.A for leg in session.truth.legs])
     depth = np.array([T.apply(A)[:, 2] for T in session.truth.T_camera_Rb])

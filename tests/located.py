@@ -52,13 +52,12 @@ def located(
     n: int = 20,
     *,
     noise: float = 1.0,
-    seed: int = 1,
     platform: Sequence[RigidTransform] | None = None,
 ) -> Located:
     """Return a machine at BASE with a tool at TOOL, measured at poses of the workspace or these."""
-    machine, chance = shipped(name), np.random.default_rng(seed)
+    machine, chance = shipped(name), np.random.default_rng(1)
     if platform is None:
-        drawn = random_configurations(machine, n, seed)
+        drawn = random_configurations(machine, n, 1)
         q, platform = drawn.readings, drawn.poses
     else:
         q = np.array([inverse_kinematics(machine, T) for T in platform])

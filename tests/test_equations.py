@@ -1,6 +1,5 @@
 """Equations of legs, their parameters, and how errors of these move the platform."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -8,14 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_legs import changed, closed_leg, leg_and_pose
+from random_legs import changed, leg_and_pose
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array
 from legcal.machine.equations import leg_equations
-from legcal.machine.leg import Leg, LegColumns, LegKind
-from legcal.machine.parameters import Parametrization, parametrize, vector_of
+from legcal.machine.leg import LegColumns, LegKind
+from legcal.machine.parameters import parametrize, vector_of
 
 FAST = settings(deadline=None, max_examples=6)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -91,29 +89,12 @@ def test_equations_of_a_leg_do_not_depend_on_the_frames(seed: int) -> None:
 # --- parameters ---------------------------------------------------------------------------------
 
 
-def legs_of(
-    types: Sequence[str], seed: int, kinds: Sequence[LegKind] | None = None
-) -> tuple[list[Leg], Array, Array]:
-    """Return legs that close at one pose, in frames that are not those on the joints."""
-    rng = np.random.default_rng(seed)
-    R, t = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
-    kinds = kinds or [ACTUATED] * len(types)
-    return [closed_leg(j, R, t, rng, k) for j, k in zip(types, kinds, strict=True)], R, t
-
-
-def parametrized(
-    legs: Sequence[Leg], *, twists: bool = False, frame: Sequence[int] = (0, 1, 2)
-) -> Parametrization:
-    names = [f"leg{j + 1}" for j in range(len(legs))]
-    return parametrize(names, legs, frame, twists=twists)
-
-
 @FAST
 @given(seed=SEEDS)
 def test_a_vector_says_how_far_each_axis_is_turned(seed: int) -> None:
-    legs, _, _ = legs_of(["UU", "RS", "SU", "UR"], seed)
+    legs = [leg_and_pose(j, seed + k)[0] for k, j in enumerate(("UU", "RS", "SU", "UR"))]
     rng = np.random.default_rng(seed)
-    found = parametrized(legs, twists=True)
+    found = parametrize(["leg1", "leg2", "leg3", "leg4"], legs, (0, 1, 2), twists=True)
     start = vector_of(found, legs, legs)
     steps = 0.1 * rng.normal(size=(4, LegColumns.COUNT))
     steps[found.place < 0] = 0.0
@@ -130,6 +111,3 @@ def test_a_vector_says_how_far_each_axis_is_turned(seed: int) -> None:
     ]
     for same in (moved, reversed_lines):
         np.testing.assert_allclose(vector_of(found, same, legs) - start, expected, atol=1e-12)
-
-
-# --- parameters and the pose --------------------------------------------------------------------

@@ -270,9 +270,6 @@ def test_a_home_further_out_than_the_travel_is_refused_with_both_numbers(
 # The singularity measure
 
 
-RING = [10.0, 110.0, 130.0, 230.0, 250.0, 350.0]
-
-
 def _turned(machine: Machine, degrees: float, height: float = 0.4) -> RigidTransform:
     """Return home turned about z, from the attitude in which base and platform are symmetric."""
     turn = Rotation.from_euler("z", degrees, degrees=True) * machine.home.rotation
