@@ -31,7 +31,6 @@ class Located:
 
     machine: Machine
     base: RigidTransform
-    tool: RigidTransform
     platform: Sequence[RigidTransform]
     poses: ToolPoses
 
@@ -71,7 +70,7 @@ def located(
         oriented=np.ones(len(tools), dtype=np.bool_),
         numbers=np.arange(1, len(tools) + 1),
     )
-    return Located(machine, BASE, TOOL, platform, poses)
+    return Located(machine, BASE, platform, poses)
 
 
 def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Array:

@@ -389,7 +389,7 @@ def placing(
 
 
 def test_a_photograph_fills_the_editor_on_a_telephone(
-    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
+    detection: tuple[Path, Detection], browser: Any
 ) -> None:
     narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)

@@ -143,7 +143,7 @@ def test_joints_are_where_the_written_model_has_them(example_run: Run) -> None:
 
 
 @pytest.mark.parametrize("model", [OBLIQUE, "3-rpr", "3-upu-tilted"])
-def test_covariance_is_that_of_joints_of_written_models(model: str, tmp_path: Path) -> None:
+def test_covariance_is_that_of_joints_of_written_models(model: str) -> None:
     """Each parameter is moved in the URDF: the joints that are loaded give the derivatives."""
     machine = load_mechanism(model)
     found, legs = parametrization_of(machine, twists=True), geometries(machine)

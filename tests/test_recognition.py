@@ -47,7 +47,7 @@ from legcal.perception.pair_matching import (
 from legcal.perception.placement import Group, Search, group_views
 from legcal.perception.view_fit import ViewFit, fit_view, min_evidence
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import outlines_of_axis
+from legcal.vision.cylinder import outlines_of_axis, steps_to_outlines
 
 CAMERA = Camera(np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]), 640, 480)
 OWN, TWIN = [0, 1, 2, 3, 4, 5], [1, 0, 3, 2, 5, 4]  # rods in pairs
@@ -354,37 +354,33 @@ N_LEGS, N_IMAGES = 6, 4
 SIGMA = 0.1  # of outlines [px]
 
 
-def _outlines(search: Search, T: RigidTransform, A: Array, B: Array, noise: Array) -> Outlines:
-    """Return both outlines of all tubes, with normal offsets (rows, legs, edges, ends) [px]."""
+def _outlines(T: RigidTransform, A: Array, B: Array) -> Outlines:
+    """Return both outlines of all tubes."""
     row, leg, edge = (x.ravel() for x in np.indices((N_IMAGES, N_LEGS, 2)))
     n = len(row)
     X = T.inv().apply(np.stack([A[row, leg], B[row, leg]], 1).reshape(-1, 3)).reshape(-1, 2, 3)
     u = X[:, 1] - X[:, 0]
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    h = outlines_of_axis(u, X[:, 0], lp.TUBE)[np.arange(n), edge]
-    along = X[:, :1] + np.array([0.03, 0.2])[:, None] * u[:, None]
-    xy = along[..., :2] / along[..., 2:]
-    normal = h[:, :2] / np.linalg.norm(h[:, :2], axis=1, keepdims=True)
-    off = (np.einsum("nkx,nx->nk", xy, h[:, :2]) + h[:, 2:]) / np.hypot(*h[:, :2].T)[:, None]
-    ends = CAMERA.distort(xy - off[..., None] * normal[:, None])
-    ends = ends + noise[row, leg, edge][..., None] * normal[:, None]
+    steps = steps_to_outlines(outlines_of_axis(u, X[:, 0], lp.TUBE), lp.TUBE)
+    ends = X[:, :1] + np.array([0.03, 0.2])[:, None] * u[:, None] + steps[np.arange(n), edge, None]
     return Outlines(
-        row, leg, ("tube",) * n, edge + 1, np.full((n, 3), np.nan), ends,
+        row, leg, ("tube",) * n, edge + 1, np.full((n, 3), np.nan), CAMERA.project(ends),
         np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), (USED,) * n,
         ("detected",) * n, **unmeasured(n),
     )  # fmt: skip
 
 
-def _fitted(seed: int, without: int = -1) -> tuple[ViewFit | None, Search, Group, RigidTransform]:
+def _fitted(
+    seed: int, is_used: bool = True
+) -> tuple[ViewFit | None, Search, Group, RigidTransform]:
     """Fit a view that starts three degrees off."""
     rng = np.random.default_rng(seed)
     made, T = lp.machine(N_LEGS, rng), lp.camera(rng)
     B = np.array([made.posed(lp.platform(rng)) for _ in range(N_IMAGES)])
     search = _search(Search, made, B)
     (group,) = group_views(search.measurements, np.arange(N_IMAGES), [None], None)
-    noise = np.zeros((N_IMAGES, N_LEGS, 2, 2))
     off = lp.motion([0.02, -0.01, 0.02], [0.0, 0.05, 0.0])
-    outlines = _outlines(search, T, search.A_base, search.B_base, noise)
+    outlines = _outlines(T, search.A_base, search.B_base)
     outlines = replace(outlines, used=np.full(len(outlines), is_used))
     return fit_view(search, group, T * off, np.zeros((N_LEGS, 2, 3)), outlines), search, group, T
 
