@@ -204,6 +204,9 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     assert re.match(r"view c3: its T_base_camera is wrong: .*it fits view c2", found.notes[1])
 
 
+X_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x is z, y is -x
+
+
 @pytest.mark.parametrize(
     ("written", "words"),
     [
@@ -237,9 +240,6 @@ def test_a_rough_pose_in_another_convention_is_called_so(
     notes = hint_notes(views, [T] * 2)
     assert len(notes) == 1 + words.startswith(";")  # one cause, one note
     assert ("views c1, c2:" in notes[0]) == (len(notes) == 1)
-
-
-X_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x is z, y is -x
 
 
 def _pose(xyz: NDArray[np.float64], rotation: Rotation) -> RigidTransform:
