@@ -24,11 +24,12 @@ from fit_sessions import (
 )
 from thinned import thinned
 
+from legcal.calibration.joint_fit import fit
 from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
-from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import RefinementSettings, State
+from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State
 from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
@@ -355,3 +356,17 @@ def test_a_start_far_away_is_refused(session: MachineSession) -> None:
     assert len(refused.value.problems) == 1
     with pytest.raises(DidNotConverge, match="needs at least one"):
         session.fit([])
+
+
+def test_the_start_of_the_lowest_cost_is_refined_wherever_it_stands(
+    session: MachineSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = [replace(session.truth, label=label) for label in ("second", "first", "third")]
+    costs = {"first": 1.0, "second": 2.0, "third": 3.0}
+    unwatched = fit._first_minimum
+
+    def with_cost(problem: FitProblem, start: Start) -> object:
+        return replace(unwatched(problem, start), cost=costs[start.label])
+
+    monkeypatch.setattr(fit, "_first_minimum", with_cost)
+    assert session.fit(starts).start == "first"
