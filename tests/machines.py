@@ -33,9 +33,9 @@ def ring(angles: list[float], radius: float, height: float = 0.0) -> Array:
 
 def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) -> MachineSpec:
     """Return a machine with up to seven legs of these types between general points, on any axes."""
-    rng = np.random.default_rng(seed)
-    A = ring([10, 50, 130, 170, 250, 290, 0], 0.3) + rng.uniform(-0.02, 0.02, (7, 3))
-    B = ring([-10, 70, 110, 190, 230, 310, 45], 0.2) + rng.uniform(-0.02, 0.02, (7, 3))
+    of_joints, of_axes = (np.random.default_rng(seed) for _ in range(2))
+    A = ring([10, 50, 130, 170, 250, 290, 0], 0.3) + of_joints.uniform(-0.02, 0.02, (7, 3))
+    B = ring([-10, 70, 110, 190, 230, 310, 45], 0.2) + of_joints.uniform(-0.02, 0.02, (7, 3))
     B[6] *= 0.3
     B = HOME.apply(B)
     kinds = kinds or ["actuated"] * len(types)
@@ -45,7 +45,7 @@ def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) ->
         u = B[j] - A[j]
         axes = []
         for letter in (leg_type + " ")[:2]:
-            axis = rng.normal(size=3)
+            axis = of_axes.normal(size=3)
             if letter == "R":
                 axis = np.cross(u, axis)
             axes.append(axis / np.linalg.norm(axis))

@@ -8,9 +8,11 @@ from dense_fit import jacobian, residuals
 from fit_sessions import (
     PINHOLE,
     MachineSession,
+    corners_of,
     disturbed_start,
     irregular_hexapod,
     machine_session,
+    with_board,
 )
 
 from legcal.calibration.estimate import (
@@ -108,6 +110,16 @@ def test_a_rejected_outline_carries_how_far_it_is_and_the_edge_that_it_lies_on()
         said = str(found.outlines.reason[wrong].detail)
         assert said.endswith(f" px, lies on edge 2 of {leg}.{leg}_tube")
     assert session.off(found.legs) < 1e-9
+
+
+def test_errors_of_corners_are_found_in_their_residuals() -> None:
+    session = machine_session("hexapod")
+    corners, claimed = corners_of(session, seed=4), []
+    for factor in (0.2, 5.0):
+        said = replace(corners, sigma_px=factor * corners.sigma_px)
+        seen, start = with_board(session, said)
+        claimed.append(session.noisy(3).fit(start, board=seen).estimates.sigma)
+    np.testing.assert_allclose(claimed[0], claimed[1], rtol=0.05)
 
 
 def biases_of(session: MachineSession) -> EdgeBiases:
