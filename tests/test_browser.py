@@ -388,22 +388,6 @@ def placing(
     return placer, camera, seen_from(folder, int(found.rows[0]), camera)
 
 
-def test_a_photograph_fills_the_editor_on_a_telephone(
-    detection: tuple[Path, Detection], browser: Any
-) -> None:
-    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
-    try:
-        editor = Editor(browser, detection[0].parent / "found" / "index.html")
-        editor.open(0)
-        stage = editor.find(".stage").size
-        editor.close()
-    finally:
-        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert stage["width"] > 300
-    assert stage["height"] > 200
-
-
 def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:
@@ -560,3 +544,22 @@ def test_only_this_machine_can_look() -> None:
             process.terminate()
             process.wait(PATIENCE)
     assert process.returncode == 0
+
+
+# On a telephone: last, as the browser keeps something of its screen
+
+
+def test_a_photograph_fills_the_editor_on_a_telephone(
+    detection: tuple[Path, Detection], browser: Any
+) -> None:
+    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+    try:
+        editor = Editor(browser, detection[0].parent / "found" / "index.html")
+        editor.open(0)
+        stage = editor.find(".stage").size
+        editor.close()
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert stage["width"] > 300
+    assert stage["height"] > 200
