@@ -24,9 +24,9 @@ def residuals(problem: EstimationProblem[Any], state: Any) -> Array:
     return np.concatenate([*of_factors, linear.prior_r])
 
 
-def jacobians(problem: EstimationProblem[Any], linear: Linearization[Any, Any]) -> dict[str, Array]:
-    """Return the derivatives (n, size) of each factor's residuals by all unknowns, and priors'."""
-    found = {}
+def jacobian(problem: EstimationProblem[Any], linear: Linearization[Any, Any]) -> Array:
+    """Return the derivatives of all residuals by all unknowns as the solver has them, (n, size)."""
+    found = []
     for factor in problem.factors:
         rows, index = linear[factor.name], problem.sparsity[factor.name].index
         n, q, _ = rows.J.shape
@@ -38,15 +38,10 @@ def jacobians(problem: EstimationProblem[Any], linear: Linearization[Any, Any]) 
             d = problem.d_element
             elements = problem.n_kept + d * factor.element[:, None] + np.arange(d)
             np.add.at(wide, (*at, elements[:, None]), rows.J_element)
-        found[factor.name] = wide[..., :-1].reshape(n * q, problem.size)
+        found.append(wide[..., :-1].reshape(n * q, problem.size))
     priors = np.zeros((len(linear.prior_r), problem.size))
     priors[:, : problem.n_kept] = linear.prior_J
-    return found | {"priors": priors}
-
-
-def jacobian(problem: EstimationProblem[Any], linear: Linearization[Any, Any]) -> Array:
-    """Return the derivatives of all residuals by all unknowns as the solver has them, (n, size)."""
-    return np.concatenate(list(jacobians(problem, linear).values()))
+    return np.concatenate([*found, priors])
 
 
 def projected_move(problem: FitProblem, state: State, x: Array) -> State:
@@ -69,20 +64,18 @@ def by_differences(
     return np.array(columns).T / (2.0 * STEP)
 
 
-def violations(problem: FitProblem, state: State) -> Array:
-    """Return the residuals of joints, constant lengths and the plane at all poses [m or rad]."""
-    found = posture_constraints(state.legs, *state.platform_pose).values.ravel()
-    if problem.legs.spatial:
-        return found
-    pose = state.platform_pose
-    plane = np.stack([pose.R[:, 2, 0], pose.R[:, 2, 1], pose.t[:, 2]], axis=1)
-    return np.concatenate([found, plane.ravel()])
-
-
 def allowed(problem: FitProblem, state: State) -> Array:
     """Return an orthonormal basis (size, f) of the steps that constraints and holds leave."""
+
+    def violations(state: State) -> Array:
+        """Return the residuals of joints, constant lengths and the plane at all poses [m, rad]."""
+        pose = state.platform_pose
+        found = posture_constraints(state.legs, *pose).values.ravel()
+        plane = np.stack([pose.R[:, 2, 0], pose.R[:, 2, 1], pose.t[:, 2]], axis=1)
+        return found if problem.legs.spatial else np.concatenate([found, plane.ravel()])
+
     eye = np.eye(problem.size)
-    C = by_differences(problem, state, lambda s: violations(problem, s), eye)
+    C = by_differences(problem, state, violations, eye)
     held = np.zeros((len(problem.held_directions), problem.size))
     held[:, : problem.held_directions.shape[1]] = problem.held_directions
     C = np.concatenate([C, held])

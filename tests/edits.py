@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from csv_rows import read_rows, write_rows
 
-Edit = Callable[[Path], None]
+Edit = Callable[[Path], object]
 GONE = object()  # of a key: take it out
 
 

@@ -34,7 +34,6 @@ from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, moved_legs
 from legcal.machine.rods import (
     actuator_index,
@@ -187,7 +186,10 @@ def machine_session(
     machine = true_machine(name)
     legs, home = geometries(machine), platform_in_base(machine, machine.home)
     fitted = replace(fitted_legs(machine), home=home)
-    R, t = _poses(machine, legs, n_views * n_poses, rng)
+    R, t = components((home,) * (n_views * n_poses))
+    lengths = [np.linalg.norm(R[0] @ leg.B + t[0] - leg.A) for leg in legs]
+    step = rng.uniform(-1.0, 1.0, (len(t), 6)) * np.repeat([_TURN, _SHIFT * np.mean(lengths)], 3)
+    R, t = closed_poses(legs, machine.frame_legs, *moved_poses(R, t, step))
     first = np.arange(len(t)) // repeats * repeats
     R, t = R[first], t[first]
     q, view = _readings(fitted, R, t), np.repeat(np.arange(n_views), n_poses)
@@ -211,16 +213,6 @@ def machine_session(
         truth,
         start_from(away, measurements, wrong, rough, at_home, "nominal"),
     )
-
-
-def _poses(
-    machine: Machine, legs: tuple[Leg, ...], n: int, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return poses around home at which the legs close."""
-    R, t = components((platform_in_base(machine, machine.home),) * n)
-    size = np.mean([np.linalg.norm(R[0] @ leg.B + t[0] - leg.A) for leg in legs])
-    step = rng.uniform(-1.0, 1.0, (n, 6)) * np.repeat([_TURN, _SHIFT * size], 3)
-    return closed_poses(legs, machine.frame_legs, *moved_poses(R, t, step))
 
 
 def _readings(fitted: FittedLegs, R: Array, t: Array) -> Array:
@@ -331,7 +323,6 @@ def disturbed_start(
 def irregular_hexapod(
     n_poses: int = 15,
     *,
-    camera: Camera = PINHOLE,
     legs_seen: int = 4,
     sigma_px: float = 0.1,
     n_views: int = 3,
@@ -343,7 +334,7 @@ def irregular_hexapod(
     have errors that do not depend on each other.
     """
     session = machine_session(
-        NONCOPLANAR, n_views=n_views, n_poses=n_poses, camera=camera, distance=2.5, repeats=repeats
+        NONCOPLANAR, n_views=n_views, n_poses=n_poses, camera=PINHOLE, distance=2.5, repeats=repeats
     )
     A = np.array([leg.A for leg in session.truth.legs])
     depth = np.array([T.apply(A)[:, 2] for T in session.truth.T_camera_Rb])

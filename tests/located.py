@@ -13,7 +13,6 @@ from legcal import Machine, ToolPoses, inverse_kinematics, load_mechanism, rando
 from legcal.calibration.location.frames import PosePairs, predicted, transforms
 from legcal.geometry.rotations import rotation_matrices
 from legcal.geometry.types import Array
-from legcal.machine.configurations import Configurations
 
 SIGMA_POSITION = 0.02e-3
 SIGMA_ANGLE = float(np.radians(0.01))
@@ -26,18 +25,12 @@ def shipped(name: str) -> Machine:
     return load_mechanism(name)
 
 
-@cache
-def workspace_poses(name: str, n: int, seed: int = 1) -> Configurations:
-    return random_configurations(shipped(name), n, seed)
-
-
 @dataclass(frozen=True, eq=False)
 class Located:
     """A machine in the world, and what was measured."""
 
     machine: Machine
     base: RigidTransform
-    tool: RigidTransform
     platform: Sequence[RigidTransform]
     poses: ToolPoses
 
@@ -58,13 +51,12 @@ def located(
     n: int = 20,
     *,
     noise: float = 1.0,
-    seed: int = 1,
     platform: Sequence[RigidTransform] | None = None,
 ) -> Located:
     """Return a machine at BASE with a tool at TOOL, measured at poses of the workspace or these."""
-    machine, chance = shipped(name), np.random.default_rng(seed)
+    machine, chance = shipped(name), np.random.default_rng(1)
     if platform is None:
-        drawn = workspace_poses(name, n, seed)
+        drawn = random_configurations(machine, n, 1)
         q, platform = drawn.readings, drawn.poses
     else:
         q = np.array([inverse_kinematics(machine, T) for T in platform])
@@ -78,7 +70,7 @@ def located(
         oriented=np.ones(len(tools), dtype=np.bool_),
         numbers=np.arange(1, len(tools) + 1),
     )
-    return Located(machine, BASE, TOOL, platform, poses)
+    return Located(machine, BASE, platform, poses)
 
 
 def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Array:

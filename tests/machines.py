@@ -31,19 +31,13 @@ def ring(angles: list[float], radius: float, height: float = 0.0) -> Array:
     return np.stack([radius * np.cos(a), radius * np.sin(a), 0.0 * a + height], axis=1)
 
 
-def _seven(seed: int = 1) -> tuple[Array, Array]:
-    """Return seven pairs of joint centres, not coplanar, in the base link at home."""
-    rng = np.random.default_rng(seed)
-    A = ring([10, 50, 130, 170, 250, 290, 0], 0.3) + rng.uniform(-0.02, 0.02, (7, 3))
-    B = ring([-10, 70, 110, 190, 230, 310, 45], 0.2) + rng.uniform(-0.02, 0.02, (7, 3))
-    B[6] *= 0.3
-    return A, np.asarray(HOME.apply(B))
-
-
 def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) -> MachineSpec:
-    """Return a machine with legs of these types between general points, general axes."""
-    rng = np.random.default_rng(seed)
-    A, B = _seven(seed)
+    """Return a machine with up to seven legs of these types between general points, on any axes."""
+    of_joints, of_axes = (np.random.default_rng(seed) for _ in range(2))
+    A = ring([10, 50, 130, 170, 250, 290, 0], 0.3) + of_joints.uniform(-0.02, 0.02, (7, 3))
+    B = ring([-10, 70, 110, 190, 230, 310, 45], 0.2) + of_joints.uniform(-0.02, 0.02, (7, 3))
+    B[6] *= 0.3
+    B = HOME.apply(B)
     kinds = kinds or ["actuated"] * len(types)
     order = [0, 2, 4, 1, 3, 5, 6]
     legs = []
@@ -51,7 +45,7 @@ def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) ->
         u = B[j] - A[j]
         axes = []
         for letter in (leg_type + " ")[:2]:
-            axis = rng.normal(size=3)
+            axis = of_axes.normal(size=3)
             if letter == "R":
                 axis = np.cross(u, axis)
             axes.append(axis / np.linalg.norm(axis))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from command_line import run
@@ -18,6 +18,7 @@ from simulated import simulated
 from legcal.machine.loader import load_mechanism
 
 ROOT = Path(__file__).resolve().parents[1]
+REDUNDANT = ROOT / "tests/data/recorded/redundant"
 
 
 @cache
@@ -56,11 +57,6 @@ def _plain(folder: Path) -> None:
     made.write()
 
 
-def _model(folder: Path) -> None:
-    """Copy the files of the shipped hexapod."""
-    copied_model(folder, "hexapod")
-
-
 def _with_motors(folder: Path) -> None:
     """Copy the files of shipped machines whose joints at A move."""
     for name in ("delta", "3-prs"):
@@ -81,11 +77,6 @@ def _tables(folder: Path) -> None:
     )
 
 
-def _tool_poses(folder: Path) -> None:
-    """Write measured poses of a tool on the shipped hexapod."""
-    write_poses(folder / "hexapod.csv", located("hexapod", 24))
-
-
 def _result(folder: Path) -> None:
     """Calibrate a 3-RPR, and take new images of the same machine for a check."""
     shutil.copytree(made_input("3-rpr-outlines"), folder / "set")
@@ -93,21 +84,18 @@ def _result(folder: Path) -> None:
     assert run(*words).code == 0
 
 
-def _written(style: str) -> Callable[[Path], None]:
+def _written(style: str, folder: Path) -> None:
     """Write the shipped hexapod in the format of another program."""
-
-    def write(folder: Path) -> None:
-        write_format(load_mechanism("hexapod"), style, folder)
-
-    return write
+    write_format(load_mechanism("hexapod"), style, folder)
 
 
-MAKERS: dict[str, Callable[[Path], None]] = {
+MAKERS: dict[str, Callable[[Path], object]] = {
     "plain": _plain,
-    "model": _model,
+    "model": lambda folder: copied_model(folder, "hexapod"),
     "motors": _with_motors,
+    "redundant": lambda folder: shutil.copytree(REDUNDANT, folder, dirs_exist_ok=True),
     "tables": _tables,
-    "tool-poses": _tool_poses,
+    "tool-poses": lambda folder: write_poses(folder / "hexapod.csv", located("hexapod", 24)),
     "result": _result,
-    **{style: _written(style) for style in ("mjcf", "loop_joint", "gepetto")},
+    **{style: partial(_written, style) for style in ("mjcf", "loop_joint", "gepetto")},
 }

@@ -7,7 +7,6 @@ import numpy as np
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import MEASURED, Outlines
 from legcal.data.reasons import USED, Reason, Rejection
-from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
@@ -58,15 +57,6 @@ def recorded(
     )
 
 
-def legs_in_view(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-    """Directions and points of n legs that the camera sees."""
-    u = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.3]
-    u[:, :2] /= np.linalg.norm(u[:, :2], axis=-1, keepdims=True)  # none towards the camera
-    u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    M = rng.uniform([-0.1, -0.1, 0.8], [0.1, 0.1, 1.0], size=(n, 3))
-    return u, M
-
-
 def outlines_of(
     seed: int,
     rows: Sequence[int] = (0, 1, 2, 3),
@@ -78,7 +68,11 @@ def outlines_of(
     rng = np.random.default_rng(seed)
     places = [(row, leg, edge) for row in rows for leg in legs for edge in (0, 1)]
     row, leg, edge = (np.array(index, dtype=np.intp) for index in zip(*places, strict=True))
-    u, M = legs_in_view(rng, len(rows) * len(legs))
+    n = len(rows) * len(legs)
+    u = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.3]
+    u[:, :2] /= np.linalg.norm(u[:, :2], axis=-1, keepdims=True)  # none towards the camera
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    M = rng.uniform([-0.1, -0.1, 0.8], [0.1, 0.1, 1.0], size=(n, 3))
     h = outlines_of_axis(u, M, 0.01).reshape(-1, 3)
     u, M = np.repeat(u, 2, axis=0), np.repeat(M, 2, axis=0)
     P = M - 0.01 * EPSILON[edge][:, None] * h

@@ -87,12 +87,6 @@ def _around(j: int, radius: float, height: float) -> tuple[Array, Array]:
     return turn.apply([radius, 0.0, height]), turn.apply([0.0, 1.0, 0.0])
 
 
-def _rod(at: Array, end: Array, tangent: Array) -> list[Joint]:
-    """Return the universal joint of a rod."""
-    inner = np.cross(tangent, end - at)
-    return [("revolute", at, tangent), ("revolute", at, inner / np.linalg.norm(inner))]
-
-
 def _arm(
     drawing: Drawing, j: int, points: Array, axis: Array, on: tuple[str, Array] | None = None
 ) -> None:
@@ -101,7 +95,9 @@ def _arm(
     drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
     drawing.motors.append(f"j_arm{j}")
     for k, out in enumerate((-0.03 * axis, 0.03 * axis)):
-        rod, name = _rod(elbow + out, end + out, axis), f"rod{j}{k}"
+        inner, name = np.cross(axis, end - elbow), f"rod{j}{k}"
+        inner /= np.linalg.norm(inner)
+        rod: list[Joint] = [("revolute", elbow + out, line) for line in (axis, inner)]
         at = on or ("platform", HEIGHT * Z)
         drawing.chain(name, f"arm{j}", pivot, rod, end=end + out, kind="3d", on=at)
         drawing.legs[name] = f"j_{name}_0"

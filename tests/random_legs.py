@@ -49,17 +49,14 @@ def closed_leg(
         platform_axis=b if platform in ("R", "") or (platform == "U" and base != "S") else None,
         twist=None if "S" in joints else 0.0,
     )
-    return leg if leg.twist is None else replace(leg, twist=twist_of(leg, R, t))
-
-
-def twist_of(leg: Leg, R: Array, t: Array) -> float:
-    """Return the twist in (-pi/2, pi/2] with which a leg without an S joint closes at a pose."""
-    sine, cosine = (
+    if leg.twist is None:
+        return leg
+    sine, cosine = (  # of the twist in (-pi/2, pi/2] with which it closes at the pose
         float(leg_equations(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
         for twist in (0.0, -0.5 * np.pi)
     )
     angle = math.atan2(sine, cosine)
-    return angle - math.pi * math.ceil(angle / math.pi - 0.5)
+    return replace(leg, twist=angle - math.pi * math.ceil(angle / math.pi - 0.5))
 
 
 def turned(vector: Array | None, axis: Array | None, angles: Array) -> Array | None:

@@ -27,6 +27,7 @@ from edits import (
     cell,
     cut,
     doubled,
+    each_row,
     header,
     kept,
     keyed,
@@ -513,8 +514,19 @@ def _tables() -> Iterable[Refusal]:
             ("'up'", "'none'", "'0'", "'x'", "'y'", "row 1", "row 4"),
         ),
         ("all-rejected", cell(o, None, verdict="rejected"), ("outline",)),
+        (
+            "leg-rejected",
+            each_row(o, lambda row: row["leg"] == "leg3" and row.update(verdict="rejected")),
+            ("no image has a usable outline of leg3", "list the visible legs of each"),
+        ),
     ]
     yield from _cases("outlines", CALIBRATE, outlines, "3-rpr-outlines")
+    wrong = cell("measurements.csv", 2, leg2_prismatic="0.12")
+    named = "readings of view c1, image p02", "from the value given by the other motors"
+    yield from _cases("reading", CALIBRATE, [("of-four", wrong, named)], "redundant")
+    short = cell("measurements.csv", 4, **{f"leg{j}_prismatic": "0.0001" for j in (1, 2, 3)})
+    named = "readings of view c1, image p04 could not be used", "needed at most"
+    yield from _cases("reading", CALIBRATE, [("out-of-reach", short, named)], "3-rpr-outlines")
 
     c = "corners.csv"
     line = f"{CORNER_COLUMNS}\n"
@@ -700,7 +712,14 @@ def _models() -> Iterable[Refusal]:
             text("result.json", '{"legcal_result": 1, "mach'))  # fmt: skip
     of_inputs: dict[str, Rows] = {
         "model": [
-            ("urdf-alone", ("/arm.urdf", _alone), ("arm.urdf",)),
+            (
+                "urdf-alone",
+                (
+                    "/arm.urdf",
+                    lambda folder: (folder / "urdf/hexapod.urdf").rename(folder / "arm.urdf"),
+                ),
+                ("arm.urdf",),
+            ),
             ("written", "/models/hexapod.yaml --write {in}", ("hexapod.yaml",)),
         ],
         "tables": [
@@ -1114,10 +1133,6 @@ def _exports() -> Iterable[Refusal]:
         ("itself", "json -o {in}/result/result.json --force", ("which is exported",)),
     ]
     yield from _cases("export", "export {in}/result --to", of_result, "result")
-
-
-def _alone(folder: Path) -> None:
-    (folder / "urdf/hexapod.urdf").rename(folder / "arm.urdf")
 
 
 def _without_visuals(folder: Path) -> None:

@@ -100,7 +100,7 @@ def _paint(image: Array, depth: Array, rays: Array, bar: Bar, light: Light, towa
     """Draw one bar over what lies behind it."""
     length = float(np.linalg.norm(bar.B - bar.A))
     u = (bar.B - bar.A) / length
-    rows, columns = _box(image.shape, rays, bar)
+    rows, columns = _box(rays, bar)
     ray = rays[rows, columns]
     across = ray - (ray @ u)[..., None] * u
     offset = bar.A - (bar.A @ u) * u
@@ -121,7 +121,7 @@ def _paint(image: Array, depth: Array, rays: Array, bar: Bar, light: Light, towa
     depth[rows, columns] = np.where(hit, z, depth[rows, columns])
 
 
-def _box(shape: tuple[int, ...], rays: Array, bar: Bar) -> tuple[slice, slice]:
+def _box(rays: Array, bar: Bar) -> tuple[slice, slice]:
     """Return the part of the image that a bar may cover."""
     ends = np.stack([bar.A, bar.B])
     xy = ends[:, :2] / ends[:, 2:]

@@ -23,25 +23,17 @@ BOARD = {"kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "mar
 IN_HAND = ("c1-1,images/c1_1.png", "c1-2,images/c1_2.png")
 
 
-def _hold(folder: Folder, view: str) -> None:
-    folder.entry["board"] = dict(BOARD)
-    folder.entry["views"][view]["hand_held"] = True
-    folder.entry["views"][view].pop("T_base_camera", None)
-
-
-def _lines(place: str, n: int = 6) -> list[str]:
-    return [f"{place},{k},{5 + k},6,0.1,used,,detected" for k in range(n)]
-
-
 def _write(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join([",".join(COLUMNS[:-1]), *lines]) + "\n")
 
 
 def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: Folder) -> None:
-    _hold(folder, "c1")
+    folder.entry["views"]["c1"]["hand_held"] = True
+    del folder.entry["views"]["c1"]["T_base_camera"]
     pose = {"xyz": [0.1, 0.0, 0.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
-    folder.entry["board"] |= {"T_base_board": pose}
-    _write(folder.path / "corners.csv", [line for place in IN_HAND for line in _lines(place)])
+    folder.entry["board"] = BOARD | {"T_base_board": pose}
+    lines = [f"{place},{k},{5 + k},6,0.1,used,,detected" for place in IN_HAND for k in range(6)]
+    _write(folder.path / "corners.csv", lines)
     dataset = load_dataset(folder.write())
     m = dataset.measurements
     assert [view.name for view in m.views] == ["c1-1", "c1-2", "c2"]
@@ -103,19 +95,15 @@ def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners
     assert _same(back, corners.choose(np.lexsort([corners.corner, corners.row])))
 
 
-def _read(tmp_path: Path, *lines: str) -> Corners:
-    _write(tmp_path / "corners.csv", list(lines))
-    return read_corners(tmp_path / "corners.csv", BOARDS, MEASUREMENTS)
-
-
 def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path) -> None:
-    corners = _read(
-        tmp_path,
+    lines = [
         "c2,a.png,3,10.0,20.0,0.1,used,,detected",
         "c2,a.png,4,11.0,20.0,0.1,used,,detected",
         "c2,a.png,3,10.5,20.5,0.2,used,,edited",
         "c2,a.png,5,,,,rejected,hidden,edited",
-    )
+    ]
+    _write(tmp_path / "corners.csv", lines)
+    corners = read_corners(tmp_path / "corners.csv", BOARDS, MEASUREMENTS)
     assert corners.corner.tolist() == [4, 3, 5]
     assert corners.px[:2, 0].tolist() == [11.0, 10.5]
     assert corners.used.tolist() == [True, True, False]

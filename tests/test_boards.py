@@ -24,6 +24,7 @@ from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
+from legcal.geometry.types import Image
 from legcal.perception.board_adjustment import camera_poses_by_board, plane_poses
 from legcal.perception.board_corners import (
     SeenBoard,
@@ -107,17 +108,34 @@ def test_targets_of_kalibr_and_basalt_are_boards(tmp_path: Path, target: str, bo
 # Where its corners are in an image.
 
 
+def sharpened(image: Image) -> Image:
+    """Return what a camera makes of an image: edges overshoot by a tenth of the contrast and more.
+
+    And its JPEG is coarse.
+    """
+    sharp = image + 1.3 * (image - cv2.GaussianBlur(image, (0, 0), 1.5))
+    _, file = cv2.imencode(".jpg", np.clip(sharp, 0, 255), [cv2.IMWRITE_JPEG_QUALITY, 75])
+    return np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE))
+
+
 @pytest.mark.parametrize("kind", [board.kind for board in BOARDS])
-def test_corners_are_where_the_camera_sees_them_and_as_good_as_they_claim(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("look", "shown", "rms", "ratio"),
+    [("plain", 0.8, 0.03, 1.6), ("sharpened", 0.95, 0.05, 2.0)],
+)
+def test_corners_are_where_the_camera_sees_them_and_as_good_as_they_claim(
+    look: str, shown: float, rms: float, ratio: float, kind: str
+) -> None:
     board, T, image = plain_picture(kind)
-    number, px, sigma = find_corners(board, image)
+    number, px, sigma = find_corners(board, sharpened(image) if look == "sharpened" else image)
     error = px - seen_at(board, T)[number]
-    assert len(number) >= 0.8 * board.n_corners
+    assert len(number) >= shown * board.n_corners
     assert np.all(np.diff(number) > 0)
-    assert np.abs(error.mean(axis=0)).max() < 0.01
-    assert np.sqrt(np.mean(error**2)) < 0.03
-    assert 0.3 < np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
-    assert np.all(sigma < 0.06)
+    assert np.sqrt(np.mean(error**2)) < rms
+    assert 0.3 < np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < ratio
+    if look == "plain":
+        assert np.abs(error.mean(axis=0)).max() < 0.01
+        assert np.all(sigma < 0.06)
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
@@ -148,19 +166,6 @@ def test_pixels_of_a_rescaled_image_are_put_back_where_they_were(scale: float) -
     v, u = np.indices((height, width))
     centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.sum(dtype=np.float64)
     assert reduced(centroid, scale) == pytest.approx([31.3, 17.8], abs=0.03)
-
-
-@pytest.mark.parametrize("kind", [board.kind for board in BOARDS])
-def test_cameras_that_sharpen_move_no_corner(kind: str) -> None:
-    """Edges overshoot by a tenth of the contrast and more, and a JPEG is coarse."""
-    board, T, image = plain_picture(kind)
-    sharp = image + 1.3 * (image - cv2.GaussianBlur(image, (0, 0), 1.5))
-    _, file = cv2.imencode(".jpg", np.clip(sharp, 0, 255), [cv2.IMWRITE_JPEG_QUALITY, 75])
-    number, px, sigma = find_corners(board, np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE)))
-    error = px - seen_at(board, T)[number]
-    assert len(number) >= 0.95 * board.n_corners
-    assert np.sqrt(np.mean(error**2)) < 0.05
-    assert 0.3 < np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 2.0
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD], ids=lambda b: b.kind)

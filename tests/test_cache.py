@@ -35,10 +35,6 @@ ALL = (0, 1, 2, 3)
 SETTINGS = {"blur": 0.4, "parts": ["rod"]}
 
 
-def _edited(outlines: Outlines) -> Outlines:
-    return replace(outlines, source=("edited",) * len(outlines))
-
-
 def _mask(rows: Collection[int]) -> BoolArray:
     return np.isin(np.arange(4), list(rows))
 
@@ -102,7 +98,10 @@ def test_what_is_searched_and_what_is_kept(
     table = None
     if detected is not None:
         parts = [outlines_of(1, rows=detected)]
-        table = join_outlines([*parts, *([_edited(outlines_of(2, rows=edited))] if edited else [])])
+        if edited:
+            by_hand = outlines_of(2, rows=edited)
+            parts.append(replace(by_hand, source=("edited",) * len(by_hand)))
+        table = join_outlines(parts)
     plan = plan_detection(table, _mask(images), recorded, "now", _mask(given))
     assert tuple(plan.detect) == searched
     assert tuple(np.flatnonzero(plan.given)) == still_given

@@ -8,31 +8,25 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from csv_rows import read_rows, write_rows
-from edits import document
+from edits import Edit, document, kept
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run
-from scipy.spatial.transform import RigidTransform
 from simulated import files_of, simulated
 
 from legcal import Calibration, calibrate, evaluate, load_mechanism, load_result
-from legcal.calibration.board import BoardViews, base_of_board
 from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.summary import sentences
 from legcal.calibration.verdict import judge
-from legcal.data.corners import found_corners
-from legcal.errors import DatasetError, NotIdentifiable, NotVisible
-from legcal.geometry.types import Array
+from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import SimulatedDataset
-from legcal.vision.board import Board, FixedBoard
 
 Row = dict[str, str]
 Rows = list[Row]
@@ -46,16 +40,6 @@ def _change(path: Path, change: Callable[[Rows], Rows]) -> Rows:
     return rows
 
 
-def _pulls(calibration: Calibration, truth: Path) -> Array:
-    """Return the errors of the kinematic parameters that are estimated over their sigmas."""
-    solution, legs = calibration.solution, geometries(load_mechanism(truth))
-    true, found = (
-        vector_of(solution.kinematic.parametrization, g, legs) for g in (legs, solution.legs)
-    )
-    sigma = np.sqrt(np.diagonal(solution.kinematic.value_covariance))
-    return np.asarray((found - true)[sigma > 0.0] / sigma[sigma > 0.0])
-
-
 def _simulated(
     folder: Path, model: str = PLANAR, *, poses: int = 6, **changes: Any
 ) -> SimulatedDataset:
@@ -67,12 +51,6 @@ def planar(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]
     """Outlines of a planar machine in three views, and their calibration, with ``result``."""
     folder = _simulated(tmp_path_factory.mktemp("planar"), views=3).folder
     return folder, calibrate(folder, output=folder.parent / "result")
-
-
-@pytest.fixture(scope="module")
-def hexapod(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Outlines of a hexapod, whose poses two views share."""
-    return _simulated(tmp_path_factory.mktemp("hexapod"), "hexapod", shared_poses=True).folder
 
 
 # Invariance.
@@ -228,9 +206,10 @@ def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
     ],
 )
 def test_images_that_cannot_do_it_are_refused_in_one_sentence(
-    hexapod: Path, tmp_path: Path, shown: str, named: str
+    tmp_path: Path, shown: str, named: str
 ) -> None:
-    folder, leg_of = Path(shutil.copytree(hexapod, tmp_path / "set")), dict[tuple[str, str], str]()
+    folder = _simulated(tmp_path, "hexapod", shared_poses=True).folder
+    leg_of = dict[tuple[str, str], str]()
 
     def is_kept(row: Row) -> bool:
         if shown == "one pose":
@@ -255,39 +234,28 @@ def test_images_that_cannot_do_it_are_refused_in_one_sentence(
 # A calibration board.
 
 
-def test_corners_that_are_too_few_are_refused(tmp_path: Path) -> None:
-    folder = _simulated(tmp_path, poses=2, views=1, board="charuco").folder
-    _change(folder / "corners.csv", lambda rows: rows[:2])
-    with pytest.raises(NotVisible, match="found no image with 4 of its corners or more"):
+def _moved_aside(entry: dict[str, Any]) -> None:
+    entry["views"]["c1"]["T_base_camera"]["xyz"][0] += 0.3
+
+
+@pytest.mark.parametrize(
+    ("spoil", "kind", "named"),
+    [
+        (kept("corners.csv", 2), NotVisible, "found no image with 4 of its corners or more"),
+        (
+            document("dataset.yaml", _moved_aside),
+            DatasetError,
+            "T_base_board and the T_base_camera .* found the board",
+        ),
+    ],
+)
+def test_a_board_that_does_not_place_the_cameras_is_refused(
+    spoil: Edit, kind: type[LegcalError], named: str, tmp_path: Path
+) -> None:
+    folder = _simulated(tmp_path, poses=2, views=1, board="charuco", board_pose=True).folder
+    spoil(folder)
+    with pytest.raises(kind, match=named):
         calibrate(folder)
-
-
-def _seen() -> BoardViews:
-    none = np.zeros(0)
-    corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
-    T_board_camera = RigidTransform.from_translation([0.0, 0.0, -1.0])
-    boards = (FixedBoard(Board("chessboard", 7, 6, 0.03), "base"),)
-    return BoardViews(boards, corners, (T_board_camera,), {}, (), 0.4)
-
-
-def _with_board(T_base_board: RigidTransform | None) -> Any:
-    fixed = FixedBoard(Board("chessboard", 7, 6, 0.03), "base", T_base_board)
-    return SimpleNamespace(board_on=lambda link: fixed, yaml_path="dataset.yaml")
-
-
-def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
-    place = RigidTransform.from_translation([0.3, 0.0, 0.0])
-    board = _with_board(place)
-    cameras = RigidTransform.from_translation([0.3, 0.04, -1.0])
-    assert base_of_board(board, _seen(), (None,)) is place
-    assert base_of_board(board, _seen(), (cameras,)) is place
-    with pytest.raises(DatasetError, match=r"T_base_board and the T_base_camera .* found the boa"):
-        base_of_board(board, _seen(), (cameras * cameras,))
-    board = _with_board(None)
-    found = base_of_board(board, _seen(), (cameras,))
-    assert found is not None
-    np.testing.assert_allclose(found.translation, [0.3, 0.04, 0.0], atol=1e-12)
-    assert base_of_board(board, _seen(), (None,)) is None
 
 
 # The photographs of the example.
@@ -323,7 +291,12 @@ def test_counts_of_rejected_outlines_in_words_add_up(example_run: Run) -> None:
 
 
 def test_errors_from_photographs_are_as_large_as_their_sigmas(example_run: Run) -> None:
-    pulls = _pulls(example_run.calibration, TRUTH)
+    solution, legs = example_run.calibration.solution, geometries(load_mechanism(TRUTH))
+    true, found = (
+        vector_of(solution.kinematic.parametrization, g, legs) for g in (legs, solution.legs)
+    )
+    sigma = np.sqrt(np.diagonal(solution.kinematic.value_covariance))
+    pulls = (found - true)[sigma > 0.0] / sigma[sigma > 0.0]
     assert len(pulls) == 30
     assert 0.2 < np.mean(np.square(pulls)) < 2.0
     radii = [row for row in example_run.calibration.result.parameters if ".radius." in row.name]

@@ -4,13 +4,13 @@ Refusals of single cells and keys are in tests/refusal_table.py; here are those 
 Python alone shows, and every kind and every fault of an image file.
 """
 
-import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from dataset_folder import JOINTS, SIZE, Folder, folder, readings
+from photograph_files import exif, jpeg
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
@@ -241,12 +241,8 @@ def test_every_cut_of_a_file_is_found(tmp_path: Path, name: str, options: tuple[
 
 
 def test_orientation_in_the_exif_data_does_not_turn_the_pixels(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.jpg", picture(), cv2.IMWRITE_JPEG_QUALITY, 100)
-    content = path.read_bytes()
-    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
-    exif = b"Exif\0\0" + tiff
-    segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
-    path.write_bytes(content[:2] + segment + content[2:])
+    path = tmp_path / "a.jpg"
+    path.write_bytes(jpeg(picture(), 100, exif(orientation=6)))
     turned = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert turned is not None
     assert turned.shape == (W, H)

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -93,7 +93,7 @@ def far_away(machine: Machine) -> Array:
     return np.where(other_way, 5.0, -5.0) * machine.sign[columns]
 
 
-def own_of(T: RigidTransform, names: tuple[str, ...]) -> Array:
+def own_of(T: RigidTransform, names: Sequence[str]) -> Array:
     """Return a machine's own coordinates of a pose [m, rad]."""
     everything = [*T.translation, *T.rotation.as_euler("xyz")]
     return np.array([everything[COORDINATES.index(name)] for name in names])
@@ -362,40 +362,15 @@ def test_corrected_commands_bring_the_machine_where_it_should_be(
     assert lines[len(said)].split(",")[: len(own)] == [
         f"{name}_{'mm' if name in 'xyz' else 'deg'}" for name in own
     ]
-    m = len(own)
+    m, units = len(own), np.array([1e3 if name in "xyz" else np.degrees(1.0) for name in own])
+    of_nominal = Subject(nominal, "nominal")
+    kinematics: Any = module_at(written(of_nominal, "python", tmp_path / "kinematics.py"))
     for row in table[:: max(1, len(table) // 5)]:
-        start = nominal.home
-        pose = _with_coordinates(nominal, own, row[m:], start)
+        pose = RigidTransform.from_matrix(kinematics.pose_at(row[m:] / units))
         reached = forward_kinematics(machine, inverse_kinematics(nominal, pose))
-        np.testing.assert_allclose(_coordinates(reached, own), row[:m], atol=1e-6)
+        np.testing.assert_allclose(units * own_of(reached, own), row[:m], atol=1e-6)
     off = figures["residual"]["max_dX_m"], figures["uncorrected"]["max_dX_m"]
     assert 0.0 < off[0] < 0.1 * off[1]
-
-
-def _coordinates(T: RigidTransform, own: list[str]) -> Array:
-    """Return coordinates of a pose [mm, deg]."""
-    everything = [*(1e3 * T.translation), *T.rotation.as_euler("xyz", degrees=True)]
-    names = ["x", "y", "z", "roll", "pitch", "yaw"]
-    return np.array([everything[names.index(name)] for name in own])
-
-
-def _with_coordinates(
-    machine: Machine, own: list[str], wanted: Array, start: RigidTransform
-) -> RigidTransform:
-    """Return the pose of a machine with given coordinates, by Newton's method on its readings."""
-    q = inverse_kinematics(machine, start)
-    motors = list(machine.motors)
-    for _ in range(30):
-        here = _coordinates(forward_kinematics(machine, q), own)
-        if np.abs(here - wanted).max() < 1e-9:
-            break
-        J = np.empty((len(own), len(motors)))
-        for k, motor in enumerate(motors):
-            ahead = q.copy()
-            ahead[motor] += 1e-6
-            J[:, k] = (_coordinates(forward_kinematics(machine, ahead), own) - here) / 1e-6
-        q[motors] += np.linalg.solve(J, wanted - here)
-    return forward_kinematics(machine, q)
 
 
 # --- parameters ---------------------------------------------------------------------------------

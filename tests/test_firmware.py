@@ -150,7 +150,7 @@ def test_a_configuration_means_the_same_however_it_is_spelt(text: str, like: str
     np.testing.assert_allclose(numbers_in(text), numbers_in(like))
 
 
-def test_the_firmware_is_told_by_its_header_and_its_codes(tmp_path: Path) -> None:
+def test_the_firmware_is_told_by_its_header_and_its_codes() -> None:
     duet, marlin = Path("config"), DUET_AS_MARLIN.partition("M665")
     np.testing.assert_allclose(numbers_in(DUET_AS_MARLIN)[-3:], [252.3, 252.7, 251.95])
     np.testing.assert_allclose(

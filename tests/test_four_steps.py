@@ -1,23 +1,31 @@
 """The four steps: exact recovery, the printed criteria, what weights are worth, and refusals."""
 
+import os
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from threading import Timer
 
+import casadi as ca
 import numpy as np
 import pytest
 from fit_sessions import MachineSession, machine_session
-from scipy.spatial.transform import RigidTransform
+from random_legs import closed_leg
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.outlines import LegAxes
-from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array
+from legcal.errors import DidNotConverge, NotIdentifiable
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import BoolArray
+from legcal.machine.equations import leg_equations
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import EquationKind, Leg, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.paper.criteria import Criteria
+from legcal.paper.equations import axis_frames, closure_of_leg, end_of_leg, leg_across_axis
 from legcal.paper.four_steps import StagedResult, run_base_steps, run_platform_steps, run_steps
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.simulation.observe import moved_outlines
 from legcal.simulation.paper import platform_errors
 from legcal.simulation.session import draw_poses
@@ -148,23 +156,14 @@ def test_wrong_outlines_hardly_matter() -> None:
 # Invariance
 
 
-def in_other_frames(axes: LegAxes, R: Array) -> LegAxes:
-    """Return axes whose camera frames are turned by R (n, 3, 3)."""
-    return replace(
-        axes,
-        u=np.einsum("nij,nj->ni", R, axes.u),
-        M=np.einsum("nij,nj->ni", R, axes.M),
-        basis=np.einsum("nij,nkj->nki", R, axes.basis),
-    )
-
-
 @pytest.mark.parametrize("name", ["3-rps", "tricept"])
 def test_turned_cameras_change_nothing(name: str) -> None:
     """Nor do other orders of legs and views, by test_calibrate.py."""
     session = shipped(name, noise=0.1)
     turns = np.array([T.rotation.as_matrix() for T in session.truth.T_camera_Rb])
-    of_rows = turns[session.measurements.view[session.axes.row]]
-    turned = in_other_frames(session.axes, of_rows)
+    axes, R = session.axes, turns[session.measurements.view[session.axes.row]]
+    u, M = (np.einsum("nij,nj->ni", R, vector) for vector in (axes.u, axes.M))
+    turned = replace(axes, u=u, M=M, basis=np.einsum("nij,nkj->nki", R, axes.basis))
     one, other = (
         session.legs.vector(
             run_steps(session.nominal, axes, session.measurements, criteria="literal").legs
@@ -217,40 +216,31 @@ def test_legs_that_meet_in_one_platform_joint_are_no_pair() -> None:
         run_platform_steps(base, session.measurements)
 
 
-def without_leg_5(o: MachineSession) -> LegAxes:
-    return o.axes.choose(np.flatnonzero(o.axes.leg != 4))
-
-
-def once_a_view(o: MachineSession) -> LegAxes:
-    first = [np.flatnonzero(o.measurements.view == v)[0] for v in range(3)]
-    return o.axes.choose(np.flatnonzero((o.axes.leg != 4) | np.isin(o.axes.row, first)))
-
-
-def two_legs_a_view(o: MachineSession) -> LegAxes:
-    return o.axes.choose(np.flatnonzero(o.axes.leg // 2 == o.measurements.view[o.axes.row]))
-
-
-def leg_6_alone(o: MachineSession) -> LegAxes:
-    view = o.measurements.view[o.axes.row]
-    return o.axes.choose(np.flatnonzero((o.axes.leg == 5) == (view == 2)))
-
-
 @pytest.mark.parametrize("criteria", CRITERIA)
 @pytest.mark.parametrize(
-    ("name", "shown", "words"),
+    ("shown", "words"),
     [
-        ("hexapod", without_leg_5, "base joint of leg leg5 could not be located: found no view"),
-        ("hexapod", once_a_view, "found in one image, and at least two different directions"),
-        ("hexapod", two_legs_a_view, "3 scalar products in all views for 12 unknowns"),
-        ("hexapod", leg_6_alone, "locates the base joints of leg6 together with"),
+        (lambda leg, *_: leg != 4, "base joint of leg leg5 could not be located: found no view"),
+        (
+            lambda leg, _, is_first: (leg != 4) | is_first,
+            "found in one image, and at least two different directions",
+        ),
+        (lambda leg, view, _: leg // 2 == view, "3 scalar products in all views for 12 unknowns"),
+        (
+            lambda leg, view, _: (leg == 5) == (view == 2),
+            "locates the base joints of leg6 together with",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_images_do_not_show_is_refused_by_leg(
-    name: str, shown: Callable[[MachineSession], LegAxes], words: str, criteria: Criteria
+    shown: Callable[..., BoolArray], words: str, criteria: Criteria
 ) -> None:
-    session = shipped(name)
+    session = shipped("hexapod")
+    axes, view = session.axes, session.measurements.view
+    is_first = np.isin(axes.row, [np.flatnonzero(view == v)[0] for v in range(3)])
+    some = axes.choose(np.flatnonzero(shown(axes.leg, view[axes.row], is_first)))
     with pytest.raises(NotIdentifiable) as refusal:
-        run_steps(session.nominal, shown(session), session.measurements, criteria=criteria)
+        run_steps(session.nominal, some, session.measurements, criteria=criteria)
     assert words in str(refusal.value)
 
 
@@ -268,3 +258,76 @@ def test_offsets_and_axes_that_no_image_shows_together_are_refused() -> None:
         some = replace(base.in_cameras, axes=axes.choose(np.flatnonzero(kept)))
         with pytest.raises(NotIdentifiable, match=words):
             run_platform_steps(replace(base, in_cameras=some), m)
+
+
+# What the steps are built of: IPOPT, and equations as those of the machine
+
+
+def _problem(name: str, x: ca.SX, residuals: ca.SX, start: list[float]) -> LeastSquares:
+    function = ca.Function("all", [x, ca.SX.sym("error", 0)], [residuals])
+    return LeastSquares(
+        name, (Term(function, np.arange(len(start))[None, :], ()),), np.array(start)
+    )
+
+
+def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:
+    x = ca.SX.sym("x", 1)
+    problem = _problem("A root", x, ca.sqrt(x) - 1.0, [-1.0])
+    with pytest.raises(DidNotConverge, match=r"A root could not be .*Invalid_Number.*, needed "):
+        solve_least_squares(problem)
+
+
+@pytest.mark.usefixtures("answered_signals")
+def test_an_interrupt_inside_ipopt_reaches_the_caller() -> None:
+    x = ca.SX.sym("x", 2)
+    problem = _problem("A valley", x, ca.vertcat(1.0 - x[0], 10.0 * (x[1] - x[0] ** 2)), [-1.2, 1])
+    solve_least_squares(problem)  # compiled
+
+    def solve_until_killed(killer: Timer) -> None:
+        killer.start()
+        while True:
+            solve_least_squares(problem)
+
+    for delay in np.linspace(0.001, 0.03, 12).tolist():
+        killer = Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            solve_until_killed(killer)
+        killer.join()
+    assert np.allclose(solve_least_squares(problem).x, 1.0)
+
+
+# Equations
+
+
+@pytest.mark.parametrize("joints", ["UU", "U", "RU", "UR", "RR"])
+def test_equations_of_a_leg_are_those_of_the_machine(joints: str) -> None:
+    """Length (13), axis across the leg (7), and closure."""
+    rng = np.random.default_rng(3)
+    R, t = Rotation.random(rng=rng).as_matrix(), rng.standard_normal(3)
+    leg = replace(closed_leg(joints, R, t, rng), q0=0.3)
+    leg = replace(leg, A=leg.A + 0.1 * rng.standard_normal(3))
+    assert leg.base_axis is not None
+    assert leg.platform_axis is not None
+    expected = leg_equations(leg, R[None], t[None])
+    values = dict(zip(expected.kinds, expected.values[0], strict=True))
+    vector = R @ leg.B + t - leg.A
+    length = float(np.linalg.norm(vector))
+    u = vector / length
+    E, none = normal_basis(u), np.zeros(8)
+    a, b = (axis_frames(v[None])[0] for v in (leg.base_axis, leg.platform_axis))
+    column = np.concatenate([leg.A, u, [length - leg.q0], *E])
+    np.testing.assert_allclose(
+        end_of_leg()(leg.q0, np.zeros(3), column).full().ravel(), R @ leg.B + t, atol=1e-12
+    )
+    assert values[EquationKind.LENGTH] == pytest.approx(length - leg.q0, abs=1e-12)
+    for about, body, frame in (
+        (EquationKind.BASE_AXIS, np.eye(3), a),
+        (EquationKind.PLATFORM_AXIS, R, b),
+    ):
+        if about in values:
+            sine = float(leg_across_axis()(np.zeros(2), none, u, E, body, frame))
+            assert sine == pytest.approx(values[about], abs=1e-12)
+    if EquationKind.TWIST in values:
+        function = closure_of_leg(leg.base_joint, leg.platform_joint)
+        sine = float(function(np.zeros(5), none, u, E, R, a, b, float(leg.twist or 0.0), 0.5))
+        assert sine == pytest.approx(2.0 * values[EquationKind.TWIST], abs=1e-12)

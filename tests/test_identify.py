@@ -37,8 +37,7 @@ from legcal.data.corners import found_corners
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
 from legcal.errors import NotIdentifiable
-from legcal.geometry.motions import motion_of
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import LegKind
 from legcal.machine.parameters import parametrization_of, parametrize
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.paper.four_steps import run_steps
@@ -133,17 +132,6 @@ def test_two_directions_fail_for_a_leg_that_never_turns() -> None:
     assert (condition.ok, condition.legs) == (False, (3,))
 
 
-def legs_of(types: str, passive: tuple[int, ...] = ()) -> list[Leg]:
-    """Return legs of types such as ``SS UU RS U``, some of them passive."""
-    rng = np.random.default_rng(1)
-    kinds = [LegKind.PASSIVE if j in passive else LegKind.ACTUATED for j in range(9)]
-    R, t = np.eye(3), np.array([0.0, 0.0, 2.0])
-    return [
-        closed_leg(joints, R, t, rng, kind)
-        for joints, kind in zip(types.split(), kinds, strict=False)
-    ]
-
-
 @pytest.mark.parametrize(
     ("types", "passive", "views", "failing"),
     [
@@ -164,8 +152,12 @@ def legs_of(types: str, passive: tuple[int, ...] = ()) -> list[Leg]:
 def test_three_legs_at_once_where_18_and_19_need_them(
     types: str, passive: tuple[int, ...], views: list[set[int]], failing: tuple[int, ...]
 ) -> None:
-    planar = types.startswith("RR")
-    condition = three_legs_at_once(views, legs_of(types, passive), spatial=not planar)
+    rng, R, t = np.random.default_rng(1), np.eye(3), np.array([0.0, 0.0, 2.0])
+    legs = [
+        closed_leg(joints, R, t, rng, LegKind.PASSIVE if j in passive else LegKind.ACTUATED)
+        for j, joints in enumerate(types.split())
+    ]
+    condition = three_legs_at_once(views, legs, spatial=not types.startswith("RR"))
     assert (condition.ok, condition.legs) == (not failing, failing)
 
 
@@ -260,35 +252,6 @@ def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
     assert not is_scale_open(replace(with_arms, choices=Choices(priors=radii)))
 
 
-def larger(leg: Leg, size: float) -> Leg:
-    cylinders = tuple(
-        replace(c, radius=size * c.radius, start=size * c.start, end=size * c.end)
-        for c in leg.cylinders
-    )
-    return replace(leg, A=size * leg.A, B=size * leg.B, q0=size * leg.q0, cylinders=cylinders)
-
-
-def test_what_is_determined_does_not_depend_on_the_size_of_the_machine() -> None:
-    """A thousand times as large and as far, before the same cameras: relative figures stay."""
-    session, size = planned_session(model("3-rps"), [range(3)] * 3, 3), 1e3
-    assert session.home is not None
-    other = replace(
-        session,
-        legs=tuple(larger(leg, size) for leg in session.legs),
-        home=motion_of(session.home.rotation.as_matrix(), size * session.home.translation),
-        t=size * session.t,
-        t_reached=size * session.t_reached,
-        cameras=tuple(
-            replace(view, T_base_camera=motion_of(T.rotation.as_matrix(), size * T.translation))
-            for view, T in zip(session.cameras, session.places, strict=True)
-        ),
-        sigma_q=size * session.sigma_q,
-    )
-    found = [Analysis(each) for each in (session, other)]
-    singular = [np.linalg.svd(each.information, compute_uv=False) for each in found]
-    np.testing.assert_allclose(size * singular[1], singular[0], rtol=1e-3)
-
-
 @pytest.mark.parametrize("name", ["planar", pytest.param("revolute", marks=pytest.mark.system)])
 def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
     """At the same poses, cameras and used outlines, with the noise of the result."""
@@ -379,12 +342,6 @@ def two_images() -> Dataset:
     return dataset_at(example(), np.array([0, 15]))
 
 
-def said(found: Identifiability) -> str:
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(identify_table(found))
-    return " ".join(console.export_text().split())
-
-
 @pytest.mark.usefixtures("without_remedies")
 @pytest.mark.parametrize(("images", "ranks"), [(6, (30, 30)), (1, (26, 30))])
 def test_a_board_raises_the_rank_and_takes_the_place_of_a_condition(
@@ -404,7 +361,10 @@ def test_only_a_board_lets_a_camera_in_the_hand_meet_the_conditions() -> None:
     assert found.full.rank == 30
     assert found.paper.ok
     assert found.board
-    assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(identify_table(found))
+    said = " ".join(console.export_text().split())
+    assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said
 
 
 @pytest.mark.usefixtures("without_remedies")

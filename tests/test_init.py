@@ -10,7 +10,7 @@ from command_line import Outcome, run
 from csv_rows import read_rows
 from hexapod_example import HEXAPOD
 from photograph_files import exif, jpeg
-from simulated import small_camera
+from simulated import files_of, small_camera
 
 from legcal import load_dataset
 from legcal.vision.image_file import camera_of_photographs, read_facts
@@ -80,10 +80,6 @@ def pairs(folder: Path) -> list[tuple[str, str, int]]:
     ]
 
 
-def snapshot(folder: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(tmp_path: Path) -> None:
     lines = ["Photo;" + ";".join(f"L{j} [mm]" for j in range(1, 7)) + ";Remark"]
     for row in read_rows(HEXAPOD / "measurements.csv"):
@@ -95,7 +91,7 @@ def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(tmp_path: P
         numbers = ";".join(f"{length:.4f}".replace(".", ",") for length in lengths)
         lines.append(f"{row['view']}\\img_{k:04d}.heic;{numbers};fine")
     (tmp_path / "own.csv").write_text("\n".join(lines))
-    before = snapshot(tmp_path / "photos")
+    before = files_of(tmp_path / "photos")
     camera = HEXAPOD / "camera_info.yaml"
     words = ("--camera", str(camera), "--encoder-sigma", "2um")
     outcome = init(tmp_path, *words)
@@ -105,7 +101,7 @@ def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(tmp_path: P
     assert "45 photographs, 3 views, 6 encoders" in out
     assert "whatever its extension" in out
     assert "'Remark'" in out
-    assert snapshot(tmp_path / "photos") == before
+    assert files_of(tmp_path / "photos") == before
     made, example = load_dataset(tmp_path / "dataset"), load_dataset(HEXAPOD)
     np.testing.assert_allclose(made.measurements.q, example.measurements.q, atol=1e-9)
     assert made.measurements.sigma_q == example.measurements.sigma_q
@@ -388,13 +384,12 @@ def test_nothing_is_overwritten_without_force_and_nothing_is_written_into_the_ph
     assert [image["image"] for image in outcome.document["images"]] == [f"photos/{x}" for x in FLAT]
     assert not (tmp_path / "images").exists()
     assert load_dataset(tmp_path).measurements.n_rows == 3
-    before = snapshot(tmp_path)
+    before = files_of(tmp_path)
     table(tmp_path, add=1.0)
     outcome = init(tmp_path, *words, output=".")
     assert outcome.code == 2
     assert "dataset.yaml, measurements.csv, camera_info.yaml already" in outcome.out
-    assert {path for path, x in snapshot(tmp_path).items() if x != before.get(path)} == {
-        str(tmp_path / "own.csv")
-    }
+    changed = {path for path, x in files_of(tmp_path).items() if x != before.get(path)}
+    assert changed == {"own.csv"}
     assert init(tmp_path, *words, "--force", output=".").code == 0
     assert load_dataset(tmp_path).measurements.q[0, 0] == pytest.approx(0.011)

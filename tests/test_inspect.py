@@ -31,15 +31,6 @@ from legcal.machine.picture import draw_machine
 from legcal.report.machine import inspect_table
 
 
-def _printed(what: object) -> str:
-    console = Console(file=io.StringIO(), width=80, highlight=False)
-    console.print(what)
-    text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert isinstance(text, str)
-    assert max(len(line) for line in text.splitlines()) <= 80
-    return text
-
-
 def _described(name: str | Path) -> dict[str, Any]:
     document = json.loads(json.dumps(machine_document(load_mechanism(name)), allow_nan=False))
     assert isinstance(document, dict)
@@ -76,11 +67,11 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
     legs: str, found: str, notes: list[str], tmp_path: Path
 ) -> None:
     description = machine_document(create_model(regular(legs), tmp_path).machine)
-    _check_notes(description, found, notes)
-
-
-def _check_notes(description: dict[str, Any], found: str, notes: list[str]) -> None:
-    assert found in _printed(inspect_table(description))
+    console = Console(file=io.StringIO(), width=80, highlight=False)
+    console.print(inspect_table(description))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert found in text
+    assert max(len(line) for line in text.splitlines()) <= 80
     said = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
     assert len(said) == len(notes)
     assert all(note in text for note, text in zip(notes, said, strict=True))

@@ -29,7 +29,7 @@ from legcal.calibration.joint_fit.determinacy import undetermined_directions
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings, Start, State
+from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State
 from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
@@ -52,20 +52,14 @@ def errors(session: MachineSession, found: Solution) -> dict[str, float]:
     }
 
 
-def shaken_radii(session: MachineSession) -> FittedLegs:
-    """Return the nominal legs with radii that are 2 % wrong."""
-    signs = np.random.default_rng(1).choice([-1.0, 1.0], len(session.legs.radii))
-    radii = {
-        part: r * (1.0 + 0.02 * sign)
-        for (part, r), sign in zip(session.legs.radii.items(), signs.tolist(), strict=True)
-    }
-    return replace(session.legs, radii=radii)
-
-
 @cache
 def fit_of_everything(session: MachineSession, *, known_radii: bool) -> Solution:
     """Return the fit with true radii, or without knowing any: a prior would pull on them."""
-    legs = session.legs if known_radii else shaken_radii(session)
+    legs = session.legs
+    if not known_radii:  # they begin 2 % wrong
+        wrong = 1.0 + 0.02 * np.random.default_rng(1).choice([-1.0, 1.0], len(legs.radii))
+        shaken = wrong * np.array(list(legs.radii.values()))
+        legs = replace(legs, radii=dict(zip(legs.radii, shaken.tolist(), strict=True)))
     names = frozenset(radius_name(legs.names[j], part) for j, part in legs.radii)
     every = legs.parametrization.names
     arms = frozenset(name for name in every if ParameterId.parse(name).kind in ARMS)
@@ -240,20 +234,6 @@ def test_errors_agree_with_the_covariance(session: MachineSession) -> None:
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.08)
 
 
-def test_the_result_is_reproduced_and_outlines_in_another_order_change_nothing(
-    session: MachineSession,
-) -> None:
-    rng = np.random.default_rng(5)
-    noisy = session.noisy(rng)
-    shuffled = noisy.outlines.choose(rng.permutation(len(noisy.outlines)))
-    found, again, other = (
-        session.errors(replace(noisy, outlines=o).fit().legs)
-        for o in (noisy.outlines, noisy.outlines, shuffled)
-    )
-    np.testing.assert_array_equal(again, found)
-    np.testing.assert_allclose(other, found, rtol=0, atol=1e-12)
-
-
 def test_the_better_start_wins_and_between_equal_ones_the_first(
     session: MachineSession,
 ) -> None:
@@ -306,19 +286,9 @@ def test_a_fit_with_a_board_and_cameras_by_hand_is_exact_without_noise() -> None
 Change = Callable[[Outlines], Outlines]
 
 
-def with_covariance(o: Outlines) -> Outlines:
-    covariance = o.covariance.copy()
-    covariance[3] = [[0.01, 0.02], [0.02, 0.01]]
-    return replace(o, covariance=covariance)
-
-
 def scattered(o: Outlines) -> Outlines:
     by = np.random.default_rng(0).uniform(-15.0, 15.0, (len(o), 2))
     return moved_outlines(o, PINHOLE, by)
-
-
-def measured_with_two_gammas(o: Outlines) -> Outlines:
-    return replace(o, gamma=np.where(np.arange(len(o)) == 5, 2.2, 1.0), by_gamma=np.ones(len(o)))
 
 
 @pytest.mark.parametrize(
@@ -331,9 +301,17 @@ def measured_with_two_gammas(o: Outlines) -> Outlines:
             "right legs and edges|outlines rejected",
         ),
         (scattered, DidNotConverge, r"outlines rejected and an error of \d+.\d px"),
-        (with_covariance, DatasetError, r"leg\d in c1_000.png .* not positive definite"),
+        (
+            lambda o: replace(o, covariance=o.covariance @ np.diag([1.0, -1.0])),
+            DatasetError,
+            r"leg\d in c1_000.png .* not positive definite",
+        ),
         (lambda o: replace(o, part=("pipe", *o.part[1:])), DatasetError, r"leg\d\.pipe"),
-        (measured_with_two_gammas, DatasetError, r"view c1 could not be used.*1 and 2\.2"),
+        (
+            lambda o: replace(o, gamma=np.where(o.row == 5, 2.2, 1.0), by_gamma=0.0 * o.row + 1.0),
+            DatasetError,
+            r"view c1 could not be used.*1 and 2\.2",
+        ),
     ],
     ids=["none", "swapped edges", "scattered", "covariance", "part", "gammas"],
 )

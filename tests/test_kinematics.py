@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from edits import keyed
-from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
-from machines import MACHINES, displaced, of_types, ring, write_home
+from layouts import Layout, LegLayout, MachineSpec, write_machine
+from machines import MACHINES, displaced, of_types, write_home
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import (
@@ -43,13 +43,6 @@ def drawn_of(name: str) -> Configurations:
 @pytest.fixture(scope="module", params=OF_EACH_KIND)
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
-
-
-def without_a_motor(name: str) -> Machine:
-    machine = machine_of(name)
-    legs = list(machine.legs)
-    legs[1] = replace(legs[1], kind=LegKind.PASSIVE)
-    return replace(machine, legs=tuple(legs), motor_rank=machine.motor_rank - 1)
 
 
 # A shipped machine of each kind
@@ -151,7 +144,10 @@ def test_readings_that_no_pose_has_are_refused(
 
 @pytest.mark.parametrize(("name", "found"), [("hexapod", "6 and 5"), ("3-rps", "3 and 2")])
 def test_too_few_motors_are_refused_with_both_numbers(name: str, found: str) -> None:
-    loose = without_a_motor(name)
+    machine = machine_of(name)
+    first, second, *others = machine.legs
+    legs = first, replace(second, kind=LegKind.PASSIVE), *others
+    loose = replace(machine, legs=legs, motor_rank=machine.motor_rank - 1)
     mobility, motors = found.split(" and ")
     with pytest.raises(NotIdentifiable, match=f"mobility {mobility} and {motors} motors"):
         forward_kinematics(loose, np.zeros(loose.n_legs))
@@ -274,9 +270,6 @@ def test_a_home_further_out_than_the_travel_is_refused_with_both_numbers(
 # The singularity measure
 
 
-RING = [10.0, 110.0, 130.0, 230.0, 250.0, 350.0]
-
-
 def _turned(machine: Machine, degrees: float, height: float = 0.4) -> RigidTransform:
     """Return home turned about z, from the attitude in which base and platform are symmetric."""
     turn = Rotation.from_euler("z", degrees, degrees=True) * machine.home.rotation
@@ -312,23 +305,11 @@ def test_a_symmetric_hexapod_is_singular_after_a_quarter_turn(quarter: float) ->
     assert singularity(machine, _turned(machine, 0.0, height=0.0)) < 1e-12  # flat on its base
 
 
-def _hexapod(A: Array, B: Array, home: RigidTransform) -> MachineSpec:
-    """Return a 6-UPS with joints A on the base and B on the platform."""
-    axis = np.array([1.0, 0.0, 0.0])
-    legs = [LegSpec("US", a, home.apply(b), base_axis=axis) for a, b in zip(A, B, strict=True)]
-    return MachineSpec(tuple(legs), home)
-
-
 @pytest.mark.parametrize("constrained", [False, True])
 def test_the_measure_does_not_depend_on_size_or_frames(constrained: bool, tmp_path: Path) -> None:
     def machine(scale: float, shift: float, inside: float) -> MachineSpec:
         """Return a machine scaled, in another frame of the base, and of the platform [m]."""
-        if constrained:
-            drawn = of_types(["RS"] * 3)
-        else:
-            home = RigidTransform.from_components([0.0, 0.0, 0.4], Rotation.from_euler("z", 0.4))
-            B = ring([50.0, 70.0, 170.0, 190.0, 290.0, 310.0], 0.2)
-            drawn = _hexapod(ring(RING, 0.3), B, home)
+        drawn = of_types(["RS"] * 3 if constrained else ["US"] * 6)
         legs = tuple(
             replace(leg, A=scale * leg.A + shift, B_home=scale * leg.B_home + shift)
             for leg in drawn.legs

@@ -103,19 +103,24 @@ def planar(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     return calibrate(simulated(folder, "3-rpr", views=3, poses=6).folder)
 
 
+def clicks_in(calibration: Calibration, rows: list[int], noise: float) -> Landmarks:
+    """Return clicks on all joints in some images, as the fit has them but for noise [px]."""
+    m, solution = calibration.dataset.measurements, calibration.solution
+    row, leg, end = (x.ravel() for x in np.meshgrid(rows, range(3), (0, 1), indexing="ij"))
+    A, B = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
+    seen = [
+        solution.cameras[v].project(solution.T_camera_Rb[v].apply(P))
+        for v, P in zip(m.view[row], np.stack([A, B], axis=2)[m.pose[row], leg, end], strict=True)
+    ]
+    px = np.array(seen) + noise * np.random.default_rng(1).normal(size=(len(row), 2))
+    return Landmarks(row, leg, end, px, np.full(len(row), 3.0))
+
+
 def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(planar: Calibration) -> None:
     calibration, dataset, solution = planar, planar.dataset, planar.solution
     m = dataset.measurements
-    rows = np.array([int(np.flatnonzero(m.view == v)[0]) for v in range(2)])
-    row, leg, end = (x.ravel() for x in np.meshgrid(rows, range(3), (0, 1), indexing="ij"))
-    A, B = ends_at_poses(solution.legs, *components(solution.T_Rb_Re))
-    joints = np.stack([A, B], axis=2)[m.pose[row], leg, end]
-    seen = [
-        solution.cameras[v].project(solution.T_camera_Rb[v].apply(P))
-        for v, P in zip(m.view[row], joints, strict=True)
-    ]
-    noise = np.random.default_rng(1).normal(size=(len(row), 2))
-    clicks = Landmarks(row, leg, end, np.array(seen) + 3.0 * noise, np.full(len(row), 3.0))
+    rows = [int(np.flatnonzero(m.view == v)[0]) for v in range(2)]
+    clicks = clicks_in(planar, rows, 3.0)
 
     def judged(clicks: Landmarks) -> Verdict:
         with_clicks = replace(dataset, landmarks=clicks)
@@ -123,7 +128,7 @@ def test_a_fit_that_leaves_the_clicks_of_a_view_is_not_trusted(planar: Calibrati
 
     assert judged(clicks) == calibration.verdict
     assert calibration.verdict.trustworthy
-    away = np.where((row == rows[1])[:, None], clicks.px + np.array([30.0, 0.0]), clicks.px)
+    away = clicks.px + np.where((clicks.row == rows[1])[:, None], [30.0, 0.0], 0.0)
     verdict = judged(replace(clicks, px=away))
     assert not verdict.trustworthy
     name = m.views[1].name
@@ -141,16 +146,10 @@ def test_a_click_that_a_fit_contradicts_is_named_with_the_joint_that_it_may_show
     planar: Calibration,
 ) -> None:
     dataset, solution = planar.dataset, planar.solution
-    joints = np.stack(ends_at_poses(solution.legs, *components(solution.T_Rb_Re)), axis=2)
-    m, v = dataset.measurements, int(dataset.measurements.view[0])
-    P = solution.T_camera_Rb[v].apply(joints[m.pose[0]].reshape(-1, 3))
-    px = solution.cameras[v].project(P) + np.random.default_rng(1).normal(size=(6, 2))
-    leg, end = np.repeat(np.arange(3), 2), np.tile([0, 1], 3)
-    clicks = Landmarks(np.zeros(6, dtype=np.intp), leg, end, px, np.full(6, 3.0))
+    clicks = clicks_in(planar, [0], 1.0)
     assert not click_notes(replace(dataset, landmarks=clicks), solution)
-    exchanged = px[
-        [0, 1, 5, 3, 4, 5]
-    ]  # the base joint of leg2 is clicked at the platform's of leg3
+    px = clicks.px
+    exchanged = px[[0, 1, 5, 3, 4, 5]]  # of the base joint of leg2, at the platform's of leg3
     wrong = replace(dataset, landmarks=replace(clicks, px=exchanged))
     (note,) = click_notes(wrong, solution)
     first, second = (joint_name(dataset.machine.leg_names[j], e) for j, e in ((1, 0), (2, 1)))

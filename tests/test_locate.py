@@ -167,42 +167,35 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
     assert right.dof == 36
 
 
-def _position(change: Callable[[Array], Array], n: int = 6, **more: Any) -> Located:
+def _hexapod(n: int, change: Callable[[ToolPoses], dict[str, Any]]) -> Located:
+    """Return a hexapod some of whose measurements are changed."""
     hexapod = located("hexapod", n)
-    position = change(hexapod.poses.position)
-    return replace(hexapod, poses=replace(hexapod.poses, position=position, **more))
+    return replace(hexapod, poses=replace(hexapod.poses, **change(hexapod.poses)))
 
 
-def _displaced(p: Array) -> Array:
-    return np.asarray(p + 5e-3 * (np.arange(len(p)) == 2)[:, None])
+def _displaced(p: ToolPoses) -> dict[str, Any]:
+    return {"position": p.position + 5e-3 * (np.arange(len(p)) == 2)[:, None]}
 
 
-def _mirrored() -> Located:
-    hexapod, S = located("hexapod", 6), np.diag([1.0, -1.0, 1.0])
-    p = hexapod.poses
-    poses = replace(p, position=p.position @ S, rotation=S @ p.rotation @ S)
-    return replace(hexapod, poses=poses)
+def _mirrored(p: ToolPoses) -> dict[str, Any]:
+    S = np.diag([1.0, -1.0, 1.0])
+    return {"position": p.position @ S, "rotation": S @ p.rotation @ S}
 
 
-def _w_first(n: int = 6) -> Located:
-    hexapod = located("hexapod", n)
-    quaternions = Rotation.from_matrix(hexapod.poses.rotation).as_quat()
-    wrong = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
-    return replace(hexapod, poses=replace(hexapod.poses, rotation=wrong))
+def _w_first(p: ToolPoses) -> dict[str, Any]:
+    quaternions = Rotation.from_matrix(p.rotation).as_quat()
+    return {"rotation": Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()}
 
 
-def _four_of_twelve() -> Located:
-    chance, hexapod = np.random.default_rng(7), located("hexapod", 12)
-    position, rotation = hexapod.poses.position.copy(), hexapod.poses.rotation.copy()
-    position[:4] += chance.normal(size=(4, 3)) * 5e-3
-    rotation[:4] = rotation_matrices(0.02 * chance.normal(size=(4, 3))) @ rotation[:4]
-    return replace(hexapod, poses=replace(hexapod.poses, position=position, rotation=rotation))
+def _four_wrong(p: ToolPoses) -> dict[str, Any]:
+    chance, wrong = np.random.default_rng(7), (np.arange(len(p)) < 4)[:, None]
+    shift, turn = chance.normal(size=(2, len(p), 3))
+    turned = rotation_matrices(0.02 * wrong * turn) @ p.rotation
+    return {"position": p.position + 5e-3 * wrong * shift, "rotation": turned}
 
 
-def _rolled() -> Located:
-    p, hexapod = located("hexapod", 6).poses, located("hexapod", 6)
-    position, rotation = (np.roll(x, 1, axis=0) for x in (p.position, p.rotation))
-    return replace(hexapod, poses=replace(p, position=position, rotation=rotation))
+def _rolled(p: ToolPoses) -> dict[str, Any]:
+    return {name: np.roll(getattr(p, name), 1, axis=0) for name in ("position", "rotation")}
 
 
 def _rows(rows: list[int], *, oriented: bool = True) -> Located:
@@ -217,17 +210,9 @@ def _along_a_line() -> Located:
     return located("3-upu", platform=[shift * home for shift in shifts])
 
 
-def _exchanged() -> Located:
-    hexapod = located("hexapod", 8)
-    q = hexapod.poses.q[:, [0, 4, 2, 3, 1, 5]]
-    return replace(hexapod, poses=replace(hexapod.poses, q=q))
-
-
-def _unreachable() -> Located:
-    hexapod = located("hexapod", 4)
-    q = hexapod.poses.q.copy()
-    q[1] = [2.0, 0.14, 0.0, 0.14, 0.0, 0.14]
-    return replace(hexapod, poses=replace(hexapod.poses, q=q))
+def _unreachable(p: ToolPoses) -> dict[str, Any]:
+    far = [2.0, 0.14, 0.0, 0.14, 0.0, 0.14]
+    return {"q": np.where((np.arange(len(p)) == 1)[:, None], far, p.q)}
 
 
 @pytest.mark.parametrize(
@@ -238,17 +223,19 @@ def _unreachable() -> Located:
         (_along_a_line, {}, NotIdentifiable, ("displaced in another direction",)),
         (lambda: _rows([0]), {}, NotIdentifiable, ("1 pose", "3 poses")),
         (lambda: _rows([0, 1, 2], oriented=False), {}, NotIdentifiable, ("4 poses", "positions")),
-        (lambda: _position(np.copy, 20, oriented=np.arange(20) == 4), {}, NotIdentifiable,
+        (lambda: _hexapod(20, lambda p: {"oriented": np.arange(20) == 4}), {}, NotIdentifiable,
          ("orientations of 20 rows", "--angle-sigma")),
-        (lambda: _position(_displaced, 4), {}, NotIdentifiable, ("measure them better",)),
-        (lambda: _position(lambda p: 1e3 * p), {}, DatasetError, ("millimetres", "1000")),
-        (_w_first, {}, DatasetError, ("order w, x, y, z",)),
-        (_mirrored, {}, DatasetError, ("left-handed axes", "mirror")),
-        (_exchanged, {}, DatasetError,
+        (lambda: _hexapod(4, _displaced), {}, NotIdentifiable, ("measure them better",)),
+        (lambda: _hexapod(6, lambda p: {"position": 1e3 * p.position}), {}, DatasetError,
+         ("millimetres", "1000")),
+        (lambda: _hexapod(6, _w_first), {}, DatasetError, ("order w, x, y, z",)),
+        (lambda: _hexapod(6, _mirrored), {}, DatasetError, ("left-handed axes", "mirror")),
+        (lambda: _hexapod(8, lambda p: {"q": p.q[:, [0, 4, 2, 3, 1, 5]]}), {}, DatasetError,
          ("columns leg2_prismatic and leg5_prismatic exchanged", "swap the headers")),
-        (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
-        (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
-        (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),
+        (lambda: _hexapod(6, _rolled), {}, DatasetError,
+         ("whatever the frames", "rows belong together")),
+        (lambda: _hexapod(12, _four_wrong), {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
+        (lambda: _hexapod(4, _unreachable), {}, DidNotConverge, ("The tool poses", "row 2")),
         (lambda: _rows([0, 1, 2]), {"angle_sigma": 0.5}, UsageError, ("angle sigma", "0.5 rad")),
         (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 0.0, float("inf"))}, UsageError,
          ("tool position",)),

@@ -2,7 +2,6 @@
 
 import pickle
 from dataclasses import replace
-from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -146,16 +145,6 @@ def _same_poses(one: Machine, other: Machine) -> None:
     assert np.abs(T.as_matrix() - one.home.as_matrix()).max() > 1e-4
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("layouts")
-
-
-@cache
-def _plain(description: str, folder: Path) -> Machine:
-    return load_mechanism(write_machine(folder / description, MACHINES[description](), Layout()))
-
-
 def _usual(description: str, name: str) -> bool:
     """Say whether a machine is tried in a layout: all layouts, one or two machines each."""
     if name == "every leg otherwise":
@@ -169,7 +158,7 @@ def _usual(description: str, name: str) -> bool:
     ("description", "name"), [pair for pair in product(MACHINES, LAYOUTS) if _usual(*pair)]
 )
 def test_every_layout_of_a_machine_gives_the_same_analysis_and_poses(
-    description: str, name: str, written: Path, tmp_path: Path
+    description: str, name: str, tmp_path: Path
 ) -> None:
     drawn, layout = MACHINES[description](), LAYOUTS[name]
     machine = load_mechanism(write_machine(tmp_path, drawn, layout))
@@ -178,7 +167,7 @@ def test_every_layout_of_a_machine_gives_the_same_analysis_and_poses(
         5 if "hexapod with a rod" in description else MOBILITY[description[0]]
     )
     if name != "every leg otherwise":  # whose revolutes do not turn anywhere
-        _same_poses(_plain(description, written), machine)
+        _same_poses(load_mechanism(write_machine(tmp_path / "plain", drawn, Layout())), machine)
 
 
 def test_a_platform_that_is_the_child_of_a_last_joint_changes_nothing(tmp_path: Path) -> None:

@@ -8,54 +8,10 @@ from legcal.geometry.types import Array
 from legcal.perception.blocks import Blocks
 from legcal.perception.limb import MATTE_DIRECTIONS, powers, profile_functions
 from legcal.perception.pooled_fit import fit_pooled
-from legcal.perception.profiles import (
-    Edge,
-    PixelBins,
-    PixelSums,
-    Samples,
-    even_weights,
-    noise_ratios,
-    to_light,
-)
+from legcal.perception.profiles import Edge, Samples, to_light
 from legcal.perception.subpixel_edges import limb_shifts
 from legcal.vision.camera import Camera
 from legcal.vision.visibility import Band
-
-# Sums over pixels, and their noise.
-
-N_BLOCKS, ROWS, REACH, NOISY_BLUR = 40, 8, 6, 0.6
-BOUNDS = np.array([0, N_BLOCKS // 2, N_BLOCKS])
-
-
-def noisy_sums(sides: Array, rng: np.random.Generator, behind: float = 1.0) -> PixelSums:
-    """Return sums over blocks across a step, noisy on its sides by edge (2, 2) as weighted.
-
-    Pixels of the background have a weight, as of light that a camera has encoded.
-    """
-    row = np.arange(-REACH, REACH + 1.0) + rng.uniform(-0.5, 0.5, (N_BLOCKS, ROWS, 1))
-    d = row.reshape(N_BLOCKS, -1).astype(np.float32)
-    rise = ndtr(d / NOISY_BLUR)
-    outer, inner = np.repeat(sides, N_BLOCKS // 2, axis=0).T[..., None]
-    noise = np.sqrt(outer**2 + (inner**2 - outer**2) * rise) * rng.normal(size=d.shape)
-    weight = np.where(d < 0.0, behind, 1.0).astype(np.float32)
-    light = (20.0 + 100.0 * rise + 2.0 * d + noise / weight).astype(np.float32)
-    return PixelBins.of(d, weight, NOISY_BLUR).sums(light)
-
-
-@pytest.mark.parametrize("behind", [1.0, 3.0])
-def test_both_sides_are_equally_noisy_when_weighted(behind: float) -> None:
-    sides, kept = np.array([[2.0, 8.0], [6.0, 3.0]]), np.ones(N_BLOCKS)
-    sums = noisy_sums(sides, np.random.default_rng(1), behind)
-    ratio = noise_ratios(sums, BOUNDS, kept, NOISY_BLUR)
-    np.testing.assert_allclose(ratio, (sides[:, 1] / sides[:, 0]) ** 2, rtol=0.25)
-    weights = even_weights(sums.grid, ratio, NOISY_BLUR)
-    np.testing.assert_allclose(weights[:, 0] / weights[:, -1], ratio, rtol=1e-6)
-    assert weights[:, np.argmin(np.abs(sums.grid))] == pytest.approx(1.0, abs=0.01)
-    kept[: BOUNDS[1]] = 0.0  # no block of the first edge
-    one, other = noise_ratios(sums, BOUNDS, kept, NOISY_BLUR)
-    assert one == 1.0
-    assert other == ratio[1]
-
 
 # All blocks of outlines together.
 

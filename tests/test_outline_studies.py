@@ -5,15 +5,7 @@ import numpy as np
 import pytest
 from bound import BoundStudy, errors_of
 from outline_bound import Bound, bound_of
-from outline_sessions import (
-    MACHINES,
-    Design,
-    Noise,
-    OutlineSession,
-    design_of,
-    draw_session,
-    one_fit,
-)
+from outline_sessions import MACHINES, Noise, design_of, draw_session, one_fit
 from outline_study import Found
 from thinned import thinned
 
@@ -25,18 +17,6 @@ N_POSES = 5
 
 
 FAILED: Record = {"failure": {"kind": "DidNotConverge", "message": "It still fell."}}
-
-
-def _design(machine: str) -> Design:
-    return design_of(machine, 3, N_POSES, NOISE.sigma_px)
-
-
-def _bound(machine: str) -> Bound:
-    return bound_of(_design(machine), NOISE.sigma_q, NOISE.radius_sigma)
-
-
-def _session(machine: str) -> OutlineSession:
-    return draw_session(_design(machine), NOISE, BoundStudy.errors, np.random.default_rng(0))
 
 
 # Statistics of estimators that are drawn
@@ -80,7 +60,9 @@ def test_a_bias_of_half_a_sigma_is_told_by_its_parameter_and_a_failed_run_is_cou
 
 @pytest.mark.parametrize("machine", thinned(MACHINES, ["3-rpr"]))
 def test_the_fit_of_every_class_states_the_bound(machine: str) -> None:
-    design, bound, session = _design(machine), _bound(machine), _session(machine)
+    design = design_of(machine, 3, N_POSES, NOISE.sigma_px)
+    bound = bound_of(design, NOISE.sigma_q, NOISE.radius_sigma)
+    session = draw_session(design, NOISE, BoundStudy.errors, np.random.default_rng(0))
     solution = one_fit(session, NOISE.radius_sigma)
     errors = errors_of(design, session, solution)
     error, of_sigma = np.array(errors["error"]), np.array(errors["of_sigma"])

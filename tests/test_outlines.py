@@ -1,6 +1,7 @@
 """Outlines measured in rendered scenes where they are known exactly, and what is rejected."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,26 +35,9 @@ def bar(x: float, lean: float, albedo: float, radius: float = 0.011, depth: floa
     return Bar(A, B, radius, albedo)
 
 
-def measurements(cam: Camera, n_legs: int) -> Measurements:
-    one = np.zeros(1, dtype=np.intp)
-    return Measurements((View("c1", cam),), ("a.png",), one, one, np.zeros((1, n_legs)), 1e-6)
-
-
-def cylinder(b: Bar, radius: float | None = None) -> tuple[Cylinder, ...]:
-    length = float(np.linalg.norm(b.B - b.A))
-    return (Cylinder("rod", b.radius if radius is None else radius, "base", 0.0, length),)
-
-
-def detect(
-    cam: Camera,
-    bars: list[Bar],
-    image: Image,
-    off: float = 2e-3,
-    radius: float | None = None,
-    solids: tuple[Occluder, ...] = (),
-) -> Outlines:
+def detect(cam: Camera, bars: list[Bar], image: Image, **options: Any) -> Outlines:
     """Detect bars whose predicted joints are ``off`` metres wrong in every coordinate."""
-    return detect_with_blur(cam, bars, image, off, radius, solids=solids)[0]
+    return detect_with_blur(cam, bars, image, **options)[0]
 
 
 def detect_with_blur(
@@ -61,7 +45,6 @@ def detect_with_blur(
     bars: list[Bar],
     image: Image,
     off: float = 2e-3,
-    radius: float | None = None,
     known: tuple[float, ...] = (),
     solids: tuple[Occluder, ...] = (),
 ) -> tuple[Outlines, float]:
@@ -70,8 +53,13 @@ def detect_with_blur(
     A = np.array([b.A for b in bars])[None] + off * rng.choice([-1.0, 1.0], (1, len(bars), 3))
     B = np.array([b.B for b in bars])[None] + off * rng.choice([-1.0, 1.0], (1, len(bars), 3))
     names = [f"leg{i + 1}" for i in range(len(bars))]
-    wanted, one_view = np.ones((1, len(bars)), dtype=np.bool_), measurements(cam, len(bars))
-    cylinders = [cylinder(b, radius) for b in bars]
+    wanted, one, q = np.ones((1, len(bars)), dtype=np.bool_), np.zeros(1, dtype=np.intp), A[..., 0]
+    one_view = Measurements((View("c1", cam),), ("a.png",), one, one, q, 1e-6)
+    lengths = [float(np.linalg.norm(b.B - b.A)) for b in bars]
+    cylinders = [
+        (Cylinder("rod", b.radius, "base", 0.0, length),)
+        for b, length in zip(bars, lengths, strict=True)
+    ]
     size = float(np.linalg.norm(B - A, axis=2).mean())
     grey = image.astype(np.float32)
     search = Search(lambda row: grey, one_view, A, B, cylinders, wanted, names, size)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -85,21 +84,14 @@ def _frames(motion: Motion) -> list[Array]:
     return [motion.frame(time, rng) for time in _stamps(motion)]
 
 
-@cache
-def _content_of_video(motion: Motion) -> bytes:
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "c1.avi")
-        video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
-        for frame in _frames(motion):
-            video.write(frame)
-        video.release()
-        return path.read_bytes()
-
-
 def _video(motion: Motion, folder: Path) -> Path:
     path = folder / "c1.avi"
     assert path.suffix in VIDEOS
-    return _written(path, _content_of_video(motion))
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
+    for frame in _frames(motion):
+        video.write(frame)
+    video.release()
+    return path
 
 
 def _folder(motion: Motion, folder: Path) -> Path:
@@ -165,8 +157,7 @@ def test_poses_that_were_held_become_rows(
     motion: Motion, tmp_path: Path, import_: Callable[..., Outcome], kind: str
 ) -> None:
     source = {"video": _video, "folder": _folder, "bag": _bag}[kind](motion, tmp_path)
-    times = np.arange(0.0, motion.times[-1], 0.02)
-    words = [] if kind == "bag" else ["--readings", _table(motion, tmp_path / "q.csv", times)]
+    words = [] if kind == "bag" else ["--readings", _ticks(motion, tmp_path)]
     assert import_(source, *words).code == 0
     folder = tmp_path / "dataset"
     dataset = load_dataset(folder)
@@ -265,15 +256,8 @@ def _written(path: Path, content: bytes) -> Path:
     return path
 
 
-@cache
-def _content_of_ticks(motion: Motion) -> bytes:
-    with TemporaryDirectory() as folder:
-        times = np.arange(0.0, motion.times[-1], 0.02)
-        return _table(motion, Path(folder, "q.csv"), times).read_bytes()
-
-
 def _ticks(motion: Motion, folder: Path) -> Path:
-    return _written(folder / "q.csv", _content_of_ticks(motion))
+    return _table(motion, folder / "q.csv", np.arange(0.0, motion.times[-1], 0.02))
 
 
 def _timeless(motion: Motion, folder: Path) -> Path:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scaled import scaled_dataset
 from simulated import simulated
-from six_photographs import FOLDER
+from test_detector_version import FOLDER
 
 from legcal import calibrate, load_dataset
 from legcal.calibration.board import rough_placement

@@ -16,6 +16,7 @@ from simulated import files_of, settings, simulated, small_camera
 
 import legcal
 from legcal import (
+    Dataset,
     Machine,
     ParameterErrors,
     SimulationSettings,
@@ -28,6 +29,7 @@ from legcal import (
 from legcal.data.outlines import read_observations
 from legcal.errors import NotVisible, UsageError
 from legcal.files.motions import motion_from_xyz_quat
+from legcal.geometry.types import Array
 from legcal.machine.parameters import geometries
 from legcal.perception.board_adjustment import camera_poses_by_board
 from legcal.perception.board_corners import find_corners
@@ -299,19 +301,28 @@ def _with_board(folder: Path, **settings: Any) -> Path:
     return folder
 
 
+def _exact_corners(dataset: Dataset) -> Array:
+    """Return where the first view sees the corners of the board by the truth, (n_corners, 2)."""
+    truth = truth_of(dataset.folder)
+    T_base_board = parse_board(truth["board"], dataset.folder).T_link_board
+    assert T_base_board is not None
+    T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board
+    points = dataset.boards[0].board.points
+    return dataset.measurements.views[0].camera.project(T.apply(points))
+
+
 def test_corners_are_off_by_as_much_as_they_claim(tmp_path: Path) -> None:
     folder = _with_board(tmp_path / "set", poses=2, board="charuco", board_pose=True, seed=3)
     dataset = load_dataset(folder)
     corners, (fixed,) = dataset.corners, dataset.boards
-    board, T_base_board = fixed.board, fixed.T_link_board
     assert corners is not None
+    exact = _exact_corners(dataset)
+    assert len(corners) >= 2 * 0.5 * len(exact)
+    assert np.std(corners.px - exact[corners.corner]) == pytest.approx(0.1, rel=0.3)
+    T_base_board = parse_board(truth_of(folder)["board"], folder).T_link_board
+    assert fixed.T_link_board is not None
     assert T_base_board is not None
-    view = dataset.measurements.views[0]
-    truth = truth_of(folder)["views"]["c1"]["T_base_camera"]
-    T = motion_from_xyz_quat(**truth).inv() * T_base_board
-    exact = view.camera.project(T.apply(board.points))[corners.corner]
-    assert len(corners) >= 2 * 0.5 * board.n_corners
-    assert np.std(corners.px - exact) == pytest.approx(0.1, rel=0.3)
+    np.testing.assert_allclose(fixed.T_link_board.as_matrix(), T_base_board.as_matrix(), atol=1e-9)
     assert np.all(corners.sigma_px == 0.1)
 
 
@@ -347,12 +358,7 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     assert dataset.corners is None
     board = dataset.boards[0].board
     number, px, sigma = find_corners(board, dataset.image_reader([0])(0))
-    truth = truth_of(tmp_path / "seen")
-    T_base_board = parse_board(truth["board"], tmp_path).T_link_board
-    assert T_base_board is not None
-    T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board
-    exact = dataset.measurements.views[0].camera.project(T.apply(board.points))
-    error = px - exact[number]
+    error = px - _exact_corners(dataset)[number]
     assert len(number) >= 20
     assert np.sqrt(np.mean(error**2)) < 0.04
     assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 2.0

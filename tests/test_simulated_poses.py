@@ -126,18 +126,15 @@ def _along(machine: Machine, T: RigidTransform, j: int) -> list[tuple[Array, flo
     ]
 
 
-def _overlap(machine: Machine, T: RigidTransform, i: int, j: int) -> float:
-    """Return by how much the cylinders of two legs overlap, from sampled points [m]."""
+def _penetration(machine: Machine, T: RigidTransform) -> float:
+    """Return by how much the cylinders of any two legs overlap, from sampled points [m]."""
+    legs = [_along(machine, T, j) for j in range(machine.n_legs)]
     return max(
         r + s - float(np.linalg.norm(P[:, None] - Q[None], axis=-1).min())
-        for P, r in _along(machine, T, i)
-        for Q, s in _along(machine, T, j)
+        for one, other in combinations(legs, 2)
+        for P, r in one
+        for Q, s in other
     )
-
-
-def _penetration(machine: Machine, T: RigidTransform) -> float:
-    """Return by how much the cylinders of any two legs overlap [m]."""
-    return max(_overlap(machine, T, i, j) for i, j in combinations(range(machine.n_legs), 2))
 
 
 def _csv(folder: Path, machine: Machine, rows: Array) -> Path:

@@ -5,21 +5,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from fit_sessions import (
-    BOARD_SCALE,
-    LENS,
-    MachineSession,
-    corners_of,
-    machine_session,
-    with_board,
-)
+from fit_sessions import BOARD_SCALE, MachineSession, corners_of, machine_session, with_board
 
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.scale import RADII, TRAVEL, NominalSize, compare_scales
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.vision.camera import with_intrinsics
 
 
 @pytest.fixture(scope="module")
@@ -94,22 +86,6 @@ def test_a_freed_radius_has_no_prior(session: MachineSession) -> None:
         fitted(
             replace(wrong, legs=replace(session.legs, radii=much)), Choices(free=frozenset(names))
         )
-
-
-@pytest.mark.parametrize(
-    ("key", "wrong", "true"),
-    [("fx", 1303.0, 1290.0), ("k1", -0.10, -0.12)],
-)
-def test_a_freed_intrinsic_is_found(
-    session: MachineSession, key: str, wrong: float, true: float
-) -> None:
-    wrong_cameras = session.with_camera(with_intrinsics(LENS, {key: wrong}))
-    found = fitted(wrong_cameras, Choices(free=frozenset({f"c1.{key}"})))
-    assert found.estimates.status[f"c1.{key}"] == "estimated"
-    assert found.estimates.values[f"c1.{key}"] == pytest.approx(true, rel=1e-6)
-    assert session.off(found.legs) < 1e-7
-    # Equal cameras are one camera.
-    assert len({camera.K[0, 0] for camera in found.cameras}) == 1
 
 
 def test_a_freed_intrinsic_that_nothing_determines_is_refused(session: MachineSession) -> None:

@@ -14,7 +14,6 @@ from toy_studies import Deadly, Draws, Mistaken
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.machine.configurations import JITTER
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries
 from legcal.paper.criteria import Criteria
 from legcal.paper.unknowns import NominalMachine
@@ -26,7 +25,6 @@ from legcal.simulation.paper import (
     SCALARS,
     EstimatorRow,
     PaperStudy,
-    Summary,
     paper_cameras,
     paper_machine,
     platform_errors,
@@ -34,24 +32,14 @@ from legcal.simulation.paper import (
 )
 from legcal.simulation.session import draw_poses, streams
 
-
-def _poses(machine: Machine, n: int = 10) -> RigidTransform:
-    drawn = draw_poses(machine, n, np.random.default_rng(0), "workspace").poses
-    return RigidTransform.concatenate(list(platforms_in_base(machine, drawn)))
-
-
-def _printed(result: Summary) -> str:
-    printed = io.StringIO()
-    Console(file=printed, width=80).print(study_table(result.document()))
-    return printed.getvalue()
-
-
 # Eq (20)
 
 
 def test_eq20_of_the_truth_is_zero_and_of_equal_offsets_the_travel_of_a_lift() -> None:
     machine = paper_machine("noncoplanar")
-    errors = platform_errors(machine, geometries(machine), _poses(machine))
+    drawn = draw_poses(machine, 10, np.random.default_rng(0), "workspace").poses
+    poses = RigidTransform.concatenate(list(platforms_in_base(machine, drawn)))
+    errors = platform_errors(machine, geometries(machine), poses)
     assert max(errors.dX, errors.dE, errors.angle) < 1e-12
     home = RigidTransform.concatenate([machine.home_of_frames])
     lifted = tuple(replace(leg, q0=leg.q0 + 1e-4) for leg in geometries(machine))
@@ -120,8 +108,10 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
     assert rows["default", True]["dX_mm"] is None
     assert rows["default", True]["parameters_mm"] == []
     assert found.document()["failures"] == {}
-    text = _printed(found)
-    assert "steps as printed, coplanar joints: 2 of 2 runs failed (DidNotConverge)" in text
+    printed = io.StringIO()
+    Console(file=printed, width=80).print(study_table(found.document()))
+    said = "steps as printed, coplanar joints: 2 of 2 runs failed (DidNotConverge)"
+    assert said in printed.getvalue()
 
 
 # The runner: the same results however it is run, written complete or not at all

@@ -19,7 +19,6 @@ from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 from legcal.data.measurements import row_names
 from legcal.data.outlines import (
     MEASURED,
-    LegAxes,
     Outlines,
     axes_of_table,
     join_axes,
@@ -34,13 +33,6 @@ FAST = settings(
 )
 MEASUREMENTS = recorded(labels=["", "", "a", "b"])
 OPTIONAL = MEASURED
-
-
-def axes_of() -> LegAxes:
-    rng = np.random.default_rng(0)
-    row, leg = np.divmod(np.arange(12, dtype=np.intp), 3)
-    values = rng.uniform([-1.2, -1.2, -0.3, 0.6], [1.2, 1.2, 0.3, 1.2], (12, 4))
-    return axes_of_table(row, leg, values, rng.uniform(1e-4, 1e-3, (12, 4)))
 
 
 def written(folder: Path, table: Outlines) -> Path:
@@ -131,7 +123,8 @@ def test_rows_without_image_are_named_by_label_or_else_by_number(tmp_path: Path)
 
 def test_joined_axes_do_not_depend_on_the_points_that_state_them() -> None:
     rng = np.random.default_rng(2)
-    exact = axes_of().choose(np.zeros(2, dtype=np.intp))  # one line, seen twice
+    values, none = np.array([[0.7, -0.5, 0.1, 0.9]] * 2), np.zeros(2, dtype=np.intp)
+    exact = axes_of_table(none, none, values, np.full((2, 4), 1e-3))  # one line, seen twice
     root = rng.normal(size=(2, 4, 4)) * 1e-3
     spread = np.einsum("ni,nia->na", rng.normal(size=(2, 2)) * 1e-3, exact.basis)
     two = replace(exact, M=exact.M + spread, covariance=root @ np.swapaxes(root, 1, 2))

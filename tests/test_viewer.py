@@ -146,13 +146,6 @@ def test_photographs_come_with_their_outlines_and_say_where_they_are_missing(
     assert "could not be read" in missing["caption"]
 
 
-def _port_in_use() -> tuple[socket.socket, str]:
-    taken = socket.socket()
-    taken.bind(("127.0.0.1", 0))
-    taken.listen()
-    return taken, str(taken.getsockname()[1])
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -169,8 +162,8 @@ def _port_in_use() -> tuple[socket.socket, str]:
 def test_what_cannot_be_shown_is_refused_in_a_sentence(
     words: list[str], said: str, tmp_path: Path
 ) -> None:
-    taken, port = _port_in_use()
-    with taken:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
         filled = [word.format(tmp=tmp_path, port=port) for word in words]
         outcome = run("view", *filled)
     assert outcome.code == 2

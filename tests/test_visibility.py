@@ -18,7 +18,7 @@ from legcal.machine.parameters import geometries
 from legcal.machine.shapes import PlacedOccluders
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.observe import legs_in_image, shares
-from legcal.simulation.solids import PosedMachine, Solid, dressed, pose_machine, solids_of
+from legcal.simulation.solids import dressed, pose_machine, solids_of
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.visibility import (
@@ -33,24 +33,10 @@ FAR = np.array([1.4, 0.3, 0.25])
 MIDDLE = np.array([0.0, 0.0, 0.2])
 
 
-@cache
-def posed_machine(name: str) -> Machine:
-    return legcal.load_mechanism(name)
-
-
-def posed(name: str, n_poses: int, *more: Solid) -> tuple[PosedMachine, ...]:
-    machine = posed_machine(name)
-    if n_poses == 1:
-        home = machine.home_configuration[None]
-        poses = Configurations(home, np.zeros((1, machine.n_legs)), [machine.home])
-    else:
-        found = legcal.random_configurations(machine, n_poses, 0)
-        poses = Configurations(found.configurations, found.readings, found.poses)
-    return pose_machine(machine, [*solids_of(machine), *more], poses)
-
-
 def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
-    machine, here = posed_machine("hexapod"), posed("hexapod", 1)[0]
+    machine = legcal.load_mechanism("hexapod")
+    at_home = machine.home_configuration[None], np.zeros((1, machine.n_legs)), [machine.home]
+    (here,) = pose_machine(machine, solids_of(machine), Configurations(*at_home))
     least = list[float]()
     for height in np.linspace(0.0, 0.6, 40):
         T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, height]))  # more and more is below the image
@@ -90,8 +76,8 @@ def test_points_that_a_lens_folds_back_are_not_in_the_picture(
 @pytest.mark.parametrize("name", ["3-rpr", "delta"])
 def test_what_sight_predicts_of_legs_is_what_rays_at_their_solids_meet(name: str) -> None:
     """Every part that is predicted is shown, hardly longer, and few that are shown are not."""
-    machine, n = posed_machine(name), 3
-    found = legcal.random_configurations(machine, n, 0)
+    machine = legcal.load_mechanism(name)
+    found = legcal.random_configurations(machine, 3, 0)
     here = pose_machine(machine, dressed(machine), found)
     views, _ = cameras_around(machine, here, {"c1": sample_camera()}, np.random.default_rng(1))
     bodies = Bodies.at(
@@ -163,15 +149,6 @@ def with_solids(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Mac
     return cache(lambda name: legcal.load_mechanism(copied_model(root, name, with_more)))
 
 
-def with_hidden(machine: Machine) -> tuple[tuple[PosedMachine, ...], list[PlacedOccluders]]:
-    """Return a machine in poses: what of it is not measured as triangles, and as occluders."""
-    solids = [solid for solid in solids_of(machine) if solid.leg is None]
-    found = random_configurations(machine, 2, 0)
-    poses = pose_machine(machine, solids, found)
-    A, B = (np.array([getattr(here, name) for here in poses]) for name in ("A", "B"))
-    return poses, PlacedOccluders.at(machine.occluders, A, B)
-
-
 @pytest.mark.parametrize(
     "name",
     ["hexapod", "3-prs", "delta"],
@@ -183,7 +160,11 @@ def test_hidden_is_what_rays_at_the_model_do_not_reach(
     machine = with_solids(name)
     size, rng = machine.size, np.random.default_rng(3)
     share, n_hidden = list[float](), 0
-    for here, placed in zip(*with_hidden(machine), strict=True):
+    # what of it is not measured as triangles, and as occluders
+    solids = [solid for solid in solids_of(machine) if solid.leg is None]
+    poses = pose_machine(machine, solids, random_configurations(machine, 2, 0))
+    A, B = (np.array([getattr(here, end) for here in poses]) for end in ("A", "B"))
+    for here, placed in zip(poses, PlacedOccluders.at(machine.occluders, A, B), strict=True):
         middle = 0.5 * (here.A.mean(axis=0) + here.B.mean(axis=0))
         direction = rng.normal(size=3)
         centre = middle + 4.0 * size * direction / np.linalg.norm(direction)

@@ -27,11 +27,7 @@ from legcal.geometry.types import Array
 from legcal.machine.equations import pose_equations
 from legcal.machine.home import home_of_legs
 from legcal.machine.leg import EquationKind, Leg, LegKind
-from legcal.machine.model_writer import (
-    check_closes,
-    write_calibrated_yaml,
-    write_urdf,
-)
+from legcal.machine.model_writer import check_closes, write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import (
     geometries,
     moved_legs,
@@ -231,12 +227,6 @@ def test_a_machine_that_does_not_close_at_home_is_noticed() -> None:
 
 # --- true machines of simulations ---------------------------------------------------------------
 
-LAYOUTS = {
-    "S as revolutes, hung from the platform": Layout(
-        (LegLayout(hung="platform", sphere=False, flip_axes=True),)
-    ),
-    "cut behind the slider": Layout((LegLayout(cut="mid", flip_slider=True, slid=0.02),)),
-}
 ALL = ParameterErrors(
     base_joints=Spread(3e-3),
     platform_joints=Spread(1e-3, Distribution.NORMAL),
@@ -248,10 +238,24 @@ ALL = ParameterErrors(
 N = 140  # draws of errors
 
 
-def _check(nominal: Machine, folder: Path, seed: int = 3) -> Machine:
-    """Check that a true model has the numbers that were drawn, and meets them where it stands."""
-    true = write_true_model(nominal, ALL, np.random.default_rng(seed), folder)
-    rng, found = np.random.default_rng(seed), geometries(true)
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("hexapod-rod", None),
+        ("3-upu-tilted", None),
+        ("6-UPS", LegLayout(hung="platform", sphere=False, flip_axes=True)),
+        ("Tricept", LegLayout(cut="mid", flip_slider=True, slid=0.02)),
+    ],
+)
+def test_a_true_model_has_the_drawn_numbers_in_any_tree(
+    name: str, layout: LegLayout | None, tmp_path: Path
+) -> None:
+    """It has what was drawn, and meets it where it stands."""
+    nominal = load_mechanism(
+        write_machine(tmp_path / "nominal", MACHINES[name](), Layout((layout,))) if layout else name
+    )
+    true = write_true_model(nominal, ALL, np.random.default_rng(3), tmp_path)
+    rng, found = np.random.default_rng(3), geometries(true)
     draws = (draw_errors(nominal, ALL, rng) for _ in range(20))
     drawn = next(legs for legs in draws if max(map(apart, legs, found)) < 1e-6)
     assert max(map(apart, drawn, geometries(nominal))) > 5e-4
@@ -273,30 +277,12 @@ def _check(nominal: Machine, folder: Path, seed: int = 3) -> Machine:
                 is_read = kind is EquationKind.LENGTH and leg.kind is not LegKind.CONSTANT
                 wanted = true.legs[j].sign * readings[j] if is_read else 0.0
                 assert abs(value - wanted) < 1e-10
-    return true
-
-
-@pytest.mark.parametrize("name", ["hexapod-rod", "3-upu-tilted"])
-def test_a_true_model_of_a_shipped_one_has_the_drawn_numbers(name: str, tmp_path: Path) -> None:
-    nominal = load_mechanism(name)
-    true = _check(nominal, tmp_path)
-    assert true.yaml_path == tmp_path / "models" / f"{name}.yaml"
-    assert true.urdf_path.resolve() == tmp_path / "urdf" / f"{name}.urdf"
-    before, after = nominal.urdf.content, true.urdf.content
-    assert before != after
-    assert ORIGINS.sub(rb"\1\2\3", before) == ORIGINS.sub(rb"\1\2\3", after)
-
-
-@pytest.mark.parametrize(
-    ("machine", "layout"),
-    [
-        ("6-UPS", "S as revolutes, hung from the platform"),
-        ("Tricept", "cut behind the slider"),
-    ],
-)
-def test_a_true_model_can_be_written_in_any_tree(machine: str, layout: str, tmp_path: Path) -> None:
-    path = write_machine(tmp_path / "nominal", MACHINES[machine](), LAYOUTS[layout])
-    _check(load_mechanism(path), tmp_path)
+    if layout is None:
+        assert true.yaml_path == tmp_path / "models" / f"{name}.yaml"
+        assert true.urdf_path.resolve() == tmp_path / "urdf" / f"{name}.urdf"
+        before, after = nominal.urdf.content, true.urdf.content
+        assert before != after
+        assert ORIGINS.sub(rb"\1\2\3", before) == ORIGINS.sub(rb"\1\2\3", after)
 
 
 def _differences(

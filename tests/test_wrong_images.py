@@ -19,7 +19,7 @@ from legcal import calibrate, detect, load_dataset
 from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
 from legcal.calibration.estimate import outlier_images
-from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
+from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
@@ -40,27 +40,10 @@ def _mirror(picture: Picture) -> Picture:
     return picture[:, ::-1]
 
 
-def _upside_down(picture: Picture) -> Picture:
-    return picture[::-1, ::-1]
-
-
 def _zoomed(picture: Picture) -> Any:
     height, width = picture.shape
     M = cv2.getRotationMatrix2D((0.5 * (width - 1), 0.5 * (height - 1)), 0.0, 1.08)
     return cv2.warpAffine(picture, M, (width, height), flags=cv2.INTER_CUBIC)
-
-
-def _blurred(picture: Picture) -> Any:
-    return cv2.GaussianBlur(picture, (0, 0), 3.0)
-
-
-def _moved(picture: Picture) -> Any:
-    return cv2.blur(picture, (13, 1))
-
-
-def _noise(level: float) -> Callable[[Picture], Any]:
-    rng = np.random.default_rng(1)
-    return lambda picture: level + 1.5 * rng.standard_normal(picture.shape)
 
 
 def _elsewhere(picture: Picture) -> Any:
@@ -72,15 +55,25 @@ def _elsewhere(picture: Picture) -> Any:
     return cv2.GaussianBlur(other, (0, 0), 0.6)
 
 
+RNG, BLURRED = np.random.default_rng(1), r"is blurred by \d\.\d.* px, the others of its view by \d"
 CHANGED: dict[tuple[str, int], tuple[Callable[[Picture], Any], str]] = {
     ("c1", 1): (lambda picture: 0 * picture, "the image is black, at most 0 of 255"),
     ("c1", 2): (lambda picture: 0 * picture + 255, "the image is overexposed, at least 255"),
     ("c1", 4): (_mirror, "the image is mirrored; replace it"),
     ("c1", 5): (_zoomed, r"it shows the legs about 1\.0[6-9] times as large as the others"),
-    ("c2", 1): (_blurred, r"the image is blurred by \d\.\d.* px, the others of its view by \d"),
-    ("c2", 2): (_moved, r"the image is blurred by \d\.\d.* px, the others of its view by \d"),
-    ("c2", 4): (_upside_down, "the image is upside down"),
-    ("c3", 1): (_noise(110.0), "the image shows nothing, all of it within"),
+    ("c2", 1): (
+        lambda picture: cv2.GaussianBlur(picture, (0, 0), 3.0),
+        r"the image is blurred by \d\.\d.* px, the others of its view by \d",
+    ),
+    ("c2", 2): (
+        lambda picture: cv2.blur(picture, (13, 1)),
+        r"the image is blurred by \d\.\d.* px, the others of its view by \d",
+    ),
+    ("c2", 4): (lambda picture: picture[::-1, ::-1], "the image is upside down"),
+    ("c3", 1): (
+        lambda picture: 110.0 + 1.5 * RNG.standard_normal(picture.shape),
+        "the image shows nothing, all of it within",
+    ),
     ("c3", 2): (
         _elsewhere,
         "0 of 1[02] predicted outlines were found, and no other explanation",
@@ -168,13 +161,8 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.5
 
 
-def _session(made: Spoiled) -> OrderedDataset:
-    dataset = load_dataset(made.write())
-    return order_dataset(dataset, in_turn, no_progress)
-
-
 def _observed(made: Spoiled) -> MeasuredImages:
-    session = _session(made)
+    session = order_dataset(load_dataset(made.write()), in_turn, no_progress)
     scene, _ = rough_placement(session)
     return place_and_measure(session.photographs, scene, no_progress)
 
@@ -216,12 +204,15 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     assert re.match(r"view c3: its T_base_camera is wrong: .*it fits view c2", found.notes[1])
 
 
+X_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x is z, y is -x
+
+
 @pytest.mark.parametrize(
     ("written", "words"),
     [
         (lambda T: T.inv(), "if it is T_camera_base, the inverse:"),
         (
-            lambda T: _pose(T.translation, _w_first(T.rotation)),
+            lambda T: _pose(T.translation, Rotation.from_quat(np.roll(T.rotation.as_quat(), 1))),
             "if its quaternion is in the order w, x, y, z:",
         ),
         (
@@ -229,7 +220,7 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
             "if its camera axes are y up and z backward:",
         ),
         (
-            lambda T: _pose(T.translation, _forward(T.rotation)),
+            lambda T: T * _pose(np.zeros(3), Rotation.from_matrix(X_FORWARD)),
             "if its camera axes are x forward and z up:",
         ),
         (
@@ -253,15 +244,6 @@ def test_a_rough_pose_in_another_convention_is_called_so(
 
 def _pose(xyz: NDArray[np.float64], rotation: Rotation) -> RigidTransform:
     return RigidTransform.from_components(xyz, rotation)
-
-
-def _forward(rotation: Rotation) -> Rotation:
-    x, y, z = rotation.as_matrix().T
-    return Rotation.from_matrix(np.stack([z, -x, -y], axis=1))
-
-
-def _w_first(rotation: Rotation) -> Rotation:
-    return Rotation.from_quat(np.roll(rotation.as_quat(), 1))
 
 
 @pytest.mark.parametrize(

@@ -116,14 +116,6 @@ class LeastSquares:
         """Number of residuals of all terms."""
         return sum(term.n_rows * len(term) for term in self.terms)
 
-    def residuals(self, x: Array, weights: Weights | None = None) -> Array:
-        """Return the residuals (m,), unweighted without weights."""
-        parts = [np.zeros(0)]
-        for term, W in zip(self.terms, weights or [None] * len(self.terms), strict=True):
-            r = term.residuals(x)
-            parts.append((r if W is None else (W @ r[..., None])[..., 0]).ravel())
-        return np.concatenate(parts)
-
     def jacobian(self, x: Array, weights: Weights | None = None) -> csc_array[np.float64]:
         """Return the derivative (m, n) of the residuals, unweighted without weights."""
         entries, rows, columns, first = [np.zeros(0)], [_NONE], [_NONE], 0

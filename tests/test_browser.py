@@ -1,18 +1,22 @@
-"""Pages in a browser: Chromium without a window, driven by Selenium."""
+"""Pages and the viewer in a browser: Chromium without a window, driven by Selenium."""
 
 import csv
 import io
+import re
 import shutil
+import socket
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import chromium, until
-from browser import errors as _errors
 from clicked_joints import seen_from
 from hexapod_example import HEXAPOD, Run
 from scipy.spatial.transform import RigidTransform
@@ -22,16 +26,56 @@ from selenium.webdriver.common.keys import Keys
 import legcal
 from legcal.calibration.detection import Detection, Examination
 from legcal.data.reasons import Reason, Rejection
+from legcal.exports.subject import Subject
 from legcal.geometry.motions import pose_distance
 from legcal.viewer.click_server import ClickServer
+from legcal.viewer.server import Address
+from legcal.viewer.source import open_source
+from legcal.viewer.view_server import ViewServer
 
 pytestmark = pytest.mark.system
+
+PATIENCE = 60  # [s] for what is drawn without a graphics card
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
+    """Start Chromium; skip without it, and fail where it is there and cannot be driven."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None:
+        pytest.skip("there is no Chromium (apt-get install chromium chromium-driver)")
+    driver = shutil.which("chromedriver")
+    if driver is None:
+        pytest.fail("Chromium is there and chromedriver is not (apt-get install chromium-driver)")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = found
+    for word in ("headless=new", "no-sandbox", "disable-gpu", "enable-unsafe-swiftshader",
+                 "window-size=1280,900"):  # fmt: skip
+        options.add_argument(f"--{word}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    with webdriver.Chrome(service=Service(driver), options=options) as started:
+        started.set_script_timeout(PATIENCE)
+        yield started
+
+
+def _errors(browser: Any) -> list[str]:
+    """Return what the console calls an error."""
+    return [one["message"] for one in browser.get_log("browser") if one["level"] == "SEVERE"]
+
+
+def until(condition: Callable[[], Any]) -> Any:
+    """Wait for something that is true, and return it."""
+    end = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return found
+
+
+# Pages of calibrations
 
 
 @pytest.fixture(scope="module")
@@ -344,22 +388,6 @@ def placing(
     return placer, camera, seen_from(folder, int(found.rows[0]), camera)
 
 
-def test_a_photograph_fills_the_editor_on_a_telephone(
-    detection: tuple[Path, Detection], browser: Any, tmp_path: Path
-) -> None:
-    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
-    try:
-        editor = Editor(browser, detection[0].parent / "found" / "index.html")
-        editor.open(0)
-        stage = editor.find(".stage").size
-        editor.close()
-    finally:
-        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert stage["width"] > 300
-    assert stage["height"] > 200
-
-
 def test_joints_are_clicked_dragged_and_downloaded_and_place_the_camera(
     detection: tuple[Path, Detection], browser: Any, tmp_path: Path
 ) -> None:
@@ -425,3 +453,113 @@ def test_a_served_page_draws_the_legs_and_saves_clicks(
         assert _errors(browser) == []
     finally:
         server.close()
+
+
+# The viewer, against its real server
+
+
+@contextmanager
+def _shown(source: Subject, browser: Any) -> Iterator[ViewServer]:
+    """Serve a source, and open it."""
+    server = ViewServer(source, Address("127.0.0.1", 0))
+    loop = threading.Thread(target=server.run, daemon=True)
+    loop.start()
+    try:
+        _errors(browser)  # those of another page
+        browser.get(str(server.address))
+        yield server
+    finally:
+        browser.get("about:blank")  # it would look for its server
+        server.close()
+        loop.join(PATIENCE)
+        assert not loop.is_alive()
+
+
+def _press(browser: Any, name: str, key: str) -> None:
+    browser.find_element("css selector", f"form[data-moves] [name={name}]").send_keys(key)
+
+
+def _drawn(browser: Any) -> Any:
+    """Return the lines of the legs that the canvas shows."""
+    return browser.execute_script("return document.querySelector('canvas').layers[3].lines")
+
+
+def test_sliders_of_the_viewer_move_the_machine(browser: Any) -> None:
+    with _shown(open_source("3-upu"), browser) as server:
+        before, lines = server.motion.posture, _drawn(browser)
+        _press(browser, "q1", Keys.END)
+        until(lambda: server.motion.posture.q[1] == 0.15)
+        after = server.motion.posture
+        np.testing.assert_allclose(after.q[[0, 2]], before.q[[0, 2]], atol=1e-9)
+        assert np.abs(after.T.translation - before.T.translation).max() > 0.05
+        until(lambda: _drawn(browser) != lines)
+        there = after.T.apply(server.source.machine.B_platform)
+        until(lambda: np.allclose([line[1] for line in _drawn(browser)], there, atol=1e-6))
+        assert "At the end of the travel: leg2" in browser.find_element("css selector", "body").text
+        _press(browser, "x2", Keys.ARROW_LEFT)
+        until(lambda: server.motion.posture.T.translation[2] < after.T.translation[2] - 1e-6)
+        np.testing.assert_allclose(
+            server.motion.posture.T.translation[:2], after.T.translation[:2], atol=1e-9
+        )
+        browser.find_element("css selector", "form[data-moves] button").click()
+        until(lambda: np.allclose(server.motion.posture.q, before.q))
+        assert _errors(browser) == []
+
+
+def test_a_result_is_shown_with_its_photographs(example_run: Run, browser: Any) -> None:
+    with _shown(open_source(example_run.output, example_run.folder), browser) as server:
+        first = server.motion.posture.T.as_matrix()
+        _press(browser, "pose", Keys.ARROW_RIGHT)
+        until(lambda: np.abs(server.motion.posture.T.as_matrix() - first).max() > 1e-3)
+        (shown,) = server._photographs.at(1)
+        until(lambda: shown["caption"] in browser.find_element("css selector", "body").text)
+        lines = browser.find_elements("css selector", ".gallery polyline")
+        assert len(lines) == len(shown["lines"]) > 0
+        width = (
+            "const i = new Image(); i.onload = () => arguments[1](i.width); i.src = arguments[0]"
+        )
+        assert browser.execute_async_script(width, f"/{shown['file']}") == min(
+            shown["size"][0], 960
+        )
+        modes = browser.find_elements("css selector", "select[name=mode] option")
+        assert len(modes) == 1 + len(server.scene.directions)
+        assert _errors(browser) == []
+
+
+def test_only_this_machine_can_look() -> None:
+    command = [sys.executable, "-m", "legcal", "view", "hexapod", "--no-browser", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            found = re.search(r"http://127\.0\.0\.1:(\d+)", process.stdout.readline())
+            assert found is not None
+            port = int(found[1])
+            with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as connection:
+                connection.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+                assert connection.recv(12) == b"HTTP/1.0 200"
+            # another address of this machine, at which all who listen everywhere answer
+            with socket.socket() as other, pytest.raises(ConnectionRefusedError):
+                other.connect(("127.0.0.2", port))
+        finally:
+            process.terminate()
+            process.wait(PATIENCE)
+    assert process.returncode == 0
+
+
+# On a telephone: last, as the browser keeps something of its screen
+
+
+def test_a_photograph_fills_the_editor_on_a_telephone(
+    detection: tuple[Path, Detection], browser: Any
+) -> None:
+    narrow = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+    try:
+        editor = Editor(browser, detection[0].parent / "found" / "index.html")
+        editor.open(0)
+        stage = editor.find(".stage").size
+        editor.close()
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert stage["width"] > 300
+    assert stage["height"] > 200
