@@ -22,6 +22,7 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
 from legcal.machine.classification import (
+    NOT_CALIBRATED,
     classify_leg,
     is_actuator,
     joint_tolerance,
@@ -36,7 +37,6 @@ from legcal.machine.spanning_tree import Source, connected
 from legcal.machine.urdf import VIRTUAL, Urdf
 
 Normals = tuple[Array, Array]
-NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 TIE = 1e-6  # difference of equally large triangles, relative to the largest
 
 
