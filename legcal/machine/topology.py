@@ -454,7 +454,10 @@ def _no_chain(
         needed = "legs that end on one rigid platform"
         remedy = f"make {joint} fixed if it does not move, otherwise {NOT_CALIBRATED}"
     elif n_onward > 1 and len(steps) > 1 and driven:
-        found = f"{n_onward} rods on link '{body}', which {last} connects to the moving link before"
+        found = (
+            f"a chain from {first} with {n_onward} rods on link '{body}', which {last} connects "
+            "to the moving link before it"
+        )
         needed = "rods on the link that one motor on the base moves"
         remedy = f"make joints of this leg fixed that do not move, otherwise {NOT_CALIBRATED}"
     elif n_onward > 1 and is_arm:
