@@ -1,7 +1,7 @@
 """What the covariance of a camera file is worth: errors over what the fit states of them.
 
     OMP_NUM_THREADS=1 python benchmarks/intrinsics.py [--runs 100] [--machine 6-spu-noncoplanar]
-                                                      [--images 12] [--noise 0.05]
+        [--images 12] [--noise 0.05] [--focal PART] [--outlines 0.1]
 
 A board of 9 x 6 squares before the true camera, in so many images, with so much noise of its
 corners [px], gives the covariance of a calibration. In every run the camera file is drawn from it,
@@ -9,7 +9,11 @@ for all views or for each of them, and the joint fit of an outline session gets 
 the drawn one as if it were exact, and the drawn one with the covariance. A line each: the squared
 error of all kinematic parameters by the whole covariance that the fit states, over their number
 (``nse``, which is that of the platform); displacement of the platform, rms over runs, true and
-predicted; how often a camera was said to disagree; time of a fit.
+predicted; error of the focal length over what is stated of it, mean and rms, where it is estimated;
+how often a camera was said to disagree; time of a fit.
+
+With --focal the covariance is that of a focal length known to that part of it, as by EXIF, and of
+nothing else; --outlines is the noise of edge points of outlines [px].
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ from camera_sessions import seen_corners
 from fit_sessions import with_camera
 from outline_sessions import (
     MACHINES,
+    SHIPPED,
     Design,
     Noise,
     OutlineSession,
@@ -58,6 +63,22 @@ def calibrated(camera: Camera, n_images: int, noise_px: float) -> Array:
     found = robust_fit(seen, ImageSize(camera.width, camera.height), camera.model)
     assert found is not None
     return found.covariance
+
+
+def focal_alone(camera: Camera, part: float) -> Array:
+    """Return the covariance where the focal length is known to a part of it, all else exactly."""
+    values = np.where(
+        np.isin(intrinsic_names(camera), ("fx", "fy")), part * intrinsic_values(camera), 0.0
+    )
+    return np.outer(values, values) + np.diag(np.full(len(values), 1e-12))
+
+
+def focal_error(found: Solution, camera: Camera) -> float:
+    """Return the error of the first focal length over what the fit states; NaN if it is fixed."""
+    estimates = found.estimates
+    names = [name for name in estimates.names if name.endswith(".fx")]
+    sigma = estimates.sigma[estimates.names.index(names[0])] if names else 0.0
+    return float((found.cameras[0].K[0, 0] - camera.K[0, 0]) / sigma) if sigma > 0.0 else np.nan
 
 
 def drawn(camera: Camera, covariance: Array, rng: np.random.Generator) -> Camera:
@@ -108,16 +129,23 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--machine", choices=MACHINES, default=MACHINES[0])
+    parser.add_argument("--machine", choices=(*MACHINES, *SHIPPED), default=MACHINES[0])
     parser.add_argument("--images", type=int, default=12)
     parser.add_argument("--noise", type=float, default=0.05)
+    parser.add_argument("--focal", type=float, help="part of it, all that is not known")
+    parser.add_argument("--outlines", type=float, default=Noise().sigma_px)
     chosen = parser.parse_args()
-    noise = Noise()
+    noise = Noise(sigma_px=chosen.outlines)
     design = design_of(chosen.machine, 3, 15, noise.sigma_px)
-    covariance = calibrated(design.camera, chosen.images, chosen.noise)
+    if chosen.focal is None:
+        covariance = calibrated(design.camera, chosen.images, chosen.noise)
+    else:
+        covariance = focal_alone(design.camera, chosen.focal)
     sigma = zip(intrinsic_names(design.camera), np.sqrt(np.diagonal(covariance)), strict=True)
     print(", ".join(f"{name} {s:.2g}" for name, s in sigma))
-    print("cameras  fit                  nse  platform um  predicted um  disagree  ms")
+    print(
+        "cameras  fit                  nse  platform um  predicted um  focal length  disagree  ms"
+    )
     for one_camera in (True, False):
         found: list[list[tuple[float, ...]]] = [[] for _ in KINDS]
         for seed in range(chosen.runs):
@@ -129,13 +157,15 @@ def main() -> None:
                 solution = one_fit(given, noise.radius_sigma)
                 took = time.perf_counter() - begin
                 doubted = bool(solution.camera_doubts)
-                found[k].append((*errors(design, given, solution), doubted, took))
+                focal = focal_error(solution, design.camera)
+                found[k].append((*errors(design, given, solution), focal, doubted, took))
         for kind, rows in zip(KINDS, found, strict=True):
-            nse, error, predicted, doubted, took = np.mean(rows, axis=0)
+            nse, error, predicted, focal, doubted, took = np.mean(rows, axis=0)
+            size = np.sqrt(np.mean(np.array(rows)[:, 3] ** 2))
             print(
                 f"{'one' if one_camera else 'three':7s}  {kind:18s} {nse:5.2f} "
                 f"{1e6 * np.sqrt(error):12.1f} {1e6 * np.sqrt(predicted):13.1f} "
-                f"{100.0 * doubted:7.0f} % {1e3 * took:4.0f}"
+                f"{focal:+7.2f}, {size:4.2f} {100.0 * doubted:7.0f} % {1e3 * took:4.0f}"
             )
 
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from csv_rows import write_rows
+from csv_rows import read_rows, write_rows
+from edits import keyed
 from machines import made
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
@@ -75,3 +76,21 @@ def test_a_3_upu_near_its_constraint_singularity_is_refused_and_at_it_is_named(
         assert report.identifiable == is_identifiable
         assert is_identifiable != any("nearly singular at home" in note for note in report.notes)
     assert any("is singular at home" in note for note in models[319.9].diagnostics)
+
+
+@pytest.mark.system
+def test_a_leg_that_no_view_shows_is_found_from_its_readings(tmp_path: Path) -> None:
+    """Its encoder says where it is, once the views list the legs that they show."""
+    made_set = simulated(tmp_path / "set", "hexapod", poses=6, seed=1)
+    folder, five = made_set.folder, [f"leg{j}" for j in range(1, 6)]
+    rows = read_rows(folder / "observations.csv")
+    write_rows(folder / "observations.csv", [row for row in rows if row["leg"] in five])
+    keyed("dataset.yaml", views__c1__legs=five, views__c2__legs=five)(folder)
+    calibration = calibrate(folder, output=tmp_path / "out")
+    assert calibration.verdict.trustworthy
+    assert calibration.solution.estimates.status["leg6.base.z"] == "estimated"
+    nominal, calibrated = (
+        legcal.evaluate(model, made_set.truth_path, dataset=folder).displacement.mean()
+        for model in (calibration.dataset.machine, tmp_path / "out" / "calibrated.yaml")
+    )
+    assert calibrated < 0.1 * nominal

@@ -19,9 +19,10 @@ from legcal.calibration.joint_fit.platform import (
 )
 from legcal.calibration.result import joints_in_links
 from legcal.calibration.verification import possible_changes
+from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
-from legcal.machine.leg import LINKS
+from legcal.machine.leg import LINKS, LegKind
 from legcal.machine.parameters import (
     Parametrization,
     geometries,
@@ -86,6 +87,15 @@ def test_predicted_errors_are_those_of_written_models_in_pinocchio(
 
 
 # Of a calibration: what it changed, how well that is known, and what wrong assumptions do
+
+
+def test_poses_that_readings_do_not_determine_have_no_predicted_error() -> None:
+    nominal = load_mechanism("hexapod")
+    first, *others = geometries(nominal)
+    legs = [replace(first, kind=LegKind.PASSIVE), *others]
+    poses = [platform_in_base(nominal, nominal.home)]
+    with pytest.raises(NotIdentifiable, match="the 5 readings do not determine platform pose 1"):
+        platform_by_parameters(legs, parametrization_of(nominal), nominal.frame_legs, poses)
 
 
 def test_the_change_and_the_workspace_are_those_of_written_models(tmp_path: Path) -> None:

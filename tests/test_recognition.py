@@ -187,6 +187,20 @@ def test_where_joints_are_known_well_a_symmetric_machine_is_not_taken_for_its_tu
     assert right[0.015] < 5
 
 
+def test_views_with_known_relative_poses_are_placed_together() -> None:
+    rng = np.random.default_rng(5)
+    made, joined = lp.machine(6, rng), []
+    for _ in range(4):  # one image each
+        T = lp.camera(rng)
+        [picture] = lp.pictures(made, T, [lp.platform(rng)], rng, joint_error=2e-3, noise=0.4)
+        T_camera_board = T.inv() * MOTION
+        R, t = T_camera_board.rotation.as_matrix(), T_camera_board.translation
+        joined.append(replace(picture, R=R, t=t))
+    placed = place_camera(joined, 6)
+    assert placed.is_convincing
+    assert _is_right(placed, MOTION)
+
+
 def test_the_rough_pose_of_a_group_is_that_of_its_frame_whichever_view_has_it() -> None:
     rng = np.random.default_rng(0)
     T_base_camera = [lp.camera(rng) for _ in range(3)]
@@ -272,6 +286,13 @@ def test_a_rough_pose_is_improved_and_that_of_another_place_is_not_clear() -> No
     near = place_near(pictures, T, 3)
     assert near.is_convincing
     assert _is_right(near, T)
+
+
+def test_pictures_of_other_things_give_no_pose() -> None:
+    (empty,), _ = _scene(0, n=1, missing=1.1)
+    (clutter,), _ = _scene(0, n=1, missing=1.1, n_clutter=12)
+    assert len(place_camera([empty] * 2, 6).poses) == 0
+    assert not place_camera([clutter] * 2, 6).is_convincing
 
 
 class _Made(Search):

@@ -14,7 +14,7 @@ from simulated import small_camera
 
 from legcal import load_dataset, load_mechanism
 from legcal.geometry.types import Array
-from legcal.recordings.frames import VIDEOS, stamp_in
+from legcal.recordings.frames import VIDEOS, read_series, stamp_in
 
 MODEL = "hexapod"
 SIZE = 96, 64  # [px]
@@ -224,6 +224,14 @@ def test_a_damaged_video_is_told_in_one_sentence_and_times_may_have_a_unit(
 )
 def test_times_in_names_keep_their_fraction(name: str, seconds: float | None) -> None:
     assert stamp_in(name) == seconds
+
+
+def test_digits_alone_are_no_dates(motion: Motion, tmp_path: Path) -> None:
+    """Seconds of a controller pass 20260101, 20260102, which as dates are days apart."""
+    table = _table(motion, tmp_path / "q.csv", np.arange(4.0) + 20260101 - 1.7e9)
+    table.write_text(table.read_text().replace(".0000,", ","))
+    times = read_series(table, load_mechanism(MODEL)).times
+    np.testing.assert_allclose(np.diff(times), 1.0)
 
 
 REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = {

@@ -366,7 +366,8 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
             f"single poses. {' '.join(sheet.notes)}".rstrip()
         )
     readings, texts = sheet.readings(lengths=lengths), sheet.table.text("time")
-    times = [seconds_in(text) for text in texts]
+    # Digits alone are no dates here: 12121000 may be the milliseconds of a controller.
+    times = [unix_seconds(float(x)) if is_number(x) else seconds_in(x) for x in texts]
     are_numbers = is_number(texts[0])
     for text, time in zip(texts, times, strict=True):
         if time is None or is_number(text) is not are_numbers:

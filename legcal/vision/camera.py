@@ -378,8 +378,11 @@ def undistort_near(camera: Camera, pixels: Array, near: Array) -> tuple[Array, A
 
     *near* are points (..., 2) near the solutions; the derivatives are (..., 2, 2).
     """
-    xy = _undistorted(camera, pixels.reshape(-1, 2), near.reshape(-1, 2)).reshape(pixels.shape)
-    return xy, camera.pixels_per_unit(xy)
+    if not pixels.size:  # OpenCV refuses to project nothing
+        return pixels, np.zeros((*pixels.shape, 2))
+    xy = _undistorted(camera, pixels.reshape(-1, 2), near.reshape(-1, 2))
+    by_xy = _with_derivatives(camera, xy, ())[1]
+    return xy.reshape(pixels.shape), by_xy.reshape(*pixels.shape, 2)
 
 
 def pixels_by_intrinsics(camera: Camera, xy: Array, names: Sequence[str]) -> Array:

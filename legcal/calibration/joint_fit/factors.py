@@ -206,16 +206,11 @@ class ObservedOutlines:
 
     def rows(self, keys: tuple[str, ...], state: State) -> Residuals:
         """Return the offsets with their derivatives."""
-        r, slope, ends, _ = self._predicted(keys, state)
+        r, slope, ends = self._predicted(keys, state)
         if self.bias_index.shape[1]:
             by_bias = -self.bias_shift.transpose(1, 2, 0)
             slope = np.concatenate([slope[:7], by_bias, slope[7:]])
         return Residuals(self._corrected(r, state), slope.T, ends.chain)
-
-    def by_intrinsics(self, wanted: tuple[str, ...], keys: tuple[str, ...], state: State) -> Array:
-        """Return derivatives (n, 2, n_wanted) of the offsets by intrinsics of their views."""
-        r, _, _, at = self._predicted(keys, state)
-        return _distances_by_intrinsics(state.cameras, wanted, self.view, r, *at).T
 
     def _corrected(self, r: Array, state: State) -> Array:
         """Subtract the common-mode biases from offsets (2, n); return (n, 2)."""
@@ -224,16 +219,10 @@ class ObservedOutlines:
         biases = state.biases[self.bias_index]
         return np.asarray(r.T - np.einsum("nc,ncq->nq", biases, self.bias_shift))
 
-    def _predicted(
-        self, keys: tuple[str, ...], state: State
-    ) -> tuple[Array, Array, _EndsInCamera, tuple[Array, Array, Array]]:
-        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and leg ends.
+    def _predicted(self, keys: tuple[str, ...], state: State) -> tuple[Array, Array, _EndsInCamera]:
+        """Return offsets (2, n) with biases, derivatives (7 + n_keys, 2, n), and leg ends."""
 
-        The fourth are what :func:`_distances_by_intrinsics` takes: the points on the sensor plane,
-        J^-T there, and the derivatives (2, 2, n) by these points.
-        """
-
-        def predicted() -> tuple[Array, Array, _EndsInCamera, tuple[Array, Array, Array]]:
+        def predicted() -> tuple[Array, Array, _EndsInCamera]:
             ends = _ends_in_camera(state, self.leg, self.view, self.pose, self.on_arm)
             xy, lens = np.ascontiguousarray(self.feet.T), self._lens
             if keys:
@@ -241,16 +230,16 @@ class ObservedOutlines:
                 xy, lens = np.ascontiguousarray(points.T), _transposed_inverses(J)
             radius = state.radii[self.radius]
             r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, lens)
-            at = xy, lens, by_xy
             if keys:
-                by_key = _distances_by_intrinsics(state.cameras, keys, self.view, r, *at)
-                slope = np.concatenate([slope, by_key])
-            return r, slope, ends, at
+                seen = self.view, r, xy, lens, by_xy
+                slope = np.concatenate(
+                    [slope, _distances_by_intrinsics(state.cameras, keys, *seen)]
+                )
+            return r, slope, ends
 
         inputs = self.radius, self.feet, self.lens, self.epsilon
         poses = state.camera_pose, state.platform_pose
-        prediction: tuple[Array, Array, _EndsInCamera, tuple[Array, Array, Array]]
-        prediction = self.memory.of(
+        prediction: tuple[Array, Array, _EndsInCamera] = self.memory.of(
             predicted, keys, *inputs, state.legs, state.radii, state.cameras, *poses
         )
         return prediction
@@ -477,8 +466,8 @@ class ObservedEdges:
         by_lean = np.einsum("ijn,in->jn", ends.R_camera, by_along)
         slope = np.concatenate([-by_B, by_B, by_lean])
         if keys:  # the line begins at the first end, as it was measured
-            at = np.stack([np.zeros_like(r), r]), xy, lens, by_xy
-            by_key = _distances_by_intrinsics(state.cameras, keys, self.view, *at)
+            seen = self.view, np.stack([np.zeros_like(r), r]), xy, lens, by_xy
+            by_key = _distances_by_intrinsics(state.cameras, keys, *seen)
             slope = np.concatenate([slope, by_key.sum(axis=1)])
 
         def chain(slope: Array) -> tuple[Array, Array]:
@@ -775,11 +764,6 @@ class ObservedCorners:
             return np.concatenate(J, axis=-1), by_pose
 
         return Residuals(r, slope, chain)
-
-    def by_intrinsics(self, wanted: tuple[str, ...], state: State) -> Array:
-        """Return derivatives (n, 2, n_wanted) of the residuals by intrinsics of their views."""
-        off = np.linalg.solve(self.lens, self.rows((), state).r[..., None])[..., 0]
-        return _pixels_by_intrinsics(state.cameras, wanted, self.view, self.feet + off)
 
     def factor(self, keys: tuple[str, ...]) -> Factor[State]:
         """Return the factor; a board on the platform depends on its poses."""

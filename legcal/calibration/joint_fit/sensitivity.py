@@ -8,7 +8,7 @@ Rao's score test, which needs no further fit.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -231,21 +231,19 @@ class CameraResiduals:
         return self.linear.state
 
     @cached_property
-    def derivatives(self) -> dict[str, Array]:
-        """Derivatives (n, q, 5) of whitened residuals by intrinsics of their view.
+    def derivatives(self) -> dict[str, tuple[IntArray, Array]]:
+        """Derivatives (n, q, 5) of whitened residuals by intrinsics of their view, with the views.
 
-        Of outlines and corners, by focal lengths, principal point and first coefficient of
+        Of outlines, edges and corners, by focal lengths, principal point and first coefficient of
         distortion, whether estimated or fixed.
         """
-        problem, state = self.problem, self.state
-        outlines = problem.outlines.by_intrinsics(_KEYS, problem.keys, state)
-        whitening = np.asarray(problem.factor("outlines").whitening)
-        return {
-            "outlines": np.einsum("nij,njk->nik", whitening, outlines),
-        } | {
-            corners.name: corners.by_intrinsics(_KEYS, state) / corners.sigma[:, None, None]
-            for corners in problem.boards
-        }
+        problem, derivatives = self.problem, dict[str, tuple[IntArray, Array]]()
+        for seen in (problem.outlines, problem.edges, *problem.boards):
+            factor = seen.factor(_KEYS)
+            factor = replace(factor, whitening=problem.factor(factor.name).whitening)
+            slope = factor.linearize(self.state).slope
+            derivatives[factor.name] = seen.view, slope[..., -len(_KEYS) :]
+        return derivatives
 
     @cached_property
     def _plain(self) -> FitNormal:
@@ -254,11 +252,9 @@ class CameraResiduals:
 
     def changes(self, error: Array) -> dict[str, Array]:
         """Return the change of whitened residuals (n, q) by errors (n_views, 5) of cameras."""
-        views = {corners.name: corners.view for corners in self.problem.boards}
-        views["outlines"] = self.problem.outlines.view
         return {
-            name: np.einsum("nqk,nk->nq", by, error[views[name]])
-            for name, by in self.derivatives.items()
+            name: np.einsum("nqk,nk->nq", by, error[view])
+            for name, (view, by) in self.derivatives.items()
         }
 
     def response(self, error: Array) -> Array:
