@@ -141,6 +141,19 @@ def _planar_arms() -> Drawing:
     return drawing
 
 
+def _stiff_arms() -> Drawing:
+    """Return arms on motors that reach the joint on the platform without a rod between."""
+    drawing = Drawing()
+    for j in range(3):
+        (pivot, axis), (end, _) = _around(j, 0.2, 0.0), _around(j, 0.05, HEIGHT)
+        drawing.add(f"arm{j}", "revolute", "base", pivot, axis)
+        drawing.motors.append(f"j_arm{j}")
+        joints: list[Joint] = [("revolute", end, axis), ("revolute", end, Z)]
+        drawing.chain(f"end{j}", f"arm{j}", pivot, joints, end=end, kind="3d")
+        drawing.legs[f"leg{j}"] = f"j_end{j}_0"
+    return drawing
+
+
 def _hinges() -> Drawing:
     drawing = Drawing()
     for j in range(3):
@@ -286,6 +299,10 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
         _drawn(partial(_bars, "revolute", 0)),
         ("overconstrained machine (1 of the 4", "moving joints at A"),
     ),
+    "stiff-arms": (
+        _drawn(_stiff_arms),
+        ("the leg of motor 'j_arm0'", "beyond it", "at each end; this machine cannot"),
+    ),
     "couplers": (_drawn(_couplers), LOOP),
     "3-rrr": (_drawn(_planar_arms), PLANE),
     **{
@@ -316,7 +333,10 @@ OUTSIDE: dict[str, tuple[Machine, tuple[str, ...]]] = {
     ),
     "turning-motor": (
         _replaced(_specified(planar), ("- leg2_slider\n", "- leg2_a1\n"), yaml=True),
-        ("found the slider 'leg2_slider' beyond the motor 'leg2_a1' on the base",),
+        (
+            "found the slider 'leg2_slider' beyond the motor 'leg2_a1' on the base",
+            "name only one of 'leg2_a1' and 'leg2_slider'",
+        ),
     ),
     "open-plane": (
         _open_across_its_plane,

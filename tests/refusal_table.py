@@ -635,6 +635,8 @@ def _models() -> Iterable[Refusal]:
         ("python", swap(y, "type:", "x: !!python/object/apply:os.system [touch trace]\ntype:"),
          ("python/object/apply",)),
         ("turning-motor", swap(y, "- leg2_prismatic\n", "- leg2_b1\n"), ("'leg2_b1'",)),
+        ("home-of-slider", swap(y, "legcal:\n", "legcal:\n  home_readings: {leg1_prismatic: 0}\n"),
+         ("legcal.home_readings.leg1_prismatic", "remove it")),
         ("xyz-huge", swap(u, "0.195", "1e300"), ("1e300",)),
         ("axis-0", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 0"'), ("line", "axis")),
         ("axis-2", swap(u, 'axis xyz="0.0 0.0 1.0"', 'axis xyz="0 0 2"'), ("length 2",)),

@@ -501,9 +501,10 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
                 "motor of a rod (PSS, RSS, PRS)"
             )
             if moves is not None:
-                how, letter = ("slides", "P") if moves == "prismatic" else ("turns", "R")
+                slides = moves is ActuatorKind.PRISMATIC
+                how, types = ("slides", "P (PSS, PRS)") if slides else ("turns", "R (RSS)")
                 found = f"the type {type_} on '{motor}', which {how}"
-                needed = f"a type that begins with {letter} for its rods (PSS, RSS, PRS)"
+                needed = f"a type for its rods that begins with {types}"
             problems.add(refused, found, needed, "correct the type or the motor")
     for name in actuators:
         if name not in motors:

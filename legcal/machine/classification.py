@@ -22,6 +22,7 @@ from legcal.machine.chain import Connection
 from legcal.machine.leg import PERPENDICULAR, Axis, JointType, Leg, LegChain, LegKind, Pivot
 
 CONCURRENT = 1.5e-5  # largest gap of axes that meet, relative to the span of the joints
+NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 _CENTRES = (
     "a joint whose centre is fixed in the base, at most one slider and "
     "one motor for each leg, and a joint whose centre is "
@@ -103,25 +104,26 @@ def _check_sliders(
     steps: Sequence[Connection], motors: Sequence[str], leg: str, *, hangs: bool
 ) -> None:
     """Check that a leg has no more than one slider or motor, and no slider on the base."""
-    sliders = [step.name for step in steps if step.type == "prismatic"]
-    found = None
-    if hangs:
-        beyond = {step.name: "the slider" for step in steps[1:] if step.type == "prismatic"}
-        beyond |= {step.name: "a second motor" for step in steps[1:] if step.joint in motors}
-        for name, kind in beyond.items():
-            found = f"{kind} '{name}' beyond the motor '{leg}' on the base"
-    elif len(sliders) > 1:
-        found = f"{len(sliders)} sliders"
-    elif steps[0].type == "prismatic":
+    onward = [step.name for step in steps[1:] if step.type == "prismatic"]
+    driven = [step.name for step in steps[1:] if step.joint in motors]
+    n_sliders = len(onward) + (steps[0].type == "prismatic")
+    found, remedy = None, "name the motor that moves the joint at A in name_mot"
+    if hangs and (driven or onward):
+        kind, name = ("a second motor", driven[0]) if driven else ("the slider", onward[0])
+        found = f"{kind} '{name}' beyond the motor '{leg}' on the base"
+        remedy = f"name only one of '{leg}' and '{name}' in name_mot, the one with a motor"
+    elif not hangs and n_sliders > 1:
+        found = f"{n_sliders} sliders"
+    elif not hangs and n_sliders > len(onward):
         found = f"the slider '{leg}' on the base itself, so that the joint at A moves"
-    if found is not None:
-        raise OutOfClass(
-            f"the leg of joint '{leg}' is not supported",
-            found,
-            _CENTRES,
-            "name the motor that moves the joint at A, and no other of this leg, in name_mot, "
-            "otherwise this machine cannot be calibrated with legcal",
-        )
+    if found is None:
+        return
+    raise OutOfClass(
+        f"the leg of joint '{leg}' is not supported",
+        found,
+        _CENTRES,
+        f"{remedy}, otherwise {NOT_CALIBRATED}",
+    )
 
 
 def actuator_of(
@@ -344,7 +346,7 @@ def _with_spins(base: Pivot, platform: Pivot, leg: str) -> tuple[Pivot, Pivot, i
             f"the axis of '{(*base.spins, *platform.spins)[0].name}' along the leg, and no S joint",
             "a joint at each end with an axis perpendicular to the leg within "
             f"{np.degrees(PERPENDICULAR):.2g} deg, or an S joint at one",
-            "correct its axis, otherwise this machine cannot be calibrated with legcal",
+            f"correct its axis, otherwise {NOT_CALIBRATED}",
         )
     idle = left + base.spare + platform.spare + all(twisting)
     return ends[0], ends[1], idle
@@ -396,14 +398,19 @@ def _rod(
         raise problems[len(places[0])]
     several = len(places) > 2
     where = f"{len(places)} joints in different places" if several else "all joints in one place"
+    if on is not None:
+        raise OutOfClass(
+            f"the leg of motor '{on}' is not supported",
+            f"no slider and {where} beyond it",
+            "a rod of constant length with a joint at each end",
+            NOT_CALIBRATED,
+        )
     hangs = ", so that the rod hangs on a moving arm and the joint at A moves" * several
-    beyond = hangs if on is None else f" beyond the motor '{on}'"
     raise OutOfClass(
         f"the leg of joint '{leg}' is not supported",
-        f"no slider and {where}{beyond}",
+        f"no slider and {where}{hangs}",
         _CENTRES,
-        "name the motor that moves the joint at A in name_mot, otherwise the machine cannot be "
-        "calibrated with legcal",
+        f"name the motor that moves the joint at A in name_mot, otherwise {NOT_CALIBRATED}",
     )
 
 

@@ -22,6 +22,7 @@ from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Pulses
 from legcal.machine.chain import Bodies, ClosedChain, rigid_bodies
 from legcal.machine.classification import (
+    NOT_CALIBRATED,
     actuator_of,
     joint_tolerance,
     leg_of,
@@ -72,7 +73,6 @@ from legcal.machine.spanning_tree import Source
 from legcal.machine.ties import is_tied, machine_ties, n_dependent_at_home, n_nearly_dependent
 from legcal.machine.tolerance import NOT_STATED
 from legcal.machine.topology import (
-    NOT_CALIBRATED,
     any_joint,
     check_virtual_joint,
     distinct_joint,

@@ -22,6 +22,7 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array
 from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
 from legcal.machine.classification import (
+    NOT_CALIBRATED,
     classify_leg,
     is_actuator,
     joint_tolerance,
@@ -36,7 +37,6 @@ from legcal.machine.spanning_tree import Source, connected
 from legcal.machine.urdf import VIRTUAL, Urdf
 
 Normals = tuple[Array, Array]
-NOT_CALIBRATED = "this machine cannot be calibrated with legcal"
 TIE = 1e-6  # difference of equally large triangles, relative to the largest
 
 
@@ -454,7 +454,10 @@ def _no_chain(
         needed = "legs that end on one rigid platform"
         remedy = f"make {joint} fixed if it does not move, otherwise {NOT_CALIBRATED}"
     elif n_onward > 1 and len(steps) > 1 and driven:
-        found = f"{n_onward} rods on link '{body}', which {last} connects to the moving link before"
+        found = (
+            f"a chain from {first} with {n_onward} rods on link '{body}', which {last} connects "
+            "to the moving link before it"
+        )
         needed = "rods on the link that one motor on the base moves"
         remedy = f"make joints of this leg fixed that do not move, otherwise {NOT_CALIBRATED}"
     elif n_onward > 1 and is_arm:

@@ -417,7 +417,7 @@ def draw_poses(
 
 
 def given_poses(machine: Machine, path: Path) -> Configurations:
-    """Return the poses at the readings of a CSV: actuated joints in its header, [m] below.
+    """Return the poses at the readings of a CSV: a table as ``init`` reads it, in SI by joints.
 
     Each is reached from the nearest pose that has been reached already, or from home.
     """
