@@ -1024,7 +1024,7 @@ def _described() -> Iterable[Refusal]:
               arm_radius=8),
          ("actuators.arm1", "arm_radius of a carriage")),
         ("slides", {"type": "6-PSS"}, ("'leg1'", "which turns", "begins with R")),
-        ("no-motor-type", {"type": "6-SS"}, ("'leg1'", "the type SS", "PSS, RSS, PRS")),
+        ("no-motor-type", {"type": "6-SS"}, ("'leg1'", "the type SS", "begins with R (RSS)")),
         ("hangs-on", {"hangs_on": ["arm1"] * 4 + ["arm3", "arm9"]},
          ("'leg6'", "'arm9'", "mean 'arm3'")),
         ("arm-alone", {"hangs_on": ["arm1"] * 4 + ["arm3"] * 2}, ("actuators.arm2", "no leg")),

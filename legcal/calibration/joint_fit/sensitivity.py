@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
+from legcal.calibration.joint_fit.factors import ObservedCorners, ObservedEdges, ObservedOutlines
 from legcal.calibration.joint_fit.problem import FitLinear, FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State, intrinsic_of
 from legcal.estimation.solver import normal_equations
@@ -238,7 +239,9 @@ class CameraResiduals:
         distortion, whether estimated or fixed.
         """
         problem, derivatives = self.problem, dict[str, tuple[IntArray, Array]]()
-        for seen in (problem.outlines, problem.edges, *problem.boards):
+        kinds: list[ObservedOutlines | ObservedEdges | ObservedCorners]
+        kinds = [problem.outlines, problem.edges, *problem.boards]
+        for seen in kinds:
             factor = seen.factor(_KEYS)
             factor = replace(factor, whitening=problem.factor(factor.name).whitening)
             slope = factor.linearize(self.state).slope
