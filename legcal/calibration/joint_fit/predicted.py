@@ -39,7 +39,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
-from legcal.calibration.tuning import TWIST_SIGMA_DEG
+from legcal.calibration.tuning import EDGE_SHARE, TWIST_SIGMA_DEG
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import OUTLINE_COLUMNS, Outlines, unmeasured
@@ -288,6 +288,7 @@ class _Images:
         linear, n = linearize(problem, state), problem.n_elements
         tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
         shifts = self._shifts(are_shared=is_fit)
+        n_shifts = shifts["outlines"].shape[2]
         blocks, is_outline, known = [], [], [linear.prior_J]
         for factor in problem.factors:
             if not factor.n:
@@ -300,15 +301,13 @@ class _Images:
             if factor.element is None:
                 known.append(J[..., :-1].reshape(-1, problem.n_kept))
                 continue
-            moved = np.zeros((factor.n, q, shifts.shape[2]))
-            if factor.name == "outlines":
-                moved = factor.whitening @ shifts
+            moved = shifts.get(factor.name, np.zeros((factor.n, q, n_shifts)))
             every = np.concatenate([found.J_element, J[..., :-1], moved], axis=2)
             every *= np.sqrt(problem.loss.efficiency(q)) if factor.robust else 1.0
             blocks.append(_by_element(every, factor.element, n))
             is_outline += [factor.name == "outlines"] * blocks[-1].shape[1]
         stacked = np.concatenate(blocks, axis=1)
-        n_own = stacked.shape[2] - problem.n_kept - shifts.shape[2]
+        n_own = stacked.shape[2] - problem.n_kept - n_shifts
         own, kept, moved = np.split(stacked, [n_own, n_own + problem.n_kept], axis=2)
         if tangent is not None:
             kept = kept + np.einsum("krd,mkd->krm", own, tangent.Q)
@@ -340,18 +339,26 @@ class _Images:
             named, kept @ turn, np.concatenate(known) @ turn, basis, at_site, site, moved
         )
 
-    def _shifts(self, *, are_shared: bool) -> Array:
-        """Return the shifts of both ends of outlines by repeated errors (n, 2, c) [px].
+    def _shifts(self, *, are_shared: bool) -> dict[str, Array]:
+        """Return how repeated errors move whitened rows (n, q, c), by the name of their factor.
 
-        By one standard deviation of each: of each place, or of bias and tilt of each outline alone.
+        By one standard deviation of each: of each place, and of each edge of a body in a view, none
+        of which a fit knows; or of bias and tilt of each outline alone.
         """
-        o, sigma = self.problem.outlines, np.array(self.noise.places_px)
+        problem, o, sigma = self.problem, self.problem.outlines, np.array(self.noise.places_px)
         if not sigma.any():
-            return np.zeros((len(o), 2, 0))
+            return {"outlines": np.zeros((len(o), 2, 0))}
+        whitening = np.asarray(problem.factor("outlines").whitening)
         if not are_shared:
-            return np.asarray(shifts_of_edges(len(o)) * sigma, dtype=np.float64)
-        shifts = shifts_at_places(o, np.ones(len(o), dtype=np.bool_))
-        return np.asarray(shifts * np.repeat(sigma, shifts.shape[2] // len(sigma)))
+            return {"outlines": whitening @ (shifts_of_edges(len(o)) * sigma)}
+        at_places = shifts_at_places(o, np.ones(len(o), dtype=np.bool_))
+        at_places = whitening @ (at_places * np.repeat(sigma, at_places.shape[2] // len(sigma)))
+        edges = problem.edges.lines_in_views(np.ones(len(problem.edges), dtype=np.bool_))
+        n_places, n_lines = at_places.shape[2], edges.shape[2]
+        return {
+            "outlines": np.pad(at_places, ((0, 0), (0, 0), (0, n_lines))),
+            "edges": np.pad(EDGE_SHARE * edges, ((0, 0), (0, 0), (n_places, 0))),
+        }
 
 
 def _weak_rows(problem: FitProblem, known: Array, length: float) -> Array:
