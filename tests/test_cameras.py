@@ -21,7 +21,7 @@ from legcal.vision.camera import (
     intrinsic_names,
     intrinsic_unit,
     intrinsic_values,
-    pixels_by_intrinsics,
+    pixel_derivatives,
     project_with_derivatives,
     shared_cameras,
     undistort_near,
@@ -112,11 +112,11 @@ PLAIN, FIVE = Camera(STRAIGHT, *SIZE), Camera(STRAIGHT, *SIZE, np.array(PLUMB_BO
 def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) -> None:
     names, values = intrinsic_names(camera), intrinsic_values(camera)
     true = camera.undistort(PIXELS)
-    for near in (true + np.array([3e-3, -2e-3]), np.full(PIXELS.shape, np.nan)):
-        xy, by_xy = undistort_near(camera, PIXELS, near)
-        np.testing.assert_allclose(xy, true, atol=1e-13)
-        np.testing.assert_allclose(by_xy, camera.pixels_per_unit(true), rtol=1e-6, atol=1e-6)
-    found = pixels_by_intrinsics(camera, true, names)
+    near = true + np.array([3e-3, -2e-3])
+    for begin in (near, np.full(PIXELS.shape, np.nan)):
+        np.testing.assert_allclose(undistort_near(camera, PIXELS, begin), true, atol=1e-13)
+    by_xy, found = pixel_derivatives(camera, true, names)
+    np.testing.assert_allclose(by_xy, camera.pixels_per_unit(true), rtol=1e-6, atol=1e-6)
     assert found.shape == (2, 2, 2, len(names))
     for k, (name, value) in enumerate(zip(names, values, strict=True)):
         step = 1e-2 if intrinsic_unit(name) == "px" else 1e-5
@@ -127,11 +127,9 @@ def test_points_move_with_each_intrinsic_as_the_differences_say(camera: Camera) 
         np.testing.assert_allclose(found[..., k], slope, rtol=2e-5, atol=2e-5, err_msg=name)
     same = with_intrinsics(camera, dict(zip(names, values, strict=True)))
     np.testing.assert_array_equal(same.undistort(PIXELS), true)
-    both = pixels_by_intrinsics(camera, true, ("cy", "fx"))
-    np.testing.assert_allclose(
-        both[..., 1:], pixels_by_intrinsics(camera, true, ("fx",)), rtol=1e-12
-    )
-    assert pixels_by_intrinsics(camera, true, ()).shape == (2, 2, 2, 0)
+    both, alone = (pixel_derivatives(camera, true, x)[1] for x in (("cy", "fx"), ("fx",)))
+    np.testing.assert_allclose(both[..., 1:], alone, rtol=1e-12)
+    assert pixel_derivatives(camera, true, ())[1].shape == (2, 2, 2, 0)
 
 
 def test_views_of_one_camera_share_its_intrinsics_in_any_order() -> None:

@@ -373,24 +373,23 @@ def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
     return replace(camera, K=K, distortion=distortion)
 
 
-def undistort_near(camera: Camera, pixels: Array, near: Array) -> tuple[Array, Array]:
-    """Return the points (..., 2) of the sensor plane at pixels, and derivatives of pixels there.
-
-    *near* are points (..., 2) near the solutions; the derivatives are (..., 2, 2).
-    """
+def undistort_near(camera: Camera, pixels: Array, near: Array) -> Array:
+    """Return the points (..., 2) of the sensor plane at pixels, by points (..., 2) near them."""
     if not pixels.size:  # OpenCV refuses to project nothing
-        return pixels, np.zeros((*pixels.shape, 2))
+        return pixels
     xy = _undistorted(camera, pixels.reshape(-1, 2), near.reshape(-1, 2))
-    by_xy = _with_derivatives(camera, xy, ())[1]
-    return xy.reshape(pixels.shape), by_xy.reshape(*pixels.shape, 2)
+    return xy.reshape(pixels.shape)
 
 
-def pixels_by_intrinsics(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
-    """Return the derivatives (..., 2, n_names) of the pixels of points (..., 2) by intrinsics."""
-    if not xy.size:  # OpenCV refuses to project nothing
-        return np.zeros((*xy.shape, len(names)))
-    by_intrinsics = _with_derivatives(camera, xy.reshape(-1, 2), names)[2]
-    return by_intrinsics.reshape(*xy.shape, len(names))
+def pixel_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return derivatives of the pixels of points (..., 2): by the points, and by intrinsics.
+
+    They are (..., 2, 2) and (..., 2, n_names).
+    """
+    if not xy.size:
+        return np.zeros((*xy.shape, 2)), np.zeros((*xy.shape, len(names)))
+    _, by_xy, by_intrinsics = _with_derivatives(camera, xy.reshape(-1, 2), names)
+    return by_xy.reshape(*xy.shape, 2), by_intrinsics.reshape(*xy.shape, len(names))
 
 
 def _undistorted(camera: Camera, pixels: Array, near: Array) -> Array:

@@ -35,13 +35,14 @@ from legcal.vision.board import FixedBoard
 from legcal.vision.camera import (
     Camera,
     intrinsic_names,
-    pixels_by_intrinsics,
+    pixel_derivatives,
     shared_cameras,
     undistort_near,
 )
 from legcal.vision.cylinder import EPSILON
 
 _SAME_GAMMA = 1e-6  # relative difference of equal gammas
+_PART_OF_DISTANCE = 1e-2  # step of differences along the distance of a measured point
 _SIX, _ALL, _ONE = slice(0, 6), slice(None), slice(0, 1)
 _OF_ACTUATOR = LegColumns.ACTUATOR
 
@@ -224,17 +225,15 @@ class ObservedOutlines:
 
         def predicted() -> tuple[Array, Array, _EndsInCamera]:
             ends = _ends_in_camera(state, self.leg, self.view, self.pose, self.on_arm)
-            xy, lens = np.ascontiguousarray(self.feet.T), self._lens
+            points, lens = (self.feet, self.lens), self._lens
             if keys:
-                points, J = _on_sensor(self, state.cameras)
-                xy, lens = np.ascontiguousarray(points.T), _transposed_inverses(J)
-            radius = state.radii[self.radius]
+                points = _on_sensor(self, state.cameras)
+                lens = _transposed_inverses(points[1])
+            radius, xy = state.radii[self.radius], np.ascontiguousarray(points[0].T)
             r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, lens)
             if keys:
-                seen = self.view, r, xy, lens, by_xy
-                slope = np.concatenate(
-                    [slope, _distances_by_intrinsics(state.cameras, keys, *seen)]
-                )
+                by_key = _distances_by_intrinsics(self, keys, state.cameras, points, r, by_xy)
+                slope = np.concatenate([slope, by_key])
             return r, slope, ends
 
         inputs = self.radius, self.feet, self.lens, self.epsilon
@@ -459,15 +458,15 @@ class ObservedEdges:
         length = np.sqrt(np.einsum("in,in->n", D, D))
         u = D / length
         along = u + np.einsum("ijn,nj->in", ends.R_camera, lean)
-        points, J = _on_sensor(self, state.cameras) if keys else (self.feet, self.lens)
-        xy, lens = points.T, _transposed_inverses(J)
-        r, by_along, by_xy = edge_offsets(along, xy, lens[:, :, 1])
+        points = _on_sensor(self, state.cameras) if keys else (self.feet, self.lens)
+        lens = _transposed_inverses(points[1][:, 1])
+        r, by_along, by_xy = edge_offsets(along, points[0].T, lens)
         by_B = (by_along - np.einsum("in,in->n", by_along, u) * u) / length
         by_lean = np.einsum("ijn,in->jn", ends.R_camera, by_along)
         slope = np.concatenate([-by_B, by_B, by_lean])
         if keys:  # the line begins at the first end, as it was measured
-            seen = self.view, np.stack([np.zeros_like(r), r]), xy, lens, by_xy
-            by_key = _distances_by_intrinsics(state.cameras, keys, *seen)
+            of_ends = np.stack([np.zeros_like(r), r])
+            by_key = _distances_by_intrinsics(self, keys, state.cameras, points, of_ends, by_xy)
             slope = np.concatenate([slope, by_key.sum(axis=1)])
 
         def chain(slope: Array) -> tuple[Array, Array]:
@@ -741,7 +740,7 @@ class ObservedCorners:
         by_projected = lens / depth[:, None]
         by_depth = -by_projected @ projected[..., None]
         r = (lens @ (projected - xy)[..., None])[..., 0]
-        by_intrinsics = _pixels_by_intrinsics(state.cameras, keys, self.view, projected)
+        by_intrinsics = _pixels_by_intrinsics(self, keys, state.cameras, xy, lens, xy - projected)
         slope = np.concatenate([by_projected, by_depth, by_intrinsics], axis=-1)
 
         def chain(slope: Array) -> tuple[Array, Array]:
@@ -922,51 +921,66 @@ def edge_offsets(along: Array, xy: Array, lens: Array) -> tuple[Array, Array, Ar
 def _on_sensor(
     seen: ObservedOutlines | ObservedEdges | ObservedCorners, cameras: Sequence[Camera]
 ) -> tuple[Array, Array]:
-    """Return measured points on the sensor planes of cameras, and derivatives of pixels there."""
+    """Return measured points on the sensor planes of cameras, and derivatives of their pixels.
+
+    These are at the points of the camera files, which do not move with the cameras.
+    """
     xy, lens = seen.feet.copy(), seen.lens.copy()
     for v in np.unique(seen.view).tolist():
         of_view = seen.view == v
-        xy[of_view], lens[of_view] = undistort_near(
-            cameras[v], seen.pixels[of_view], seen.feet[of_view]
-        )
+        xy[of_view] = undistort_near(cameras[v], seen.pixels[of_view], seen.feet[of_view])
+        lens[of_view] = pixel_derivatives(cameras[v], seen.feet[of_view], ())[0]
     return xy, lens
 
 
 def _pixels_by_intrinsics(
-    cameras: Sequence[Camera], keys: tuple[str, ...], view: IntArray, xy: Array
+    seen: ObservedOutlines | ObservedEdges | ObservedCorners,
+    keys: tuple[str, ...],
+    cameras: Sequence[Camera],
+    xy: Array,
+    lens: Array,
+    off: Array,
 ) -> Array:
-    """Return derivatives (n, ..., 2, n_keys) of pixels of points (n, ..., 2) by intrinsics."""
-    by_intrinsics = np.zeros((*xy.shape, len(keys)))
-    for v in np.unique(view).tolist() if keys else ():
-        of_view, names = view == v, intrinsic_names(cameras[v])
-        present = [k for k, key in enumerate(keys) if key in names]
-        moved = np.zeros((*xy[of_view].shape, len(keys)))
-        moved[..., present] = pixels_by_intrinsics(
-            cameras[v], xy[of_view], [keys[k] for k in present]
+    """Return derivatives (n, ..., 2, n_keys) of pixels where measured points should be.
+
+    Measured points xy (n, ..., 2) are *off* from there; *lens* are the derivatives of their pixels
+    (:func:`_on_sensor`). An intrinsic moves what is predicted by what it moves xy, less what it
+    changes of the distance: a longer focal length would shrink distances otherwise, so that noise
+    alone would lengthen it.
+    """
+    moved = np.zeros((*xy.shape, len(keys)))
+    for v in np.unique(seen.view).tolist() if keys else ():
+        of_view, camera = seen.view == v, cameras[v]
+        present = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
+        names, step = [keys[k] for k in present], _PART_OF_DISTANCE * off[of_view]
+        by_xy, by_intrinsics = pixel_derivatives(camera, xy[of_view], names)
+        beyond, before = (
+            pixel_derivatives(camera, seen.feet[of_view] + x, names)[1] for x in (step, -step)
         )
-        by_intrinsics[of_view] = moved
-    return by_intrinsics
+        of_distance = (beyond - before) / (2.0 * _PART_OF_DISTANCE)
+        of_names = np.zeros((*xy[of_view].shape, len(keys)))
+        of_names[..., present] = lens[of_view] @ np.linalg.solve(by_xy, by_intrinsics) - of_distance
+        moved[of_view] = of_names
+    return moved
 
 
 def _distances_by_intrinsics(
-    cameras: Sequence[Camera],
+    seen: ObservedOutlines | ObservedEdges,
     keys: tuple[str, ...],
-    view: IntArray,
+    cameras: Sequence[Camera],
+    points: tuple[Array, Array],
     r: Array,
-    xy: Array,
-    lens: Array,
     by_xy: Array,
 ) -> Array:
     """Return derivatives (n_keys, 2, n) of distances of points from lines by intrinsics.
 
-    *r* (2, n) are the distances [px] of both points xy (2, 2, n), *lens* is J^-T there, *by_xy* are
-    their derivatives by xy. A distance grows by what an intrinsic moves the nearest point of the
-    line: at the measured point instead, distances would shrink with a longer focal length, so that
-    noise alone would lengthen it.
+    *points* are those of :func:`_on_sensor`, *r* (2, n) are the distances [px] of both, *by_xy*
+    (2, 2, n) are their derivatives by the coordinates of the points.
     """
-    normal = np.einsum("ijen,jen->ien", lens, by_xy)
-    nearest = xy - r * np.einsum("ijen,ien->jen", lens, normal)
-    moved = _pixels_by_intrinsics(cameras, keys, view, nearest.T)
+    inverse = _transposed_inverses(points[1])
+    normal = np.einsum("ijen,jen->ien", inverse, by_xy)
+    off = r * np.einsum("ijen,ien->jen", inverse, normal)
+    moved = _pixels_by_intrinsics(seen, keys, cameras, *points, off.T)
     return np.asarray(-np.einsum("ien,neik->ken", normal, moved))
 
 
