@@ -22,16 +22,20 @@ from legcal.calibration.identify.identifiability import Analysis
 from legcal.calibration.identify.session import recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
-from legcal.calibration.joint_fit.predicted import PredictedNoise, Predictor, read_noise
+from legcal.calibration.joint_fit.predicted import (
+    PredictedNoise,
+    Predictor,
+    read_noise,
+)
 from legcal.calibration.pipeline import chosen_parameters
 from legcal.calibration.result import Calibration
 from legcal.data.dataset import Dataset
+from legcal.data.outlines import no_outlines
 from legcal.estimation.problem import Frames
 from legcal.geometry.types import Array
 from legcal.machine.configurations import workspace
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import Leg
-from legcal.planning.exchange import Session
 
 ROOT = Path(__file__).parents[1]
 RECORDED = ROOT / "tests/data/recorded"
@@ -89,21 +93,17 @@ def by_identify(calibration: Calibration, noise: PredictedNoise) -> float:
         replace(view, T_base_camera=to_Rb * T)
         for view, T in zip(session.cameras, places, strict=True)
     )
-    found = replace(session, R=R, t=t, cameras=cameras).contributions(
-        choices_of(dataset), noise, solution.outlines
+    session = replace(
+        session, R=R, t=t, cameras=cameras, found=solution.outlines, found_edges=solution.edges
     )
-    rows = np.concatenate([found.all_gains(), found.known])
-    _, singular, basis = np.linalg.svd(Analysis(session).of_parameters(rows, found.basis))
-    seen = singular * session.mean_length > 1.0
-    root = basis[seen].T / singular[seen] * session.unit[:, None]
-    return size(calibration, session.legs, root @ root.T)
+    return size(calibration, session.legs, Analysis(session, choices_of(dataset), noise).covariance)
 
 
 def by_plan(calibration: Calibration, noise: PredictedNoise) -> float:
     """Return the figure of plan."""
     dataset, solution = calibration.dataset, calibration.solution
     m, o = dataset.measurements, solution.outlines.choose(solution.outlines.used)
-    parts = []
+    parts, none = [], no_outlines()
     predictor = predictor_of(calibration, noise)
     for v, T in enumerate(solution.cameras_in_base(dataset.machine.T_base_Rb)):
         rows = np.flatnonzero(m.view == v)
@@ -111,15 +111,16 @@ def by_plan(calibration: Calibration, noise: PredictedNoise) -> float:
         if not of_view.any():
             continue
         outlines = replace(o.choose(of_view), row=np.searchsorted(rows, o.row[of_view]))
+        edges = none if solution.edges is None else solution.edges
+        edges = edges.choose(edges.used & np.isin(edges.row, rows))
+        edges = replace(edges, row=np.searchsorted(rows, edges.row))
         poses = [solution.T_Rb_Re[k] for k in m.pose[rows]]
         view = np.zeros(len(rows), dtype=np.intp)
         parts.append(
-            predictor.contributions(
-                {"here": T}, view, poses, noise.of(outlines), solution.legs, is_fit=True
-            )
+            predictor.contributions({"here": T}, view, poses, outlines, solution.legs, edges)
         )
-    basis = parts[0].basis
-    return size(calibration, predictor.legs.nominal, basis @ Session([], parts).fitted() @ basis.T)
+    covariance = predictor.covariance(parts, solution.T_Rb_Re, solution.legs)
+    return size(calibration, predictor.legs.nominal, covariance)
 
 
 def predictor_of(calibration: Calibration, noise: PredictedNoise) -> Predictor:

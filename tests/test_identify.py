@@ -33,6 +33,7 @@ from legcal.calibration.identify.identifiability import (
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import Session, planned_session, recorded_session
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
+from legcal.calibration.joint_fit.predicted import WHITE
 from legcal.data.corners import found_corners
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
@@ -243,7 +244,7 @@ def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
     with_arms, without = (
         Analysis(planned_session(m, [range(6)] * 2, 15)) for m in (machine, model("delta"))
     )
-    sigma, other = (a.motion.sigma(a.information) for a in (with_arms, without))
+    sigma, other = (a.motion.sigma(a.covariance) for a in (with_arms, without))
     assert sigma is not None
     assert other is not None
     assert 0.5 * other.dX_m < sigma.dX_m < 0.9 * other.dX_m
@@ -413,11 +414,11 @@ def test_choices_determine_what_they_say_and_no_more() -> None:
     assert check_identifiable(two_images(), known) == ()
 
     def rank(choices: Choices) -> int:
-        return Analysis(recorded_session(two_images()), choices).full.rank
+        return Analysis(recorded_session(two_images()), choices, WHITE).full.rank
 
     alone = rank(Choices())
     assert rank(Choices(fixed=frozenset(names))) == 30
-    assert rank(Choices(fixed=frozenset({"leg4.offset"}))) == alone + 1
+    assert rank(Choices(fixed=frozenset({"leg5.platform.x"}))) == alone + 1
     assert rank(vague) == alone
 
 

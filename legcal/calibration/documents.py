@@ -235,6 +235,7 @@ class ResidualsBlock(FitQuality, SparseDocument):
 
     noise: NoiseBlock
     shared_px: dict[str, NotNegative]
+    edges_px: NotNegative | None = None  # of edges of bodies; left out where none is used
     redundant_readings: RedundantReadings | None = None  # left out where readings cannot disagree
 
 

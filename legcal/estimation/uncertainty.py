@@ -464,10 +464,15 @@ def scores_of_block(linear: Linearization[Any, Any], name: str) -> tuple[Array, 
 _UNKNOWN = 1e-3  # [1 / unit]: singular values up to here count as undetermined unknowns
 
 
-def marginal_rows(rows: Array, which: IntArray) -> Array:
-    """Marginalise out all unknowns of rows (m, n) but *which*; return rows (c, c)."""
+def marginal_rows(rows: Array, shifts: Array, which: IntArray) -> tuple[Array, Array]:
+    """Marginalise out all unknowns of rows (m, n) but *which*; return k rows (k, c) by these.
+
+    *shifts* (m, s) are changes of the rows; what the unknowns leave of them is returned, (k, s).
+    """
     others = np.setdiff1d(np.arange(rows.shape[1]), which)
-    return compress(eliminate(rows[None][:, :, np.append(others, which)], len(others)))
+    every = np.hstack([rows[:, np.append(others, which)], shifts])
+    left = compress(eliminate(every[None], len(others)))
+    return left[:, : len(which)], left[:, len(which) :]
 
 
 def eliminate(
@@ -492,7 +497,8 @@ def eliminate(
     left, singular, _ = np.linalg.svd(upper[:, :n_nuisance, :n_nuisance])
     rotated = np.swapaxes(left, 1, 2) @ upper[:, :n_nuisance, n_nuisance:]
     lower = upper[:, n_nuisance:, n_nuisance:]
-    return np.concatenate([rotated[singular <= _UNKNOWN], lower.reshape(-1, n_shared)])
+    n_lower = lower.shape[0] * lower.shape[1]
+    return np.concatenate([rotated[singular <= _UNKNOWN], lower.reshape(n_lower, n_shared)])
 
 
 def compress(rows: Array) -> Array:

@@ -151,19 +151,21 @@ def predicted_edges(
     view: IntArray,  # (n_images,)
     ends: tuple[Array, Array],  # A and B of each image in the base link, (n_images, n_legs, 3) [m]
     wanted: BoolArray,  # (n_views, n_legs)
-    sigma_px: float,
 ) -> Outlines:
-    """Return the edges of bodies in images, hidden by bodies of other legs alone."""
+    """Return the edges of bodies in images, hidden by bodies of other legs alone.
+
+    Their covariance is that of ends known to a pixel.
+    """
     tables, bodies = list[Outlines](), bodies_of(occluders, wanted.shape[1])
     placed = PlacedOccluders.at(occluders, *ends) if any(bodies) else ()
     for row, here in enumerate(placed):
         v, joints = int(view[row]), (ends[0][row], ends[1][row])
         for body in bodies_in_view(bodies, here, *views[v], joints, wanted[v], step=BLOCK):
-            tables.append(_silhouette(row, views[v][0], body, sigma_px))
+            tables.append(_silhouette(row, views[v][0], body))
     return join_outlines(tables)
 
 
-def _silhouette(row: int, camera: Camera, seen: BodyInView, sigma_px: float) -> Outlines:
+def _silhouette(row: int, camera: Camera, seen: BodyInView) -> Outlines:
     """Return the two edges of a body as its silhouette has them, where nothing hides it.
 
     The body counts as round: what a fit learns from edges does not depend on where they are.
@@ -175,10 +177,9 @@ def _silhouette(row: int, camera: Camera, seen: BodyInView, sigma_px: float) -> 
     axis = seen.A + seen.along[[first, last], None] * u
     beside = cross(u, axis.mean(axis=0))
     beside *= seen.body.radius / np.linalg.norm(beside)
-    covariance = sigma_px**2 * np.eye(2)
     length = float(BLOCK * (last - first))
     edges = [
-        BodyEdge(camera.project(axis + side * beside), covariance, np.nan, length, np.nan)
+        BodyEdge(camera.project(axis + side * beside), np.eye(2), np.nan, length, np.nan)
         for side in (-1.0, 1.0)
     ]
     return _table(row, seen.leg, seen.body.link, camera, edges)

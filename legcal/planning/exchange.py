@@ -18,7 +18,7 @@ from legcal.calibration.joint_fit.platform import (
     expected_error,
     platform_by_parameters,
 )
-from legcal.calibration.joint_fit.predicted import KINEMATIC, Contributions
+from legcal.calibration.joint_fit.predicted import Contributions, joined
 from legcal.calibration.joint_fit.variables import FittedLegs
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.lines import cross
@@ -43,23 +43,13 @@ class Session:
     """The information and covariance of all unknowns for the selected images."""
 
     def __init__(self, slots: Sequence[Contributions], given: Sequence[Contributions] = ()) -> None:
-        names: dict[str, int] = {}
-        self.columns: list[IntArray] = []
-        for s, slot in enumerate((*slots, *given)):
-            local_names = [f"{s}/{name}" if ": " in name else name for name in slot.names]
-            self.columns.append(
-                np.array([names.setdefault(name, len(names)) for name in local_names])
-            )
-        self.information = np.zeros((len(names), len(names)))
-        for columns, slot in zip(self.columns, (*slots, *given), strict=True):
-            self.information[np.ix_(columns, columns)] = slot.prior
+        self.columns, self.information = joined((*slots, *given))
         for columns, slot in zip(self.columns[len(slots) :], given, strict=True):
             stacked = slot.all_gains()
             self.information[np.ix_(columns, columns)] += stacked.T @ stacked
-        self.names = names
-        self.slots, self.given = list(slots), list(given)
+        self.slots = list(slots)
         self._chosen_at: dict[tuple[int, int], list[int]] = {}  # selected images of each site
-        self.p = sum(name.startswith(KINEMATIC) for name in names)
+        self.p = (*slots, *given)[0].basis.shape[1]
         self.covariance = np.linalg.inv(self.information)
 
     @property
@@ -111,15 +101,6 @@ class Session:
         S = np.eye(rows.shape[1]) + rows_covariance @ np.swapaxes(rows, 1, 2)
         half = rows_covariance[..., :p]
         return np.asarray(self.machine - np.swapaxes(half, 1, 2) @ np.linalg.solve(S, half))
-
-    def fitted(self) -> Array:
-        """Return the covariance (p, p) of a fit to the given images, with errors at places."""
-        covariance = self.machine
-        for columns, slot in zip(self.columns[len(self.slots) :], self.given, strict=True):
-            shift = np.einsum("krm,krc->mc", slot.rows, slot.shifts)
-            shift = self.covariance[: self.p, columns] @ shift
-            covariance = covariance + shift @ shift.T
-        return np.asarray(covariance, dtype=np.float64)
 
 
 @dataclass

@@ -165,12 +165,13 @@ class Task:
         *,
         surely: bool = True,
         is_shot: bool = False,
-        is_fit: bool = False,
+        to_choose: bool = True,
         found: BoolArray | None = None,  # (n_images, n_legs) legs whose outlines count
     ) -> Contributions | None:
         """Return the information of images at poses T_Rb_Re; None if they show nothing.
 
-        An image without the board has no information, unless it exists already.
+        To choose some of them, or of a fit to all. An image without the board has no information,
+        unless it exists already.
         """
         seen, n = self.seen(T, poses, surely=surely), len(poses)
         with_board = is_shot or self.board_is_shown(T, poses, surely=surely)
@@ -182,7 +183,7 @@ class Task:
             outlines = outlines.choose(found[outlines.row, outlines.leg])
         view = np.zeros(n, dtype=np.intp)
         added = predictor.contributions(
-            {"here": T}, view, poses, outlines, self.legs, is_fit=is_fit
+            {"here": T}, view, poses, outlines, self.legs, to_choose=to_choose
         )
         if self.board is not None:
             added = added.tied_by_board({"here": T})
@@ -640,7 +641,7 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
 def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.Generator) -> Array:
     """Return the covariance (p, p) of the parameters in a random session within tolerance."""
     scene = replace(task, drawn=drawn_legs(task.predictor.legs, task.setting, rng))
-    machine, parts = task.machine, []
+    machine, parts, every_pose = task.machine, [], list[RigidTransform]()
     for candidates, is_set in (*((c, False) for c in current), *((c, True) for c in task.given)):
         nearby = platforms_in_base(machine, candidates.poses.poses)
         poses: Sequence[RigidTransform] = nearby
@@ -648,9 +649,8 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
             poses = poses_at_readings(machine, scene.legs, candidates.poses.readings, nearby)
         T = candidates.place.T_base_camera
         T = T if is_set else task.setting.perturbed_camera(T, rng)
-        added = scene.contributions(T, poses, surely=False, is_shot=is_set, is_fit=True)
+        added = scene.contributions(T, poses, surely=False, is_shot=is_set, to_choose=False)
         if added is not None:
             parts.append(added)
-    session = Session([], parts)
-    basis = parts[0].basis
-    return np.asarray(basis @ session.fitted() @ basis.T)
+            every_pose += poses
+    return task.predictor.covariance(parts, every_pose, scene.legs)

@@ -429,12 +429,12 @@ class GuidedSession:
     @cached_property
     def error(self) -> PlatformError | None:
         """The predicted error of the platform with the photographs so far; None if unknown."""
-        known = self._known_with("", None)
-        if known is None or self._work is None:
+        taken = self._taken(to_choose=False)
+        if not taken or self._work is None:
             return None
-        session = known[0]
-        basis = session.slots[0].basis
-        return self._work.error(basis @ session.machine @ basis.T)
+        poses = [pose for _, _, of_view, _ in taken for pose in of_view]
+        covariance = self._task.predictor.covariance([added for _, added, _, _ in taken], poses)
+        return self._work.error(covariance)
 
     @cached_property
     def _task(self) -> Task:
@@ -462,38 +462,16 @@ class GuidedSession:
         q = self.dataset.measurements.q[list(rows)][:, list(self.machine.motors)]
         return np.array(list(follow_each(self.machine, q)))
 
-    def _known_with(
-        self, view: str, pool: Configurations | None
-    ) -> tuple[Session, int, int] | None:
+    def _known_with(self, view: str, pool: Configurations) -> tuple[Session, int, int] | None:
         """Return the information of what is taken, with poses that a view may take.
 
         With the number of this view among the slots, and of its first such pose.
         """
-        m, machine, at, first = self.dataset.measurements, self.machine, 0, 0
-        slots, counts = list[Contributions](), list[int]()
-        if self._work is None:
-            return None
-        for v, one in enumerate(m.views):
-            rows = [row for row in self.taken if m.view[row] == v]
-            T = self.cameras.get(one.name, one.T_base_camera)
-            if T is None or not rows:
-                continue
-            try:
-                configurations = list(self._configurations(rows))
-            except DidNotConverge:
-                return None
-            n, n_legs = len(rows), machine.n_legs
-            found = np.array([self.found.get(m.image[row], np.ones(n_legs, dtype=np.bool_))
-                              for row in rows])  # fmt: skip
-            if pool is not None and one.name == view:
-                configurations += list(pool.configurations)
-                found = np.concatenate([found, np.ones((len(pool.poses), n_legs), dtype=np.bool_)])
-                at, first = len(slots), n
-            poses = platforms_in_base(machine, poses_at(machine, configurations).poses)
-            added = self._task.contributions(T, poses, surely=False, found=found)
-            if added is not None:
-                slots.append(added)
-                counts.append(n)
+        slots, counts, at = list[Contributions](), list[int](), 0
+        for name, added, _, n in self._taken(view, pool, to_choose=True):
+            at = len(slots) if name == view else at
+            slots.append(added)
+            counts.append(n)
         if not slots:
             return None
         session = Session(slots)
@@ -501,7 +479,40 @@ class GuidedSession:
             for k in range(n):
                 session.changed(s, k, 1.0)
         session.renewed()
-        return session, at, first
+        return session, at, counts[at]
+
+    def _taken(
+        self, view: str = "", pool: Configurations | None = None, *, to_choose: bool
+    ) -> list[tuple[str, Contributions, Sequence[RigidTransform], int]]:
+        """Return placed views, the information of their images, poses, and numbers of images taken.
+
+        The poses of the *pool* follow those that are taken from a *view*. Nothing where readings do
+        not determine a pose.
+        """
+        m, machine = self.dataset.measurements, self.machine
+        views = list[tuple[str, Contributions, Sequence[RigidTransform], int]]()
+        for v, one in enumerate(m.views if self._work is not None else ()):
+            rows = [row for row in self.taken if m.view[row] == v]
+            T = self.cameras.get(one.name, one.T_base_camera)
+            if T is None or not rows:
+                continue
+            try:
+                configurations = list(self._configurations(rows))
+            except DidNotConverge:
+                return []
+            n, n_legs = len(rows), machine.n_legs
+            found = np.array([self.found.get(m.image[row], np.ones(n_legs, dtype=np.bool_))
+                              for row in rows])  # fmt: skip
+            if pool is not None and one.name == view:
+                configurations += list(pool.configurations)
+                found = np.concatenate([found, np.ones((len(pool.poses), n_legs), dtype=np.bool_)])
+            poses = platforms_in_base(machine, poses_at(machine, configurations).poses)
+            added = self._task.contributions(
+                T, poses, surely=False, to_choose=to_choose, found=found
+            )
+            if added is not None:
+                views.append((one.name, added, poses, n))
+        return views
 
 
 def _cells(path: Path) -> tuple[list[str], list[dict[str, str]]]:

@@ -277,7 +277,7 @@ def edges_of_bodies(
     ends = scene.A[images.pose], scene.B[images.pose]
     wanted = np.ones((len(scene.views), scene.A.shape[1]), dtype=np.bool_)
     places = [(view.camera, view.T_base_camera) for view in scene.views]
-    exact = predicted_edges(occluders, places, images.view, ends, wanted, 0.0)
+    exact = predicted_edges(occluders, places, images.view, ends, wanted)
     covariances = [noise.covariance(length) for length in exact.length.tolist()]
     exact = replace(exact, covariance=np.array(covariances).reshape(-1, 2, 2))
     for v, view in enumerate(scene.views):

@@ -19,7 +19,6 @@ from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
-    EDGE_SIGMA_PX,
     Contributions,
     PredictedNoise,
     information_of_images,
@@ -100,6 +99,9 @@ class Session:
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     occluders: tuple[Occluder, ...] = ()  # solids of legs; bodies among them have edges
+    # outlines and edges of bodies that are there; without them those that are predicted
+    found: Outlines | None = None
+    found_edges: Outlines | None = None
 
     @property
     def n_legs(self) -> int:
@@ -137,7 +139,9 @@ class Session:
 
     @cached_property
     def outlines(self) -> Outlines:
-        """Outlines of all that views show, whatever may hide it."""
+        """Outlines that are there, or of all that views show, whatever may hide it."""
+        if self.found is not None:
+            return self.found
         tables = []
         for v, view in enumerate(self.cameras):
             row = np.flatnonzero(self.view == v)
@@ -149,10 +153,12 @@ class Session:
 
     @cached_property
     def edges(self) -> Outlines:
-        """Edges of bodies of the legs that views show."""
+        """Edges of bodies that are there, or of the legs that views show."""
+        if self.found_edges is not None:
+            return self.found_edges
         views = [(view.camera, T) for view, T in zip(self.cameras, self.places, strict=True)]
         A, B = (end[self.pose] for end in self.ends)
-        return predicted_edges(self.occluders, views, self.view, (A, B), self.seen, EDGE_SIGMA_PX)
+        return predicted_edges(self.occluders, views, self.view, (A, B), self.seen)
 
     @cached_property
     def measurements(self) -> Measurements:
@@ -172,7 +178,6 @@ class Session:
         self,
         choices: Choices,
         noise: PredictedNoise = DEFAULT_NOISE,
-        measured: Outlines | None = None,  # in place of the predicted ones
     ) -> Contributions:
         """Return the information of the joint fit of these images."""
         board, T_Re_board = self._corners()
@@ -186,7 +191,7 @@ class Session:
         contributions = information_of_images(
             self.fitted,
             self.measurements,
-            noise.of(self.outlines if measured is None else measured),
+            self.outlines,
             start,
             noise,
             choices,

@@ -12,16 +12,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import null_space
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
 from legcal.calibration.joint_fit.variables import State, with_values
 from legcal.calibration.tuning import HARMLESS, HELD_SIGMA, MAX_SIGMA
 from legcal.errors import NotIdentifiable
+from legcal.estimation.problem import Frames
 from legcal.estimation.solver import inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.equations import pose_sensitivity
-from legcal.machine.parameters import SHOWN, describe_direction, sparse_basis, split_by_motion
+from legcal.machine.leg import Leg
+from legcal.machine.parameters import (
+    SHOWN,
+    Parametrization,
+    describe_direction,
+    sparse_basis,
+    split_by_motion,
+)
 
 _MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
 _REMEDY = "add images from other directions, of other legs or at poses that differ more"
@@ -179,6 +188,31 @@ def covariance_of_held(problem: FitProblem, state: State, held: HeldDirections) 
     return np.asarray(to_steps @ spread @ to_steps.T)
 
 
+def covariance_as_stated(
+    S: Array,  # (p, p) of steps of the parameters, by the information of a fit
+    moved: Array,  # (p, c) their changes by errors that it does not know, one sigma of each
+    legs: Sequence[Leg],
+    parametrization: Parametrization,
+    frame_legs: Sequence[int],
+    T_Rb_Re: Sequence[RigidTransform],  # the poses of its images
+    length: float,  # mean leg length [m]
+) -> Array:
+    """Return the covariance (p, p) that a calibration states before it sees measurements.
+
+    Weak directions that hardly move the platform are known then, since they are held.
+    """
+    unit = np.array([1.0 if unit == "m" else 1.0 / length for unit in parametrization.units])
+    variance, direction = np.linalg.eigh(S / unit[:, None] / unit)
+    weak = direction[:, variance > (HELD_SIGMA * length) ** 2].T
+    C = np.asarray(S + moved @ moved.T)
+    if not len(weak):
+        return C
+    motion = _motion_by(legs, parametrization, frame_legs, T_Rb_Re)
+    H = split_by_motion(None if motion is None else motion * unit, weak, length, HARMLESS)[1] / unit
+    rest = np.eye(len(S)) - S @ H.T @ np.linalg.solve(H @ S @ H.T, H)
+    return np.asarray(rest @ C @ rest.T)
+
+
 def named_units(problem: FitProblem, state: State) -> Array:
     """Equivalent of a metre in the unit of each named unknown; angles at the mean leg length."""
     length = state.mean_length
@@ -190,15 +224,26 @@ def named_units(problem: FitProblem, state: State) -> Array:
 def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
     """Motion of the platform (k, 6, n_named) by each named unknown, scaled by *unit*."""
     legs, n = problem.legs, problem.n_kinematic
-    try:
-        by_steps = pose_sensitivity(
-            state.legs, legs.parametrization, legs.frame_legs, *state.platform_pose.frames
-        )
-    except NotIdentifiable:
+    poses = state.platform_pose.motions
+    by_steps = _motion_by(state.legs, legs.parametrization, legs.frame_legs, poses)
+    if by_steps is None:
         return None
     motion = np.zeros((len(by_steps), 6, len(unit)))
     motion[..., :n] = by_steps[..., problem.free] @ np.linalg.inv(problem.jacobian(state))[:n, :n]
     return motion * unit
+
+
+def _motion_by(
+    legs: Sequence[Leg],
+    parametrization: Parametrization,
+    frame_legs: Sequence[int],
+    T_Rb_Re: Sequence[RigidTransform],
+) -> Array | None:
+    """Motion of the platform (k, 6, p) by steps of parameters; None if readings do not tell it."""
+    try:
+        return pose_sensitivity(legs, parametrization, frame_legs, *Frames.of(T_Rb_Re))
+    except NotIdentifiable:
+        return None
 
 
 def _in_words(names: Sequence[str], row: Array, leg_names: Sequence[str]) -> str:

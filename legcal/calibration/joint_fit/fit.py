@@ -177,9 +177,9 @@ def _with_edges(solution: Solution, edges: Outlines, gain: float) -> Solution:
     used, weight = problem.edges, np.ravel(problem.factor("edges").whitening)
     disagrees = np.zeros(len(edges), dtype=np.bool_)
     disagrees[used.index] = weight == 0.0
-    if not weight.any():
+    sigma = solution.quality.edges_px
+    if sigma is None:
         return dataclasses.replace(solution, edges=edges.reject(disagrees, Reason.DISAGREES))
-    sigma = float(np.median(1.0 / weight[weight > 0.0]))
     detail = (
         f"{np.count_nonzero(weight)} of {len(edges)} edges of bodies were used; one end of an "
         f"edge, seen from the other, is known to {sigma:.2f} px. "

@@ -2,16 +2,18 @@
 
 The joint fit itself is built at outlines, with its common-mode edge biases, radii, intrinsics of
 which the camera file states a covariance, lines of arms with their prior, and gamma where it is not
-given. ``identify`` asks for its rank, ``plan`` selects images by it, and ``calibrate`` has it at
-the solution. Platform poses are eliminated; machine, cameras and what images share are kept, so
-that an image is a low-rank update: rows U with U^T U added to the information. Unknowns have names,
-those of a view begin with its name; unknown kinematic parameters are coordinates inside what the
-mechanism ties.
+given. ``identify`` asks for its rank and covariance, ``plan`` selects images by it, and
+``calibrate`` has it at the solution. Platform poses are eliminated; machine, cameras and what
+images share are kept, so that an image is a low-rank update: rows U with U^T U added to the
+information. Unknowns have names, those of a view begin with its name; unknown kinematic parameters
+are coordinates inside what the mechanism ties.
 
-**Places.** Edges that come back to the same place of a view err alike again. Photographs of one
-*site*, with all legs where others of them have theirs, share these errors: the second tells less
-than the first. In rows that make shared errors of variances s^2 independent, n photographs tell
-n / (1 + n s^2) of what one would without such errors.
+**Errors that no fit knows**, of edges at places and of bodies in a view, move its result; their
+effect adds to the covariance (:func:`fitted_machine`). To choose images that would need
+all others: photographs of one *site*, with all legs where others of them have theirs, count as
+sharing errors at places, so that the second tells less than the first. In rows that make shared
+errors of variances s^2 independent, n photographs tell n / (1 + n s^2) of what one would without
+such errors.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import ResidualsBlock, Result
+from legcal.calibration.joint_fit.determinacy import covariance_as_stated
 from legcal.calibration.joint_fit.factors import BoardCorners, ObservedOutlines
 from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
@@ -39,7 +42,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
-from legcal.calibration.tuning import EDGE_SHARE, TWIST_SIGMA_DEG
+from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import OUTLINE_COLUMNS, Outlines, unmeasured
@@ -57,10 +60,8 @@ from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import Seen
 
-KINEMATIC = "machine"  # names of coordinates of the machine begin so
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
 _WEAK, _WEAK_LENGTH = 1.0, 2.5
-EDGE_SIGMA_PX = 0.2  # of an edge of a body, at its ends
 _RANK = 1e-7  # of the largest singular value
 
 
@@ -91,11 +92,11 @@ class Contributions:
     rows: Array  # (n_images, r, m): of each image, its platform pose eliminated
     known: Array  # (r, m): rows of priors and of measured lengths, of no image
     basis: Array  # (n_parameters, p): directions of the kinematic parameters
-    at_site: Array  # (n_images, r) variances of what photographs of a site share, in those rows
-    site: IntArray  # (n_images,)
-    # (n_images, r, c) how errors at places, one standard deviation of each, move the rows; none of
-    # them unless a fit is predicted that does not know them
+    # (n_images, r, c) how errors that a fit does not know, one standard deviation of each, move the
+    # rows; to choose images none of them, but in their place
     shifts: Array
+    at_site: Array  # (n_images, r) variances of what photographs of a site share, in the rows
+    site: IntArray  # (n_images,)
 
     @property
     def prior(self) -> Array:
@@ -117,6 +118,14 @@ class Contributions:
         number[order] = 1 + np.arange(len(order)) - np.repeat(first, count)
         rows = self.gains(np.arange(len(order)), number)
         return rows.reshape(len(order) * rows.shape[1], rows.shape[2])
+
+    @property
+    def every_row(self) -> tuple[Array, Array]:
+        """All rows together, with those of no image, (q, m), and how errors move them, (q, c)."""
+        rows = self.all_gains()
+        moved = self.shifts.reshape(len(rows), self.shifts.shape[2])
+        moved = np.pad(moved, ((0, len(self.known)), (0, 0)))
+        return np.concatenate([rows, self.known]), moved
 
     def tied_by_board(self, T_base_camera: Mapping[str, RigidTransform]) -> Contributions:
         """Replace camera poses of views by the pose of a board on the base.
@@ -144,15 +153,46 @@ class Contributions:
         """Eliminate the unknowns of single views."""
         is_own = np.array([": " in name for name in self.names])
         shared, with_own = np.flatnonzero(~is_own), self.known[:, is_own].any(axis=1)
-        rows = marginal_rows(np.concatenate([self.all_gains(), self.known[with_own]]), shared)
-        names, known = tuple(self.names[i] for i in shared), self.known[~with_own][:, shared]
-        nothing, site = np.zeros((1, len(rows), 0)), np.zeros(1, dtype=np.intp)
+        known = self.known[~with_own][:, shared]
+        rows, shifts = marginal_rows(*replace(self, known=self.known[with_own]).every_row, shared)
+        names, site = tuple(self.names[i] for i in shared), np.zeros(1, dtype=np.intp)
         no_errors = np.zeros((1, len(rows)))  # all rows count as those of one image
-        return Contributions(names, rows[None], known, self.basis, no_errors, site, nothing)
+        return Contributions(names, rows[None], known, self.basis, shifts[None], no_errors, site)
 
     def repeated(self, times: float) -> Contributions:
         """Return the information of *times* photographs in place of each one."""
         return replace(self, rows=self.rows * np.sqrt(times), at_site=self.at_site * times)
+
+
+def joined(parts: Sequence[Contributions]) -> tuple[list[IntArray], Array]:
+    """Return the numbers of each part's unknowns among all, and the prior information of all.
+
+    Unknowns of single views belong to their part; what is known of others is the same in each.
+    """
+    number, columns = dict[str, int](), list[IntArray]()
+    for s, part in enumerate(parts):
+        local = [f"{s}/{name}" if ": " in name else name for name in part.names]
+        columns.append(np.array([number.setdefault(name, len(number)) for name in local]))
+    prior = np.zeros((len(number), len(number)))
+    for where, part in zip(columns, parts, strict=True):
+        prior[np.ix_(where, where)] = part.prior
+    return columns, prior
+
+
+def fitted_machine(parts: Sequence[Contributions]) -> tuple[Array, Array]:
+    """Return the covariance (p, p) of all parameters by a fit to all images of several views.
+
+    And how errors that it does not know move them (p, c), by one standard deviation of each.
+    """
+    (columns, information), basis = joined(parts), parts[0].basis
+    pulls = list[Array]()
+    for where, part in zip(columns, parts, strict=True):
+        rows = part.all_gains()
+        information[np.ix_(where, where)] += rows.T @ rows
+        pulls.append(rows.T @ part.shifts.reshape(len(rows), part.shifts.shape[2]))
+    by_all = basis @ np.linalg.inv(information)[: basis.shape[1]]
+    moved = [by_all[:, at] @ pull for at, pull in zip(columns, pulls, strict=True)]
+    return by_all[:, : basis.shape[1]] @ basis.T, np.hstack(moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,13 +218,13 @@ class Predictor:
         poses: Sequence[RigidTransform],  # T_Rb_Re of each image
         outlines: Outlines,
         legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
+        edges: Outlines | None = None,  # of bodies; without them those that are predicted
         *,
-        is_fit: bool = False,
+        to_choose: bool = False,
     ) -> Contributions:
-        """Return the contribution of images to the information.
+        """Return the contribution of images to the information of a fit, or *to_choose* some.
 
-        With *is_fit* that of a fit that weighs outlines as if they had no errors at places, and how
-        these move it. Unknowns without a prior have a weak one.
+        Unknowns without a prior have a weak one.
         """
         n, shown = len(poses), tuple(legs or self.legs.nominal)
         camera = replace(self.camera, gamma_is_given=False)
@@ -198,14 +238,14 @@ class Predictor:
             sigma_by_joint=self.sigma_by_joint,
         )
         T_base_Rb = self.machine.T_base_Rb
-        edges = predicted_edges(
-            self.machine.occluders,
-            [(camera, T) for T in views.values()],
-            view,
-            ends_in_base(shown, T_base_Rb, *Frames.of(poses), measurements.q),
-            np.ones((len(views), len(shown)), dtype=np.bool_),
-            EDGE_SIGMA_PX,
-        )
+        if edges is None:
+            edges = predicted_edges(
+                self.machine.occluders,
+                [(camera, T) for T in views.values()],
+                view,
+                ends_in_base(shown, T_base_Rb, *Frames.of(poses), measurements.q),
+                np.ones((len(views), len(shown)), dtype=np.bool_),
+            )
         start = Start(
             shown,
             tuple(T.inv() * T_base_Rb for T in views.values()),
@@ -215,13 +255,31 @@ class Predictor:
         return information_of_images(
             self.legs,
             measurements,
-            self.noise.of(outlines),
+            outlines,
             start,
             self.noise,
             self.choices,
             edges=edges,
-            is_fit=is_fit,
+            to_choose=to_choose,
             known_length=self.machine.size,
+        )
+
+    def covariance(
+        self,
+        parts: Sequence[Contributions],
+        poses: Sequence[RigidTransform],
+        legs: Sequence[Leg] | None = None,
+    ) -> Array:
+        """Return the covariance (p, p) that a fit to all images of views, at *poses*, states."""
+        fitted, (S, moved) = self.legs, fitted_machine(parts)
+        return covariance_as_stated(
+            S,
+            moved,
+            fitted.nominal if legs is None else legs,
+            fitted.parametrization,
+            fitted.frame_legs,
+            poses,
+            self.machine.size,
         )
 
 
@@ -240,24 +298,31 @@ def readings_at(legs: Sequence[Leg], R: Array, t: Array) -> Array:
 def information_of_images(
     legs: FittedLegs,
     measurements: Measurements,
-    outlines: Outlines,
+    outlines: Outlines,  # which there are: their errors are those of *noise*
     start: Start,
-    noise: PredictedNoise,  # besides the covariances of the outlines
+    noise: PredictedNoise,
     choices: Choices = NO_CHOICES,
     *,
     board: BoardCorners | None = None,
-    edges: Outlines | None = None,  # of bodies
-    is_fit: bool = False,  # as in :meth:`Predictor.contributions`
+    edges: Outlines | None = None,  # of bodies, likewise
+    to_choose: bool = False,  # as in :meth:`Predictor.contributions`
     known_length: float | None = None,  # mean leg length of weak priors; without it there are none
 ) -> Contributions:
     """Return the information of the joint fit, linearised at a start."""
-    usual = _as_calibrated(legs, choices)
-    problem = build_fit(legs, measurements, outlines, board=board, choices=usual, edges=edges)
+    usual = replace(_as_calibrated(legs, choices), of_photographs=noise.of_photographs)
+    problem = build_fit(
+        legs,
+        measurements,
+        noise.of(outlines),
+        board=board,
+        choices=usual,
+        edges=None if edges is None else noise.of_bodies(edges),
+    )
     biases = possible_biases(problem.outlines, legs.names)
     problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
     state = problem.begin(start)
     images = _Images(problem.weighted(NoiseModel()), state, noise)
-    return images.contributions(measurements.view_names, known_length, is_fit=is_fit)
+    return images.contributions(measurements.view_names, known_length, to_choose=to_choose)
 
 
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
@@ -281,13 +346,13 @@ class _Images:
     noise: PredictedNoise
 
     def contributions(
-        self, views: Sequence[str], known_length: float | None, *, is_fit: bool
+        self, views: Sequence[str], known_length: float | None, *, to_choose: bool
     ) -> Contributions:
         """Return the whitened rows of every image, and the priors of all unknowns."""
         problem, state = self.problem, self.state
         linear, n = linearize(problem, state), problem.n_elements
         tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
-        shifts = self._shifts(are_shared=is_fit)
+        shifts = self._shifts(to_choose=to_choose)
         n_shifts = shifts["outlines"].shape[2]
         blocks, is_outline, known = [], [], [linear.prior_J]
         for factor in problem.factors:
@@ -315,9 +380,14 @@ class _Images:
         U, s, _ = np.linalg.svd(own, full_matrices=False)
         U = U * (s > _RANK * s[:, :1])[:, None]
         kept = _without(U, kept)
-        at_site = np.zeros(kept.shape[:2])
-        if not is_fit and np.any(self.noise.places_px):
-            at_site, kept = _apart(kept, U, moved, np.array(is_outline))
+        at_site, site = np.zeros(kept.shape[:2]), np.arange(n)
+        if not to_choose:
+            moved = _without(U, moved)
+        else:
+            if any(self.noise.places_px):
+                at_site, kept = _apart(kept, U, moved, np.array(is_outline))
+                site = _sites(problem.outlines, n)
+            moved = moved[..., :0]
         names = _names(problem, views)
         if known_length is not None:
             known.append(_weak_rows(problem, np.concatenate(known), known_length))
@@ -328,37 +398,24 @@ class _Images:
         # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
         basis[problem.free] = problem.jacobian(state)[:k, :k] @ untied
         turn = block_diag(untied, np.eye(problem.n_kept - k))
-        named = *(f"{KINEMATIC} {i}" for i in range(untied.shape[1])), *names[k:]
-        if not is_fit:
-            moved, site = moved[..., :0], np.arange(n)
-            if self.noise.places_px[0] or self.noise.places_px[1]:
-                site = _sites(problem.outlines, n)
-        else:
-            moved, site = _without(U, moved), np.arange(n)
+        named = *(f"machine {i}" for i in range(untied.shape[1])), *names[k:]
         return Contributions(
-            named, kept @ turn, np.concatenate(known) @ turn, basis, at_site, site, moved
+            named, kept @ turn, np.concatenate(known) @ turn, basis, moved, at_site, site
         )
 
-    def _shifts(self, *, are_shared: bool) -> dict[str, Array]:
-        """Return how repeated errors move whitened rows (n, q, c), by the name of their factor.
+    def _shifts(self, *, to_choose: bool) -> dict[str, Array]:
+        """Return how errors that a fit does not know move whitened rows (n, q, c), by their factor.
 
-        By one standard deviation of each: of each place, and of each edge of a body in a view, none
-        of which a fit knows; or of bias and tilt of each outline alone.
+        By one standard deviation of each; to choose, of bias and tilt of each outline alone.
         """
         problem, o, sigma = self.problem, self.problem.outlines, np.array(self.noise.places_px)
-        if not sigma.any():
-            return {"outlines": np.zeros((len(o), 2, 0))}
-        whitening = np.asarray(problem.factor("outlines").whitening)
-        if not are_shared:
+        if to_choose:
+            whitening = np.asarray(problem.factor("outlines").whitening)
             return {"outlines": whitening @ (shifts_of_edges(len(o)) * sigma)}
-        at_places = shifts_at_places(o, np.ones(len(o), dtype=np.bool_))
-        at_places = whitening @ (at_places * np.repeat(sigma, at_places.shape[2] // len(sigma)))
-        edges = problem.edges.lines_in_views(np.ones(len(problem.edges), dtype=np.bool_))
-        n_places, n_lines = at_places.shape[2], edges.shape[2]
-        return {
-            "outlines": np.pad(at_places, ((0, 0), (0, 0), (0, n_lines))),
-            "edges": np.pad(EDGE_SHARE * edges, ((0, 0), (0, 0), (n_places, 0))),
-        }
+        at_places = shifts_at_places(o, np.full(len(o), sigma.any()))
+        return problem.unknown_errors(
+            at_places * np.repeat(sigma, at_places.shape[2] // len(sigma))
+        )
 
 
 def _weak_rows(problem: FitProblem, known: Array, length: float) -> Array:
@@ -478,15 +535,29 @@ class PredictedNoise:
     places_px: tuple[float, ...] = (0.024, 0.023)  # of bias and tilt of an edge at a place [px]
     gamma_px: float = 0.1  # motion of an outline with ln gamma, which counts as not known [px]
     source: str = "what photographs of simulated machines show"  # where it is from, in words
+    # standard deviations of bias and tilt of single outlines [px]
+    bias_px: float = 0.0
+    tilt_px: float = 0.0
+    edge_px: float = 0.28  # of one end of an edge of a body, seen from the other [px]
+
+    @property
+    def of_photographs(self) -> bool:
+        """Whether edges share errors, as those in photographs do."""
+        return any(self.common_px)
+
+    def of_bodies(self, edges: Outlines) -> Outlines:
+        """Return edges of bodies with the covariance that is predicted."""
+        covariance = np.tile(0.5 * self.edge_px**2 * np.eye(2), (len(edges), 1, 1))
+        return replace(edges, covariance=covariance)
 
     def of(self, outlines: Outlines) -> Outlines:
         """Return outlines with the covariance and the dependence on gamma that are predicted."""
         n = len(outlines.row)
         length = np.linalg.norm(outlines.ends[:, 1] - outlines.ends[:, 0], axis=-1)
         of_ends = 4.0 * np.array([[1.0, self.correlation], [self.correlation, 1.0]])
-        with_noise = replace(
-            outlines, covariance=(self.sigma_px**2 / length)[:, None, None] * of_ends
-        )
+        of_length = (self.sigma_px**2 / length)[:, None, None] * of_ends
+        single = NoiseModel(1.0, self.bias_px, self.tilt_px)
+        with_noise = replace(outlines, covariance=single.covariance(of_length))
         if self.gamma_px == 0.0:
             return with_noise
         return replace(with_noise, gamma=np.full(n, 2.2), by_gamma=np.full(n, self.gamma_px))
@@ -525,10 +596,15 @@ def _noise_of_result(residuals: ResidualsBlock, file: Path) -> PredictedNoise:
             variance = 0.5 * (s00 + s11)
             sigma = noise.scale * float(np.median(np.sqrt(variance * length / 4.0)))
             correlation = float(np.median(s01 / variance))
-    shared = tuple(common.get(kind, 0.0) for kind in KINDS)
-    # With few images, errors at places appear as bias and tilt of single outlines.
-    single_edges = noise.bias_px, noise.tilt_px
-    at_places = (common.get(kind, 0.0) for kind in PLACES)
-    places = tuple(max(both) for both in zip(single_edges, at_places, strict=True))
-    gamma = 0.0 if not any(shared) else DEFAULT_NOISE.gamma_px
-    return PredictedNoise(sigma, max(min(correlation, 0.9), -0.9), shared, places, gamma, str(file))
+    shared, places = (tuple(common.get(kind, 0.0) for kind in kinds) for kinds in (KINDS, PLACES))
+    return PredictedNoise(
+        sigma,
+        max(min(correlation, 0.9), -0.9),
+        shared,
+        places,
+        DEFAULT_NOISE.gamma_px if any(shared) else 0.0,
+        str(file),
+        noise.bias_px,
+        noise.tilt_px,
+        DEFAULT_NOISE.edge_px if residuals.edges_px is None else residuals.edges_px,
+    )

@@ -51,7 +51,7 @@ from legcal.calibration.joint_fit.variables import (
     changed_cameras,
     intrinsic_of,
 )
-from legcal.calibration.tuning import EDGE_BIAS_PX, LEAN_SIGMA
+from legcal.calibration.tuning import EDGE_BIAS_PX, EDGE_SHARE, LEAN_SIGMA
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.outlines import Outlines
 from legcal.errors import NotIdentifiable
@@ -221,6 +221,21 @@ class FitProblem(EstimationProblem[State]):
         """Set the noise of outlines, and weights (n_outlines,) of their squares."""
         whitening = noise.whitening(self.outlines.covariance, weight)
         return self.with_factors(replace(self.factor("outlines"), whitening=whitening))
+
+    def unknown_errors(self, shifts: Array) -> dict[str, Array]:
+        """Return how errors that a fit does not know move whitened residuals, by their factor.
+
+        By one standard deviation of each, (n, q, c): of *shifts* (n, 2, k) of both ends of outlines
+        [px], and in photographs of what each edge of a body keeps in all images of a view.
+        """
+        outlines, edges = (self.factor(name).whitening for name in ("outlines", "edges"))
+        used = np.asarray(edges)[:, 0, 0] > 0.0
+        lines = EDGE_SHARE * self.edges.lines_in_views(used & self.choices.of_photographs)
+        before, behind = (shifts.shape[2], 0), (0, lines.shape[2])
+        return {
+            "outlines": np.pad(outlines @ shifts, ((0, 0), (0, 0), behind)),
+            "edges": np.pad(lines, ((0, 0), (0, 0), before)),
+        }
 
     def with_biases(self, biases: EdgeBiases) -> FitProblem:
         """Replace the common-mode edge biases."""

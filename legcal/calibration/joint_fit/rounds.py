@@ -45,7 +45,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.variables import RefinementSettings, State
-from legcal.calibration.tuning import EDGE_SHARE, FIRST_MINIMUM_SIGMA, REJECTION_TAPER
+from legcal.calibration.tuning import FIRST_MINIMUM_SIGMA, REJECTION_TAPER
 from legcal.data.reasons import Reason, Rejection
 from legcal.errors import DidNotConverge
 from legcal.estimation.problem import GaussianPrior, linearize
@@ -323,15 +323,10 @@ def _absorbed_errors(fit: Fit, possible: EdgeBiases) -> tuple[dict[str, float], 
         if len(beyond):
             shifts.append(beyond.shifts)
             sizes |= beyond.of_sizes(least).sizes
-    moved = np.concatenate(shifts, axis=2)
-    columns = {"outlines": whitening @ moved} if moved.any() else {}
-    if problem.choices.of_photographs and len(problem.edges):
-        of_edges = np.asarray(problem.factor("edges").whitening)[:, 0, 0]
-        columns["edges"] = EDGE_SHARE * problem.edges.lines_in_views(of_edges > 0.0)
-    if not columns:
+    errors = problem.unknown_errors(np.concatenate(shifts, axis=2))
+    if not any(columns.any() for columns in errors.values()):
         return None
-    normal = information(linear, problem.loss)
-    moved = np.concatenate([response(normal, {name: c}) for name, c in columns.items()], axis=1)
+    moved = response(information(linear, problem.loss), errors)
     return sizes, moved @ moved.T
 
 

@@ -188,6 +188,8 @@ class GoodnessOfFit:
     rms_corners_px: Mapping[Link, float]  # of corners of the calibration board on each link [px]
     noise: NoiseModel  # errors of single outlines
     shared_px: Mapping[str, float]  # sigmas of common-mode biases by kind [px]; empty without any
+    # of one end of an edge of a body, seen from the other [px]; None where no edge is used
+    edges_px: float | None
     redundant_readings: JudgedReadings | None  # None where readings cannot disagree
 
 
@@ -326,6 +328,8 @@ def _goodness_of_fit(fit: Fit, normal: FitNormal, n_held: int) -> GoodnessOfFit:
     n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     of_rows = sum(float(np.sum(rows.r**2)) for rows in linear.rows.values())
     claimed = problem.weighted(NoiseModel())
+    of_edges = np.ravel(problem.factor("edges").whitening)
+    of_edges = of_edges[of_edges > 0.0]
     return GoodnessOfFit(
         cost=robust_cost(linearize(claimed, state), claimed.loss),
         chi2=float(np.sum(linear.prior_r**2)) + of_rows,
@@ -338,6 +342,7 @@ def _goodness_of_fit(fit: Fit, normal: FitNormal, n_held: int) -> GoodnessOfFit:
         },
         noise=fit.noise,
         shared_px=fit.shared_px,
+        edges_px=float(np.median(1.0 / of_edges)) if len(of_edges) else None,
         redundant_readings=readings,
     )
 
