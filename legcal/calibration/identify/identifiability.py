@@ -46,6 +46,7 @@ from legcal.calibration.joint_fit.predicted import (
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
+from legcal.data.outlines import join_outlines
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.estimation.problem import Frames
 from legcal.estimation.uncertainty import compress, marginal_rows
@@ -526,17 +527,19 @@ def identifiability(
 
 
 def identifiability_of_dataset(
-    # images are not read: every view shows the legs that it names, or all
+    # images are not read: without outlines every view shows the legs that it names, or all
     dataset: Dataset,
     # fixed parameters, priors, and estimated twists
     choices: Choices = NO_CHOICES,
     noise: PredictedNoise = DEFAULT_NOISE,
 ) -> Identifiability:
-    """Judge the identifiability from the readings, cameras and visible legs of a dataset.
+    """Judge the identifiability from the readings, cameras and outlines of a dataset.
 
     Raises DidNotConverge if the forward kinematics at the readings fail.
     """
-    analysis = replace(_analysis_of(dataset, choices), noise=noise)
+    analysis = _analysis_of(dataset, choices)
+    session = analysis.session.with_outlines_of(dataset)
+    analysis = replace(analysis, session=session, noise=noise)
     report = _report_on(dataset.machine, analysis, None)
     if dataset.machine.is_determined:
         return report
@@ -598,6 +601,11 @@ def _report_on(
     notes += _machine_notes(machine)
     if full.complete:
         notes += _rough_notes(analysis)
+        if analysis.noise is DEFAULT_NOISE and analysis.motion.by_metres is not None:
+            notes.append(
+                f"Errors of outlines are {DEFAULT_NOISE.source}; --noise RESULT takes those of an "
+                "earlier result."
+            )
     notes += sigmas_in_words(analysis.parts)
     return Identifiability(
         spatial=machine.spatial,
@@ -894,8 +902,10 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
     A, B = (end.mean(axis=0) for end in session.ends)
     rng = np.random.default_rng(_SEED)
     (further,) = default_cameras(A, B, [legs], session.spatial, rng)
-    return replace(
+    extended = replace(
         session,
+        found=None,
+        found_edges=None,
         R=np.concatenate([session.R, session.R[images]]),
         t=np.concatenate([session.t, session.t[images]]),
         unread=np.concatenate([session.unread, session.unread[images]]),
@@ -909,3 +919,11 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
             np.full(len(images), session.platform_board.all())[: len(session.platform_board)],
         ),
     )
+    found = [
+        None if there is None else join_outlines([there, new.choose(new.row >= len(session.view))])
+        for there, new in (
+            (session.found, extended.outlines),
+            (session.found_edges, extended.edges),
+        )
+    ]
+    return replace(extended, found=found[0], found_edges=found[1])

@@ -301,6 +301,16 @@ class Session:
             return replace(self, platform_board=np.ones(len(self.view), dtype=np.bool_))
         return replace(self, board=np.ones(self.n_views, dtype=np.bool_))
 
+    def with_outlines_of(self, dataset: Dataset) -> Session:
+        """Return the same with the outlines of its dataset, if it says where they are.
+
+        The poses of cameras and of the platform have to be known.
+        """
+        is_placed = all(view.T_base_camera is not None for view in dataset.measurements.views)
+        if dataset.observations is None or not (is_placed and dataset.machine.is_determined):
+            return self
+        return replace(self, found=dataset.observations, found_edges=dataset.body_edges)
+
     def columns(self, kind: int) -> IntArray:
         """Return the parameters that stand for one of the numbers (:class:`LegColumns`) of legs."""
         columns_of_legs = self.parametrization.place[:, kind]
