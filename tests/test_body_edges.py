@@ -13,12 +13,19 @@ from machines import copied_model
 from simulated import settings, small_camera, standing
 
 from legcal import calibrate, load_dataset, load_mechanism, simulate
-from legcal.calibration.identify.identifiability import identifiability_of_dataset
+from legcal.calibration.identify.identifiability import Analysis, identifiability_of_dataset
+from legcal.calibration.identify.session import planned_session
+from legcal.calibration.joint_fit.outline_errors import NoiseModel, possible_biases
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.variables import Start
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.data.outlines import no_outlines
 from legcal.data.reasons import Reason
+from legcal.estimation.problem import Frames, linearize
+from legcal.estimation.solver import information
+from legcal.estimation.uncertainty import response
 from legcal.machine.inspection import machine_document
 from legcal.machine.parameters import geometries
 from legcal.machine.shapes import SECTIONS, PlacedOccluders, bodies_of
@@ -222,3 +229,50 @@ def test_plans_count_edges_of_bodies(with_bodies: Path) -> None:
         known.append(np.sum(added.all_gains()[:, : added.basis.shape[1]] ** 2))
     assert known[0] > 0.0
     assert known[1] < 0.5 * known[0]
+
+
+def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) -> None:
+    """As the joint fit to the same images does: by its covariance and its response to an error."""
+    machine = load_mechanism(with_bodies)
+    noise = replace(DEFAULT_NOISE, places_px=(0.0, 0.0), gamma_px=0.0, sigma_px=1.0)
+    choices = Choices(fixed=frozenset(f"{name}.twist" for name in machine.leg_names))
+    session = planned_session(machine, [range(6)] * 3, 6)
+    outlines, edges = session.outlines, session.edges
+    problem = build_fit(
+        session.fitted,
+        session.measurements,
+        noise.of(outlines),
+        choices=choices,
+        edges=noise.of_bodies(edges),
+    )
+    possible = possible_biases(problem.outlines, machine.leg_names)
+    problem = problem.with_biases(possible.of_sizes(np.append(noise.common_px, 0.0)))
+    problem, poses = problem.weighted(NoiseModel()), Frames(session.R, session.t).motions
+    views = tuple(T.inv() for T in session.places)
+    at = problem.begin(Start(session.fitted.nominal, views, poses, "here"))
+    normal = information(linearize(problem, at), problem.loss)
+    line = 10 * (6 * session.view[edges.row] + edges.leg) + edges.edge
+    same = (line[:, None] == np.unique(line)) * problem.loss.efficiency(1)
+    moved, n = response(normal, {"edges": same[:, None]}), problem.n_kinematic
+    alone = normal.kept_covariance()
+    stated = np.sqrt(np.diagonal(alone + moved @ moved.T)[:n])
+    assert np.any(stated > 1.2 * np.sqrt(np.diagonal(alone)[:n]))
+
+    found = Analysis(session, choices, noise).covariance
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found)), stated, rtol=0.01)
+    planned = Predictor(machine, session.cameras[0].camera, noise, session.sigma_q, choices)
+    parts = []
+    for v, T in enumerate(session.places):
+        row, alike = np.flatnonzero(session.view == v), np.zeros(6, dtype=np.intp)
+        of_view = [
+            replace(some, row=np.searchsorted(row, some.row))
+            for some in (one.choose(np.isin(one.row, row)) for one in (outlines, edges))
+        ]
+        of_poses = [poses[k] for k in row]
+        parts.append(
+            planned.contributions(
+                {"c": machine.T_base_Rb * T}, alike, of_poses, *of_view[:1], edges=of_view[1]
+            )
+        )
+    found = planned.covariance(parts, poses)[problem.free][:, problem.free]
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found)), stated, rtol=0.02)
