@@ -27,7 +27,7 @@ from legcal.calibration.joint_fit.predicted import (
 )
 from legcal.calibration.joint_fit.variables import FittedLegs, Start
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data.corners import found_corners
+from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, join_outlines
@@ -39,7 +39,15 @@ from legcal.machine.actuator import Actuator
 from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import SIGMA_READING, Cylinder, Leg, LegKind, Link, radius_name
+from legcal.machine.leg import (
+    LINKS,
+    SIGMA_READING,
+    Cylinder,
+    Leg,
+    LegKind,
+    Link,
+    radius_name,
+)
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -96,6 +104,7 @@ class Session:
     board: BoolArray
     # (n_images,): those that show a calibration board on the platform; none if it is empty
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    boards: Mapping[Link, Board] = field(default_factory=dict)  # those whose dimensions are known
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
     sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     occluders: tuple[Occluder, ...] = ()  # solids of legs; bodies among them have edges
@@ -180,15 +189,15 @@ class Session:
         noise: PredictedNoise = DEFAULT_NOISE,
     ) -> Contributions:
         """Return the information of the joint fit of these images."""
-        board, T_Re_board = self._corners()
+        board, T_link_board = self._corners()
         start = Start(
             self.fitted.nominal,
             tuple(T.inv() for T in self.places),
             Frames(self.R, self.t).motions,
             "identify",
-            T_Re_board=T_Re_board,
+            *(T_link_board.get(link, RigidTransform.identity()) for link in LINKS),
         )
-        contributions = information_of_images(
+        return information_of_images(
             self.fitted,
             self.measurements,
             self.outlines,
@@ -198,36 +207,34 @@ class Session:
             board=board,
             edges=self.edges,
         )
-        places = zip(self.cameras, self.places, self.board, strict=True)
-        return contributions.tied_by_board({view.name: T for view, T, has in places if has})
 
-    def _corners(self) -> tuple[BoardCorners | None, RigidTransform]:
-        """Return the corners of a board on the platform in images, and its pose T_Re_board.
+    def _corners(self) -> tuple[BoardCorners | None, dict[Link, RigidTransform]]:
+        """Return the corners of boards in images, and the poses of boards in R_b and R_e.
 
-        The board is centred on the platform joints.
+        A board is centred on the joints of its link; without one of its own it is about as large.
         """
-        image = np.flatnonzero(self.platform_board)
-        if not len(image):
-            return None, RigidTransform.identity()
-        B = np.array([leg.B for leg in self.legs])
-        middle = B.mean(axis=0)
-        _, spread, axes = np.linalg.svd(B - middle)
-        side = 2.0 * _BOARD * float(spread[0]) / np.sqrt(len(B))
-        board = Board("chessboard", _SQUARES, _SQUARES, side / (_SQUARES - 2))
-        T_Re_board = facing_board(board, middle, axes[2], axes[1])
-        corners = T_Re_board.apply(board.points)
-        px = []
-        for v, k in zip(self.view[image].tolist(), self.pose[image].tolist(), strict=True):
-            in_camera = self.places[v].inv().apply(corners @ self.R[k].T + self.t[k])
-            px.append(self.cameras[v].camera.project(in_camera))
-        n = board.n_corners
-        shown = found_corners(
-            np.repeat(image, n),
-            np.tile(np.arange(n), len(image)),
-            np.concatenate(px),
-            np.full(n * len(image), _CORNER_PX),
-        )
-        return BoardCorners((FixedBoard(board, "platform"),), shown), T_Re_board
+        fixed, tables, poses = list[FixedBoard](), list[Corners](), dict[Link, RigidTransform]()
+        joints_of = {"base": self.ends[0][0], "platform": np.array([leg.B for leg in self.legs])}
+        shown = {"base": self.board[self.view], "platform": self.platform_board}
+        for link in LINKS:
+            image, joints, px = np.flatnonzero(shown[link]), joints_of[link], list[Array]()
+            if not len(image):
+                continue
+            middle = joints.mean(axis=0)
+            _, spread, axes = np.linalg.svd(joints - middle)
+            square = 2.0 * _BOARD * float(spread[0]) / np.sqrt(len(joints)) / (_SQUARES - 2)
+            board = self.boards.get(link, Board("chessboard", _SQUARES, _SQUARES, square))
+            poses[link] = facing_board(board, middle, axes[2], axes[1])
+            points = poses[link].apply(board.points)
+            for v, k in zip(self.view[image].tolist(), self.pose[image].tolist(), strict=True):
+                in_Rb = points if link == "base" else points @ self.R[k].T + self.t[k]
+                px.append(self.cameras[v].camera.project(self.places[v].inv().apply(in_Rb)))
+            first, n = sum(one.board.n_corners for one in fixed), board.n_corners
+            fixed.append(FixedBoard(board, link, first=first))
+            number = first + np.tile(np.arange(n), len(image))
+            sigma = np.full(len(number), _CORNER_PX)
+            tables.append(found_corners(np.repeat(image, n), number, np.concatenate(px), sigma))
+        return BoardCorners(tuple(fixed), join_corners(tables)) if fixed else None, poses
 
     @cached_property
     def frame(self) -> IntArray:
@@ -444,6 +451,7 @@ def recorded_session(
         unread=np.isnan(m.q_of_poses),
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),
+        boards={fixed.link: fixed.board for fixed in dataset.boards},
         occluders=solids,
     )
 
