@@ -329,12 +329,7 @@ def draw_session(
         design.view,
         design.pose,
         q[design.pose],
-        noise.sigma_q,
-        sigma_by_joint={
-            str(leg.prismatic): s
-            for leg, s in zip(true.nominal, sigma.tolist(), strict=True)
-            if leg.actuator is not None
-        },
+        np.where(sigma > 0.0, sigma, noise.sigma_q),
     )
     outlines = noisy_outlines(design.outlines, design.camera, rng)
     nominal = moved_legs(true.nominal, design.parametrization.place, step)

@@ -30,7 +30,7 @@ from scipy.stats import spearmanr
 import legcal
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, WHITE, Predictor
-from legcal.data.reading_units import sigmas_of
+from legcal.data.reading_units import sigmas_of, sigmas_of_legs
 from legcal.errors import LegcalError, NotIdentifiable
 from legcal.geometry.lines import direction_above
 from legcal.geometry.types import Array
@@ -138,8 +138,9 @@ def compared(name: str, machine: Machine, args: argparse.Namespace) -> dict[str,
     if rod is not None:
         known = Prior(rod[0].q0, LENGTH_SIGMA)
         choices = Choices(priors={f"{rod[0].name}.length": known})
-    sigma = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
-    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, 2e-6, choices, sigma)
+    stated = {} if args.encoder_sigma is None else sigmas_of(args.encoder_sigma, machine.legs)
+    sigma_q = sigmas_of_legs(machine.legs, 2e-6, stated)
+    predictor = Predictor(machine, sample_camera(), DEFAULT_NOISE, sigma_q, choices)
     task = Task(predictor, args.images, args.cameras, default_setting(machine))
     work = workspace_of(machine, predictor.legs)
     if work is None:
@@ -209,9 +210,8 @@ def shot(
     dX, dE, stated, turned, failed = [], [], [], [], []
     rod = machine.rod_for_scale(has_length=False)
     lengths = {} if rod is None else {rod[1]: LENGTH_SIGMA}
-    angles = None
-    if plan.sigma_by_joint:
-        angles = Spread(min(plan.sigma_by_joint.values()), Distribution.NORMAL)
+    turning = [s for leg, s in zip(machine.legs, plan.sigma_q, strict=True) if leg.reads_angle]
+    angles = Spread(float(min(turning)), Distribution.NORMAL) if turning else None
     for seed in range(first, first + runs):
         folder = session.parent / f"shot{seed}"
         out = session.parent / f"{folder.name}-result"

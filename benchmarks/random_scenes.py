@@ -363,9 +363,8 @@ def _measurements(
     n = len(q)
     rows = np.arange(n, dtype=np.intp)
     names = tuple(f"{row + 1}.png" for row in range(n))
-    return Measurements(
-        (View("c1", camera),), names, np.zeros(n, dtype=np.intp), rows, q, 2e-6, names
-    )
+    view, sigma = np.zeros(n, dtype=np.intp), np.full(q.shape[1], 2e-6)
+    return Measurements((View("c1", camera),), names, view, rows, q, sigma, names)
 
 
 def _nominal_joints(nominal: Machine, measurements: Measurements) -> tuple[Array, Array]:

@@ -127,9 +127,7 @@ def predictor_of(calibration: Calibration, noise: PredictedNoise) -> Predictor:
     """Return the predictor of a plan."""
     dataset = calibration.dataset
     m = dataset.measurements
-    return Predictor(
-        dataset.machine, m.views[0].camera, noise, m.sigma_q, choices_of(dataset), m.sigma_by_joint
-    )
+    return Predictor(dataset.machine, m.views[0].camera, noise, m.sigma_q, choices_of(dataset))
 
 
 def choices_of(dataset: Dataset) -> Choices:

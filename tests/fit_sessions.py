@@ -29,6 +29,7 @@ from legcal.calibration.joint_fit.variables import (
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, unmeasured
+from legcal.data.reading_units import sigmas_of_legs
 from legcal.data.reasons import USED
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
@@ -200,7 +201,7 @@ def machine_session(
         view,
         np.arange(len(view)),
         q,
-        SIGMA_Q,
+        sigmas_of_legs(legs, SIGMA_Q),
     )
     truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
     away = _wrong(fitted, legs, 0.003, float(np.deg2rad(1.0)), rng)

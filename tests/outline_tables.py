@@ -52,7 +52,7 @@ def recorded(
         view=np.arange(n, dtype=np.intp) % 2,
         pose=np.arange(n, dtype=np.intp),
         q=q,
-        sigma_q=1e-6,
+        sigma_q=np.full(len(LEGS), 1e-6),
         pose_labels=tuple(labels),
     )
 

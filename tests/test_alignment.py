@@ -78,7 +78,7 @@ def measured(n: int, width: int, height: int) -> Measurements:
         pose=np.arange(n),
         image=tuple(f"{k}.png" for k in range(n)),
         q=np.zeros((n, 1)),
-        sigma_q=1e-5,
+        sigma_q=np.full(1, 1e-5),
     )
 
 

@@ -55,7 +55,7 @@ MEASUREMENTS = Measurements(
     view=np.array([0, 0, 1]),
     pose=np.arange(3),
     q=np.zeros((3, 1)),
-    sigma_q=1e-6,
+    sigma_q=np.full(1, 1e-6),
 )
 BOARDS = (FixedBoard(CHARUCO, "base"),)
 KEYS = st.lists(

@@ -256,7 +256,7 @@ def _measurements(per_view: tuple[int, ...], camera: Camera = LENS) -> Measureme
         view=view,
         pose=np.arange(n),
         q=np.zeros((n, 1)),
-        sigma_q=1e-6,
+        sigma_q=np.full(1, 1e-6),
     )
 
 

@@ -224,7 +224,8 @@ def test_plans_count_edges_of_bodies(with_bodies: Path) -> None:
     home = machine.home_of_frames
     known = []
     for occluders in (machine.occluders, ()):
-        predictor = Predictor(replace(machine, occluders=occluders), lens, DEFAULT_NOISE, 1e-5)
+        nominal, sigma = replace(machine, occluders=occluders), np.full(6, 1e-5)
+        predictor = Predictor(nominal, lens, DEFAULT_NOISE, sigma)
         added = predictor.contributions(views, np.zeros(1, dtype=np.intp), [home], no_outlines())
         known.append(np.sum(added.all_gains()[:, : added.basis.shape[1]] ** 2))
     assert known[0] > 0.0
@@ -264,15 +265,11 @@ def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) ->
     parts = []
     for v, T in enumerate(session.places):
         row, alike = np.flatnonzero(session.view == v), np.zeros(6, dtype=np.intp)
-        of_view = [
+        rods, bodies = (
             replace(some, row=np.searchsorted(row, some.row))
             for some in (one.choose(np.isin(one.row, row)) for one in (outlines, edges))
-        ]
-        of_poses = [poses[k] for k in row]
-        parts.append(
-            planned.contributions(
-                {"c": machine.T_base_Rb * T}, alike, of_poses, *of_view[:1], edges=of_view[1]
-            )
         )
+        at_poses, view = [poses[k] for k in row], {"c": machine.T_base_Rb * T}
+        parts.append(planned.contributions(view, alike, at_poses, rods, edges=bodies))
     found = planned.covariance(parts, poses)[problem.free][:, problem.free]
     np.testing.assert_allclose(np.sqrt(np.diagonal(found)), stated, rtol=0.02)

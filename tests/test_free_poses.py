@@ -104,7 +104,7 @@ def test_poses_are_found_by_clicks(tmp_path: Path) -> None:
         view,
         pose,
         np.full((4, machine.n_legs), np.nan),
-        2e-6,
+        np.full(machine.n_legs, 2e-6),
     )
     # Clicks on all joints of each picture; cameras follow from those of the base.
     image, end, leg = (x.ravel() for x in np.meshgrid(range(4), (0, 1), every, indexing="ij"))

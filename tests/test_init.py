@@ -104,7 +104,7 @@ def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(tmp_path: P
     assert files_of(tmp_path / "photos") == before
     made, example = load_dataset(tmp_path / "dataset"), load_dataset(HEXAPOD)
     np.testing.assert_allclose(made.measurements.q, example.measurements.q, atol=1e-9)
-    assert made.measurements.sigma_q == example.measurements.sigma_q
+    np.testing.assert_array_equal(made.measurements.sigma_q, example.measurements.sigma_q)
     for k in range(45):
         one, two = made.image_path(k), example.image_path(k)
         assert one is not None

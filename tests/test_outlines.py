@@ -54,7 +54,7 @@ def detect_with_blur(
     B = np.array([b.B for b in bars])[None] + off * rng.choice([-1.0, 1.0], (1, len(bars), 3))
     names = [f"leg{i + 1}" for i in range(len(bars))]
     wanted, one, q = np.ones((1, len(bars)), dtype=np.bool_), np.zeros(1, dtype=np.intp), A[..., 0]
-    one_view = Measurements((View("c1", cam),), ("a.png",), one, one, q, 1e-6)
+    one_view = Measurements((View("c1", cam),), ("a.png",), one, one, q, np.full(len(bars), 1e-6))
     lengths = [float(np.linalg.norm(b.B - b.A)) for b in bars]
     cylinders = [
         (Cylinder("rod", b.radius, "base", 0.0, length),)

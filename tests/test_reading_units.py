@@ -48,8 +48,7 @@ def test_units_of_each_motor_give_joint_values_and_their_sigmas(tmp_path: Path) 
     ).measurements
     np.testing.assert_allclose(found.q, ANGLES, atol=1e-8)
     wanted = [0.5, 0.5, 0.1, 0.2, 3.0 / 11.1, 4.0 / 11.1]
-    got = [np.degrees(found.sigma_by_joint[name]) for name in SERVOS]
-    np.testing.assert_allclose(got, wanted)
+    np.testing.assert_allclose(np.degrees(found.sigma_q), wanted)
 
 
 def test_a_sigma_of_a_motor_that_there_is_not_is_refused_with_the_closest_name() -> None:
@@ -134,8 +133,7 @@ def test_init_takes_angles_and_pulses(
     found = [[float(row[name]) for name in SERVOS] for row in rows]
     np.testing.assert_allclose(found, ANGLES, atol=1e-4)
     measurements = load_dataset(tmp_path / "dataset").measurements
-    got = np.degrees([measurements.sigma_by_joint[name] for name in SERVOS])
-    np.testing.assert_allclose(got, sigma_deg, rtol=0.01)
+    np.testing.assert_allclose(np.degrees(measurements.sigma_q), sigma_deg, rtol=0.01)
 
 
 def init(

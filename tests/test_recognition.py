@@ -207,7 +207,7 @@ def test_the_rough_pose_of_a_group_is_that_of_its_frame_whichever_view_has_it() 
     joined = [MOTION.inv() * T for T in T_base_camera]
     measurements = Measurements(
         tuple(View(f"c{v}", CAMERA) for v in range(3)), ("a", "b", "c"), np.arange(3),
-        np.zeros(3, np.intp), np.zeros((3, 6)), 1e-6,
+        np.zeros(3, np.intp), np.zeros((3, 6)), np.full(6, 1e-6),
     )  # fmt: skip
     for v in range(3):
         hints = [T if w == v else None for w, T in enumerate(T_base_camera)]
@@ -315,7 +315,7 @@ def _search(kind: type[Search], made: lp.MachineSpec, B: Array) -> Search:
     rows = np.arange(n)
     measurements = Measurements(
         (View("c1", CAMERA),), tuple(f"{row}.png" for row in rows), np.zeros(n, np.intp), rows,
-        np.zeros((n, n_legs)), 1e-6,
+        np.zeros((n, n_legs)), np.full(n_legs, 1e-6),
     )  # fmt: skip
     A = np.broadcast_to(made.A, B.shape)
     wanted = np.ones((1, n_legs), dtype=np.bool_)

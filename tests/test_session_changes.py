@@ -20,6 +20,7 @@ from legcal.calibration.joint_fit.variables import Start, fitted_legs
 from legcal.calibration.session_changes import ALL_MOTORS, Finding, session_tests
 from legcal.calibration.verdict import commanded
 from legcal.data.image_choice import chosen_images, dataset_at, image_sequences, own_zeros
+from legcal.data.reading_units import sigmas_of_legs
 from legcal.errors import UsageError
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray
@@ -171,7 +172,8 @@ def test_the_first_finding_is_what_was_done_with_its_amount(
 
 def test_a_slip_is_found_where_readings_are_stated_as_exact(healthy: Dataset, start: Start) -> None:
     slipped = _with_readings(_slipped)(healthy)
-    m = replace(slipped.measurements, sigma_q=1e-9, sigma_by_joint={})
+    sigma = sigmas_of_legs(slipped.machine.legs, 1e-9)
+    m = replace(slipped.measurements, sigma_q=sigma)
     finding = _findings(replace(slipped, measurements=m), start)[0]
     assert (finding.kind, finding.subject) == ("encoder", "leg2")
 
@@ -219,8 +221,8 @@ def test_an_encoder_sigma_far_above_what_readings_scatter_is_noted(
     assert len(said) == (times > 1.0)
     for note in said:
         found, stated = map(float, re.findall(r"([\d.]+) mm", note))
-        assert stated == pytest.approx(1e3 * times * m.sigma_q)
-        assert 0.5 < 1e-3 * found / m.sigma_q < 2.0
+        assert 1e3 * times * m.sigma_q == pytest.approx(stated)
+        assert np.all(np.abs(np.log2(1e-3 * found / m.sigma_q)) < 1.0)
 
 
 def _exchanged(dataset: Dataset) -> Dataset:

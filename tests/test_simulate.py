@@ -91,7 +91,7 @@ def test_readings_scatter_and_camera_poses_are_rough_as_they_claim(made: Simulat
     true = np.array([list(truth["poses"][label]["joints"].values()) for label in m.pose_labels])
     error = m.q - true[m.pose]
     assert 0.7e-4 < np.abs(error).max() <= 1e-4
-    assert error.std() == pytest.approx(m.sigma_q, rel=0.15)
+    assert error.std() == pytest.approx(m.sigma_q[0], rel=0.15)
     assert m.sigma_q == pytest.approx(1e-4 / np.sqrt(3.0))
     for view in m.views:
         assert view.T_base_camera is not None

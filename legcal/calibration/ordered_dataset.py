@@ -357,7 +357,7 @@ def _contradictions(
     readings are accused, poses near those of the other images are tried.
     """
     T, q = list(T_Rb_Re), measurements.q_of_poses
-    motors, sigma = list(machine.motors), measurements.sigma_of(machine.legs)
+    motors, sigma = list(machine.motors), measurements.sigma_q
     accused = contradictions(machine, T, q[:, motors], sigma[motors])
     if accused:
         _solve_anew(machine, q, T, list(accused))

@@ -161,8 +161,7 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
         for view in measurements.views
     ]
     rows = [measurements.image, measurements.view.tolist(), measurements.pose.tolist()]
-    document = [FORMAT, __version__, settings, views, rows, measurements.sigma_q]
-    document += [dict(measurements.sigma_by_joint)] if measurements.sigma_by_joint else []
+    document = [FORMAT, __version__, settings, views, rows, measurements.sigma_q.tolist()]
     for fixed in dataset.boards:  # they place the cameras for the search of outlines
         T = fixed.T_link_board
         document.append(board_document(fixed.board))

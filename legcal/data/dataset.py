@@ -46,6 +46,7 @@ from legcal.data.reading_units import (
     reading_units,
     sigma_in,
     sigma_too_large,
+    sigmas_of_legs,
 )
 from legcal.errors import DatasetError, Place, Problem
 from legcal.files.folder import path_problem
@@ -353,8 +354,8 @@ def load_dataset(
                 "images alone do not say where the rods begin; record them."
             )
         machine = load_mechanism(mechanism, without=unread)
-        by_joint = {name: sigma for name, sigma in by_joint.items() if name not in unread}
-    rows, notes = measurements_in(table, folder, views, machine.legs, sigma_q, by_joint, units)
+    sigma = sigmas_of_legs(machine.legs, sigma_q, by_joint)
+    rows, notes = measurements_in(table, folder, views, machine.legs, sigma, units)
     if unread:
         notes = (*notes, _without_readings(table_path, machine, unread))
     if in_mm:

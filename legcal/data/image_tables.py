@@ -120,6 +120,7 @@ def reorder_measurements(measurements: Measurements, order: Order) -> Measuremen
         views=tuple(measurements.views[v] for v in order.views.tolist()),
         view=inverse(order.views)[moved.view],
         q=moved.q[:, order.legs],
+        sigma_q=moved.sigma_q[order.legs],
     )
 
 

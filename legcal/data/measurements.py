@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -27,7 +27,6 @@ from legcal.data.reading_units import (
     legs_with_readings,
     likely_cause,
     readings_of_lengths,
-    sigmas_of_legs,
 )
 from legcal.errors import Problem
 from legcal.files.folder import path_problem
@@ -88,9 +87,8 @@ class Measurements:
     # (n_rows, n_legs) readings [m]; for rods on actuators the reading of the actuator [m or rad];
     # zero for other constant-length legs, NaN for passive ones
     q: Array
-    sigma_q: float  # of a reading [m]
+    sigma_q: Array  # (n_legs,) standard deviation of the reading of each leg [m or rad]
     pose_labels: tuple[str, ...] = ()  # label of each pose, or ""; empty without that column
-    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     time: Array | None = None  # (n_rows,) when images were taken [s], NaN where unknown
     own_zeros: tuple[OwnZero, ...] = ()
 
@@ -133,10 +131,6 @@ class Measurements:
     def clicked_views(self) -> tuple[str, ...]:
         """The views with a rough pose from clicks on joints."""
         return tuple(view.name for view in self.views if view.by_landmarks)
-
-    def sigma_of(self, legs: Sequence[Leg]) -> Array:
-        """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad]."""
-        return sigmas_of_legs(legs, self.sigma_q, self.sigma_by_joint)
 
 
 def row_names(measurements: Measurements) -> tuple[str, ...]:
@@ -350,8 +344,7 @@ def measurements_in(
     folder: Path,
     views: Sequence[View],
     legs: Sequence[Leg],
-    sigma_q: float,
-    sigma_by_joint: Mapping[str, float],
+    sigma_q: Array,
     units: Mapping[str, ReadingUnit],
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the rows of the table ``measurements.csv`` in its order, and notes on odd readings.
@@ -363,7 +356,7 @@ def measurements_in(
     view = table.positions("view", view_names, "a view of the dataset file")
     _refuse_images(table, images, folder)
     motors = legs_with_readings(legs)
-    sigma = sigmas_of_legs(motors, sigma_q, sigma_by_joint)
+    sigma = sigma_q[[next(j for j, leg in enumerate(legs) if leg is motor) for motor in motors]]
     readings, notes = readings_in(table, legs, units, sigma, place="dataset file")
     pose, labels = _poses(table.text("pose"))
     q = np.full((len(table), len(legs)), math.nan)
@@ -376,7 +369,6 @@ def measurements_in(
         q=q,
         sigma_q=sigma_q,
         pose_labels=labels if "pose" in table else (),
-        sigma_by_joint=sigma_by_joint,
         time=table.number("time") if "time" in table else None,
     )
     shared = _shared_readings(table, legs, pose, readings, sigma)

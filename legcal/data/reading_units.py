@@ -201,7 +201,11 @@ def reading_units(
     return units
 
 
-def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, float]) -> Array:
+def sigmas_of_legs(
+    legs: Sequence[Leg],
+    sigma_q: float,
+    stated: Mapping[str, float] = MappingProxyType({}),
+) -> Array:
     """Return the standard deviation of the reading of each leg, (n_legs,) [m or rad].
 
     It is the stated value of its motor, or else the usual one: *sigma_q* [m] for a sliding motor.
@@ -209,6 +213,15 @@ def sigmas_of_legs(legs: Sequence[Leg], sigma_q: float, stated: Mapping[str, flo
     sigmas = [stated.get(str(leg.prismatic), usual_sigma(leg, sigma_q)) for leg in legs]
     least = LEAST_SIGMA * np.ptp(np.reshape([leg.travel for leg in legs], (-1, 2)), axis=1)
     return np.maximum(sigmas, np.where(np.isfinite(least), least, 0.0))
+
+
+def stated_sigma(legs: Sequence[Leg], sigma_q: Array) -> float | dict[str, float]:
+    """Return ``encoder_sigma`` of a dataset: by motor where they turn or differ, else one [m]."""
+    motors = [j for j, leg in enumerate(legs) if leg.is_motor]
+    sigma_of = {str(legs[j].prismatic): float(sigma_q[j]) for j in motors}
+    if len({*sigma_of.values()}) > 1 or any(legs[j].reads_angle for j in motors):
+        return sigma_of
+    return float(sigma_q[motors[0]])
 
 
 def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:

@@ -85,7 +85,7 @@ def leg_directions(
     covariance = np.zeros((len(j), 3, 3))
     of_u = axes.covariance[first, :2, :2] / count[:, None, None]
     covariance[:, :2, :2] = onto @ of_u @ np.swapaxes(onto, 1, 2)
-    covariance[:, 2, 2] = measurements.sigma_q**2
+    covariance[:, 2, 2] = measurements.sigma_q[j] ** 2
     return LegDirections(
         group=v * measurements.n_poses + k,
         view=v,

@@ -593,7 +593,6 @@ class _Search:
             setting=task.setting,
             noise=predictor.noise,
             sigma_q=predictor.sigma_q,
-            sigma_by_joint=predictor.sigma_by_joint,
             views=_named(views, task),
             value=value,
             error=None if self.work is None else self.work.error(covariance),

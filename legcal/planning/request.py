@@ -16,7 +16,7 @@ from legcal.calibration.joint_fit.predicted import (
     read_noise,
 )
 from legcal.data.dataset import Dataset, load_dataset, rows_with_image
-from legcal.data.reading_units import sigmas_of
+from legcal.data.reading_units import sigmas_of, sigmas_of_legs
 from legcal.errors import DatasetError, ModelError, NotIdentifiable, Problem, UsageError
 from legcal.geometry.types import Array
 from legcal.machine.configurations import poses_at
@@ -147,15 +147,10 @@ def plan(
         selected_camera = sample_camera() if shot is None else shot.measurements.views[0].camera
     else:
         selected_camera = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-    usual_q = SIGMA_READING * machine.size
-    sigma_q, sigma_by_joint = usual_q, dict[str, float]()
-    if encoder_sigma is not None:
-        sigma_by_joint = sigmas_of(encoder_sigma, machine.legs)
-        sliding = [str(leg.prismatic) for leg in machine.legs if not leg.reads_angle]
-        sigma_q = min((s for name, s in sigma_by_joint.items() if name in sliding), default=usual_q)
-    elif shot is not None:
+    stated = {} if encoder_sigma is None else sigmas_of(encoder_sigma, machine.legs)
+    sigma_q = sigmas_of_legs(machine.legs, SIGMA_READING * machine.size, stated)
+    if shot is not None and encoder_sigma is None:
         sigma_q = shot.measurements.sigma_q
-        sigma_by_joint = dict(shot.measurements.sigma_by_joint)
     predicted_noise = noise if isinstance(noise, PredictedNoise) else read_noise(Path(noise))
     choices, scale_notes = Choices.by_tolerances(machine, only), tuple[str, ...]()
     if only is None:
@@ -164,7 +159,7 @@ def plan(
     if laid is not None:
         parse_board(board_document(laid), Path("--board"))  # as a dataset does
     task = Task(
-        Predictor(machine, selected_camera, predicted_noise, sigma_q, choices, sigma_by_joint),
+        Predictor(machine, selected_camera, predicted_noise, sigma_q, choices),
         n_images,
         n_views,
         setting,

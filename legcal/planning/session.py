@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,7 +25,7 @@ from legcal.calibration.joint_fit.predicted import PredictedNoise
 from legcal.calibration.summary import mm_deg
 from legcal.data.dataset import PLAN_NAME, POSES_NAME
 from legcal.data.dataset_file import dataset_texts
-from legcal.data.reading_units import sigmas_of_legs
+from legcal.data.reading_units import stated_sigma
 from legcal.files.folder import (
     OutputKind,
     check_destination,
@@ -113,13 +113,13 @@ def _dataset(plan: Plan, model: str) -> dict[str, str]:
         views[view.name] = entry
     if plan.hand_held:
         views = {HAND: {"camera": CAMERA, "hand_held": True}}
-    motors = list(plan.machine.motors)
+    motors, sigma = list(plan.machine.motors), stated_sigma(plan.machine.legs, plan.sigma_q)
     rows = [
         [name, image, label, *plan.views[v].poses.readings[k, motors].tolist()]
         for name, image, label, v, k in images_of(plan)
     ]
     board = {} if plan.board is None else {"board": board_document(plan.board.board)}
-    return dataset_texts(plan.machine, model, views, rows, _encoder_sigma(plan), board)
+    return dataset_texts(plan.machine, model, views, rows, sigma, board)
 
 
 def rough_view(
@@ -133,16 +133,6 @@ def rough_view(
     if legs is not None and len(legs) < machine.n_legs:
         entry["legs"] = list(legs)
     return entry
-
-
-def _encoder_sigma(plan: Plan) -> float | dict[str, float]:
-    """Return the standard deviation of readings [m], by motor [m or rad] where they differ."""
-    legs = [plan.machine.legs[j] for j in plan.machine.motors]
-    sigma = sigmas_of_legs(legs, plan.sigma_q, plan.sigma_by_joint).tolist()
-    sigma_of_motor = {str(leg.prismatic): value for leg, value in zip(legs, sigma, strict=True)}
-    if any(leg.reads_angle for leg in legs) or set(sigma_of_motor.values()) - {plan.sigma_q}:
-        return sigma_of_motor
-    return plan.sigma_q
 
 
 def settings_in_words(machine: Machine, q: Array, digits: int = 3) -> tuple[str, ...]:
@@ -216,7 +206,7 @@ class Plan:
     camera: Camera
     setting: Setting
     noise: PredictedNoise
-    sigma_q: float  # [m] of a reading of a motor that slides
+    sigma_q: Array  # (n_legs,) standard deviations of readings [m or rad]
     views: tuple[PlannedView, ...]  # of a camera in the hand, every image is one
     # The criterion as planned: the mean error of the platform over the workspace [m], or where
     # readings do not give its pose, the determinant's root
@@ -236,7 +226,6 @@ class Plan:
     given: str = ""  # the dataset that the plan extends
     n_given: int = 0  # number of its photographs
     notes: tuple[str, ...] = ()
-    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     parts: tuple[PartSigma, ...] = ()  # what is expected of parts, with tolerances as priors
     only: Group | None = None  # the group of parts asked for
 

@@ -139,9 +139,8 @@ class GuidedSession:
             self._planned = _cells(path)[1]
             units = self.dataset.units
             whole, _ = measurement_table(path, units)
-            planned, _ = measurements_in(
-                whole, self.folder, m.views, self.machine.legs, m.sigma_q, m.sigma_by_joint, units
-            )
+            legs = self.machine.legs
+            planned, _ = measurements_in(whole, self.folder, m.views, legs, m.sigma_q, units)
         done = {_label(cells) for cells in self._cells}
         self._left = [
             (cells, planned.q[k])
@@ -440,9 +439,7 @@ class GuidedSession:
     def _task(self) -> Task:
         m, board = self.dataset.measurements, self.dataset.board_on("base")
         lengths, _ = measured_length(self.machine, board=board is not None)
-        predictor = Predictor(
-            self.machine, m.views[0].camera, DEFAULT_NOISE, m.sigma_q, lengths, m.sigma_by_joint
-        )
+        predictor = Predictor(self.machine, m.views[0].camera, DEFAULT_NOISE, m.sigma_q, lengths)
         return Task(predictor, 1, 1, default_setting(self.machine))
 
     @cached_property

@@ -19,7 +19,7 @@ from legcal.data.dataset import CORNERS_NAME, OBSERVATIONS_NAME, PLAN_NAME
 from legcal.data.dataset_file import dataset_texts
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import join_outlines, write_observations
-from legcal.data.reading_units import sigma_too_large
+from legcal.data.reading_units import sigma_too_large, stated_sigma
 from legcal.errors import UsageError
 from legcal.files.folder import (
     OutputKind,
@@ -314,7 +314,7 @@ def write_session(
     blocks = {} if board is None else {"board": board}
     if lengths:
         blocks["parameters"] = {"lengths": dict(lengths)}
-    sigma = dict(m.sigma_by_joint) or m.sigma_q
+    sigma = stated_sigma(machine.legs, m.sigma_q)
     for name, text in dataset_texts(machine, model, views, rows, sigma, blocks, columns).items():
         (folder / name).write_text(text, encoding="utf-8")
 

@@ -22,6 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import PLAN_NAME, load_dataset
 from legcal.data.measurements import Measurements, View
+from legcal.data.reading_units import sigmas_of_legs
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
 from legcal.files.reading import read_json
@@ -360,6 +361,8 @@ def _recorded(
         else:
             errors += size * rngs["readings"].normal(size=q.shape)
     q = q + errors[:, list(truth.reads)]
+    stated = {str(truth.legs[j].prismatic): spreads[j].sigma for j in truth.motors}
+    sigma = np.maximum(sigmas_of_legs(truth.legs, settings.encoder_sigma, stated), _MIN_SIGMA_Q)
     names = [""] * len(images)
     if photographs:
         repeated, suffix = int(images.repeat.max()) > 0, settings.appearance.pipeline.suffix
@@ -374,12 +377,7 @@ def _recorded(
         view=images.view,
         pose=pose.astype(np.intp),
         q=q[images.pose],
-        sigma_q=max(settings.encoder_sigma, _MIN_SIGMA_Q),
-        sigma_by_joint={
-            str(truth.legs[j].prismatic): max(spreads[j].sigma, _MIN_SIGMA_Q) for j in truth.motors
-        }
-        if any(a.turns for a in truth.actuators)
-        else {},
+        sigma_q=sigma,
         pose_labels=tuple(labels[p] for p in visible_poses),
         time=np.asarray(_SECONDS_A_POSE * images.pose + images.repeat, dtype=np.float64),
     )

@@ -80,7 +80,8 @@ def _session(machine: Machine, given: str | Path, result: EarlierResult | None) 
     if result is not None and os.path.isfile(result.folder / OBSERVATIONS_NAME):
         outlines, _ = read_observed(result.folder, dataset.machine, dataset.measurements)
     order = [names.index(name) for name in machine.leg_names]
-    measurements = replace(dataset.measurements, q=dataset.measurements.q[:, order])
+    m = dataset.measurements
+    measurements = replace(m, q=m.q[:, order], sigma_q=m.sigma_q[order])
     return replace(dataset, measurements=measurements, observations=outlines)
 
 

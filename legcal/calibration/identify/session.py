@@ -31,6 +31,7 @@ from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, join_outlines
+from legcal.data.reading_units import sigmas_of_legs
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
@@ -97,7 +98,7 @@ class Session:
     pose: IntArray
     seen: BoolArray  # (n_views, n_legs): the legs that each view shows
     cameras: tuple[View, ...]  # of each view, where it stands in R_b
-    sigma_q: float  # standard deviation of a reading [m]
+    sigma_q: Array  # (n_legs,) standard deviations of readings [m or rad]
     unread: BoolArray  # (k, n_legs): which readings are missing
     # (n_views,): the views whose images show a calibration board on the base: how these cameras
     # stand to each other is known
@@ -106,7 +107,6 @@ class Session:
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     boards: Mapping[Link, Board] = field(default_factory=dict)  # those whose dimensions are known
     home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
-    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
     occluders: tuple[Occluder, ...] = ()  # solids of legs; bodies among them have edges
     # outlines and edges of bodies that are there; without them those that are predicted
     found: Outlines | None = None
@@ -180,7 +180,6 @@ class Session:
             pose=self.pose,
             q=q[self.pose],
             sigma_q=self.sigma_q,
-            sigma_by_joint=self.sigma_by_joint,
         )
 
     def contributions(
@@ -358,7 +357,7 @@ def planned_session(
         pose=np.arange(n_poses),
         seen=seen,
         cameras=default_cameras(A, B, views, machine.spatial, rng, hand_held=hand_held),
-        sigma_q=SIGMA_READING * machine.size,
+        sigma_q=sigmas_of_legs(machine.legs, SIGMA_READING * machine.size),
         unread=np.zeros((n_poses, len(legs)), dtype=np.bool_),
         board=np.full(len(views), board, dtype=np.bool_),
         platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
@@ -447,7 +446,6 @@ def recorded_session(
         seen=seen,
         cameras=cameras,
         sigma_q=m.sigma_q,
-        sigma_by_joint=m.sigma_by_joint,
         unread=np.isnan(m.q_of_poses),
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),

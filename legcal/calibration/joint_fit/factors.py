@@ -622,7 +622,7 @@ def observed_readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     is_read = [leg.kind is LegKind.ACTUATED or j in first for j, leg in enumerate(legs.nominal)]
     leg, pose = np.nonzero((np.isfinite(q) & is_read).T)
     sign = np.where(on < 0, legs.sign, 1)[leg].astype(np.float64)
-    sigma = measurements.sigma_of(legs.nominal)[leg]
+    sigma = measurements.sigma_q[leg]
     motors = np.array([nominal.motor_label for nominal in legs.nominal], dtype=object)
     own = measurements.own_zeros
     has = [(motors == one.motor)[leg] & one.rows[measurements.first_rows][pose] for one in own]

@@ -19,7 +19,7 @@ such errors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -202,9 +202,8 @@ class Predictor:
     machine: Machine
     camera: Camera
     noise: PredictedNoise
-    sigma_q: float  # of a reading [m]
+    sigma_q: Array  # (n_legs,) of readings [m or rad]
     choices: Choices = NO_CHOICES
-    sigma_by_joint: Mapping[str, float] = field(default_factory=dict)  # where stated [m or rad]
 
     @cached_property
     def legs(self) -> FittedLegs:
@@ -235,7 +234,6 @@ class Predictor:
             pose=np.arange(n, dtype=np.intp),
             q=readings_at(shown, *Frames.of(poses)),
             sigma_q=self.sigma_q,
-            sigma_by_joint=self.sigma_by_joint,
         )
         T_base_Rb = self.machine.T_base_Rb
         if edges is None:
