@@ -25,6 +25,7 @@ from legcal.calibration.joint_fit.platform import expected_error, platform_by_pa
 from legcal.calibration.joint_fit.predicted import (
     PredictedNoise,
     Predictor,
+    fitted_covariance,
     read_noise,
 )
 from legcal.calibration.pipeline import chosen_parameters
@@ -96,7 +97,8 @@ def by_identify(calibration: Calibration, noise: PredictedNoise) -> float:
     session = replace(
         session, R=R, t=t, cameras=cameras, found=solution.outlines, found_edges=solution.edges
     )
-    return size(calibration, session.legs, Analysis(session, choices_of(dataset), noise).covariance)
+    found = Analysis(session, choices_of(dataset), noise)
+    return size(calibration, session.fitted.nominal, found.covariance)
 
 
 def by_plan(calibration: Calibration, noise: PredictedNoise) -> float:
@@ -119,8 +121,9 @@ def by_plan(calibration: Calibration, noise: PredictedNoise) -> float:
         parts.append(
             predictor.contributions({"here": T}, view, poses, outlines, solution.legs, edges)
         )
-    covariance = predictor.covariance(parts, solution.T_Rb_Re, solution.legs)
-    return size(calibration, predictor.legs.nominal, covariance)
+    size_of_machine, legs = dataset.machine.size, predictor.legs
+    covariance = fitted_covariance(parts, legs, solution.T_Rb_Re, size_of_machine, solution.legs)
+    return size(calibration, legs.nominal, covariance)
 
 
 def predictor_of(calibration: Calibration, noise: PredictedNoise) -> Predictor:

@@ -17,7 +17,7 @@ from legcal.calibration.identify.identifiability import Analysis, identifiabilit
 from legcal.calibration.identify.session import planned_session
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, possible_biases
 from legcal.calibration.joint_fit.parameter_choices import Choices
-from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor
+from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor, fitted_covariance
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.variables import Start
 from legcal.calibration.ordered_dataset import nominal_poses
@@ -259,7 +259,7 @@ def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) ->
     stated = np.sqrt(np.diagonal(alone + moved @ moved.T)[:n])
     assert np.any(stated > 1.2 * np.sqrt(np.diagonal(alone)[:n]))
 
-    found = Analysis(session, choices, noise).covariance
+    found = Analysis(session, choices, noise).covariance[problem.free][:, problem.free]
     np.testing.assert_allclose(np.sqrt(np.diagonal(found)), stated, rtol=0.01)
     planned = Predictor(machine, session.cameras[0].camera, noise, session.sigma_q, choices)
     parts = []
@@ -271,5 +271,6 @@ def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) ->
         )
         at_poses, view = [poses[k] for k in row], {"c": machine.T_base_Rb * T}
         parts.append(planned.contributions(view, alike, at_poses, rods, edges=bodies))
-    found = planned.covariance(parts, poses)[problem.free][:, problem.free]
+    found = fitted_covariance(parts, planned.legs, poses, machine.size)
+    found = found[problem.free][:, problem.free]
     np.testing.assert_allclose(np.sqrt(np.diagonal(found)), stated, rtol=0.02)

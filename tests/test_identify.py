@@ -244,7 +244,7 @@ def test_arms_tell_of_motors_but_not_of_the_scale(tmp_path: Path) -> None:
     with_arms, without = (
         Analysis(planned_session(m, [range(6)] * 2, 15)) for m in (machine, model("delta"))
     )
-    sigma, other = (a.motion.sigma(a.covariance) for a in (with_arms, without))
+    sigma, other = (a.platform_sigma for a in (with_arms, without))
     assert sigma is not None
     assert other is not None
     assert 0.5 * other.dX_m < sigma.dX_m < 0.9 * other.dX_m

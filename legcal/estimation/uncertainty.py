@@ -464,15 +464,10 @@ def scores_of_block(linear: Linearization[Any, Any], name: str) -> tuple[Array, 
 _UNKNOWN = 1e-3  # [1 / unit]: singular values up to here count as undetermined unknowns
 
 
-def marginal_rows(rows: Array, shifts: Array, which: IntArray) -> tuple[Array, Array]:
-    """Marginalise out all unknowns of rows (m, n) but *which*; return k rows (k, c) by these.
-
-    *shifts* (m, s) are changes of the rows; what the unknowns leave of them is returned, (k, s).
-    """
+def marginal_rows(rows: Array, which: IntArray) -> Array:
+    """Marginalise out all unknowns of rows (m, n) but *which*; return rows (c, c)."""
     others = np.setdiff1d(np.arange(rows.shape[1]), which)
-    every = np.hstack([rows[:, np.append(others, which)], shifts])
-    left = compress(eliminate(every[None], len(others)))
-    return left[:, : len(which)], left[:, len(which) :]
+    return compress(eliminate(rows[None][:, :, np.append(others, which)], len(others)))
 
 
 def eliminate(
@@ -497,8 +492,7 @@ def eliminate(
     left, singular, _ = np.linalg.svd(upper[:, :n_nuisance, :n_nuisance])
     rotated = np.swapaxes(left, 1, 2) @ upper[:, :n_nuisance, n_nuisance:]
     lower = upper[:, n_nuisance:, n_nuisance:]
-    n_lower = lower.shape[0] * lower.shape[1]
-    return np.concatenate([rotated[singular <= _UNKNOWN], lower.reshape(n_lower, n_shared)])
+    return np.concatenate([rotated[singular <= _UNKNOWN], lower.reshape(-1, n_shared)])
 
 
 def compress(rows: Array) -> Array:

@@ -20,6 +20,7 @@ from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.calibration.joint_fit.predicted import (
     Contributions,
     Predictor,
+    fitted_covariance,
     predicted_outlines,
 )
 from legcal.errors import NotIdentifiable, NotVisible
@@ -178,7 +179,7 @@ class Task:
         if not len(seen.leg) or not np.any(with_board):
             return None
         predictor = self.predictor
-        outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp), predictor.noise)
+        outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp))
         if found is not None:
             outlines = outlines.choose(found[outlines.row, outlines.leg])
         view = np.zeros(n, dtype=np.intp)
@@ -652,4 +653,5 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
         if added is not None:
             parts.append(added)
             every_pose += poses
-    return task.predictor.covariance(parts, every_pose, scene.legs)
+    legs = task.predictor.legs
+    return fitted_covariance(parts, legs, every_pose, machine.size, scene.legs)

@@ -28,6 +28,7 @@ from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     Contributions,
     Predictor,
+    fitted_covariance,
 )
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.causes import Cause
@@ -432,8 +433,8 @@ class GuidedSession:
         if not taken or self._work is None:
             return None
         poses = [pose for _, _, of_view, _ in taken for pose in of_view]
-        covariance = self._task.predictor.covariance([added for _, added, _, _ in taken], poses)
-        return self._work.error(covariance)
+        parts, legs = [added for _, added, _, _ in taken], self._task.predictor.legs
+        return self._work.error(fitted_covariance(parts, legs, poses, self.machine.size))
 
     @cached_property
     def _task(self) -> Task:

@@ -27,7 +27,6 @@ from legcal.calibration.identify.session import (
     planned_session,
     recorded_session,
 )
-from legcal.calibration.joint_fit.determinacy import covariance_as_stated
 from legcal.calibration.joint_fit.parameter_choices import (
     NO_CHOICES,
     Choices,
@@ -35,20 +34,23 @@ from legcal.calibration.joint_fit.parameter_choices import (
     choices_of,
 )
 from legcal.calibration.joint_fit.part_errors import PartSigma, predicted_sigmas, sigmas_in_words
-from legcal.calibration.joint_fit.platform import expected_error, moved_by
+from legcal.calibration.joint_fit.platform import (
+    expected_error,
+    moved_by,
+    platform_by_parameters,
+)
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
     WHITE,
     Contributions,
     PredictedNoise,
-    fitted_machine,
+    fitted_covariance,
     read_noise,
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
 from legcal.data.outlines import join_outlines
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.estimation.problem import Frames
 from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
@@ -128,42 +130,40 @@ class Analysis:
     @cached_property
     def information(self) -> Array:
         """The joint fit: rows by parameters, (p, p)."""
-        return self._information_and_shifts[0]
-
-    @cached_property
-    def _information_and_shifts(self) -> tuple[Array, Array]:
-        return self.of_parameters(*self.contributions.every_row, self.contributions.basis)
+        contributions = self.contributions
+        rows = np.concatenate([contributions.all_gains(), contributions.known])
+        return self.of_parameters(rows, contributions.basis)
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance (p, p) of the parameters along determined directions, as stated later."""
-        session, (rows, shifts) = self.session, self._information_and_shifts
-        left, singular, basis = np.linalg.svd(rows, full_matrices=False)
-        seen = singular > _limit(session)
-        half = session.unit[:, None] * basis[seen].T / singular[seen]
-        return covariance_as_stated(
-            half @ half.T,
-            half @ (left[:, seen].T @ shifts),
-            session.legs,
-            session.parametrization,
-            session.frame_legs,
-            Frames(session.R_reached, session.t_reached).motions,
-            session.mean_length,
+        """The covariance of all parameters of the fit that a calibration would state."""
+        session = self.session
+        found = session.contributions(self.choices, self.noise, known_length=session.mean_length)
+        return fitted_covariance([found], session.fitted, session.reached, session.mean_length)
+
+    @property
+    def platform_sigma(self) -> RmsMotion | None:
+        """The predicted error of the platform; None where readings do not determine its pose."""
+        fitted, session = self.session.fitted, self.session
+        if self.motion.by_metres is None:
+            return None
+        by_parameters = platform_by_parameters(
+            fitted.nominal, fitted.parametrization, session.frame_legs, session.reached
         )
+        return RmsMotion(*expected_error(by_parameters, self.covariance).rms)
 
     @cached_property
     def parts(self) -> tuple[PartSigma, ...]:
         """What is expected of the parts, with tolerances as priors; () without these."""
         if self.choices.built is None:
             return ()
-        S, moved = fitted_machine([self.contributions])
-        return predicted_sigmas(self.session.fitted, self.choices, S + moved @ moved.T)
+        return predicted_sigmas(self.session.fitted, self.choices, self.covariance)
 
-    def of_parameters(self, rows: Array, shifts: Array, basis: Array) -> tuple[Array, Array]:
-        """Return information rows (k, p) by parameters in metres, and how errors move them (k, s).
+    def of_parameters(self, rows: Array, basis: Array) -> Array:
+        """Return information rows (p, p) by parameters in metres.
 
-        *rows* (m, n), which *shifts* (m, s) move, begin with the coordinates of the machine, of
-        which *basis* are the derivatives of parameters.
+        *rows* (m, n) begin with the coordinates of the machine, of which *basis* are the
+        derivatives of parameters.
         """
         session = self.session
         number = {name: i for i, name in enumerate(session.fitted.parametrization.names)}
@@ -172,12 +172,10 @@ class Analysis:
         free = np.flatnonzero(by_coordinates.any(axis=0))
         k, (Q, S) = len(free), np.linalg.qr(by_coordinates[:, free], mode="complete")
         # Fixed parameters, and what the mechanism ties, are known exactly.
-        known = Q[:, k:].T / (_EXACT * session.mean_length)
-        rows, shifts = marginal_rows(rows, shifts, free)
-        rows = np.linalg.solve(S[:k].T, rows.T).T @ Q[:, :k].T
-        shifts = np.pad(shifts, ((len(known), 0), (0, 0)))
-        every = compress(np.hstack([np.concatenate([known, rows]), shifts]))
-        return every[:, : len(Q)], every[:, len(Q) :]
+        known = [Q[:, k:].T / (_EXACT * session.mean_length)]
+        if k:
+            known.append(np.linalg.solve(S[:k].T, marginal_rows(rows, free).T).T @ Q[:, :k].T)
+        return compress(np.concatenate(known))
 
     @cached_property
     def motion(self) -> PlatformMotion:
@@ -215,13 +213,6 @@ class PlatformMotion:
             self.why_not = str(error)
             return
         self.by_metres = moved * session.unit
-
-    def sigma(self, covariance: Array) -> RmsMotion | None:
-        """Return the standard deviation of the platform for a covariance (p, p) of parameters."""
-        if self.by_metres is None:
-            return None
-        by_parameters = self.by_metres / self.session.unit
-        return RmsMotion(*expected_error(by_parameters, covariance).rms)
 
     def split(self, basis: Array) -> tuple[Array, Array]:
         """Split a space (w, p) into directions that move the platform and harmless ones."""
@@ -348,14 +339,13 @@ def _information(
     Lines of arms have stated priors only.
     """
     found = analysis.without_radii
-    rows, _ = found.every_row
+    rows = np.concatenate([found.all_gains(), found.known])
     column = {name.removeprefix("radii "): i for i, name in enumerate(found.names)}
     known = [name for name in sigma_radii if name in column]
     prior = np.zeros((len(known), rows.shape[1]))
     for row, name in zip(prior, known, strict=True):
         row[column[name]] = 1.0 / sigma_radii[name]
-    rows = np.concatenate([rows, prior])
-    return analysis.of_parameters(rows, np.zeros((len(rows), 0)), found.basis)[0]
+    return analysis.of_parameters(np.concatenate([rows, prior]), found.basis)
 
 
 def _stated_radii(analysis: Analysis) -> dict[str, float]:
@@ -621,7 +611,7 @@ def _report_on(
         images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
         board=bool(session.board.all()),
         platform_board=len(on_platform) == session.n_views,
-        platform_sigma=analysis.motion.sigma(analysis.covariance) if full.complete else None,
+        platform_sigma=analysis.platform_sigma if full.complete else None,
         remedies=() if full.complete else find_remedies(analysis, replanned),
         notes=tuple(notes),
         scale_is_open=bool(session.actuators) and is_scale_open(analysis),

@@ -128,6 +128,11 @@ class Session:
         places = (view.T_base_camera for view in self.cameras)
         return tuple(T for T in places if T is not None)
 
+    @property
+    def reached(self) -> tuple[RigidTransform, ...]:
+        """The poses T_Rb_Re over which errors of the platform are judged."""
+        return Frames(self.R_reached, self.t_reached).motions
+
     @cached_property
     def fitted(self) -> FittedLegs:
         """The legs as the joint fit takes them; a leg without any visible part has a thin rod."""
@@ -157,7 +162,7 @@ class Session:
             pose = self.pose[row]
             bodies = Bodies.at(self.fitted.nominal, self.R[pose], self.t[pose], self.mean_length)
             seen = visible_parts(view.camera, self.places[v], bodies, stated=self.seen[v])
-            tables.append(predicted_outlines(seen, row, DEFAULT_NOISE))
+            tables.append(predicted_outlines(seen, row))
         return join_outlines(tables)
 
     @cached_property
@@ -186,6 +191,7 @@ class Session:
         self,
         choices: Choices,
         noise: PredictedNoise = DEFAULT_NOISE,
+        known_length: float | None = None,  # of weak priors
     ) -> Contributions:
         """Return the information of the joint fit of these images."""
         board, T_link_board = self._corners()
@@ -205,6 +211,7 @@ class Session:
             choices,
             board=board,
             edges=self.edges,
+            known_length=known_length,
         )
 
     def _corners(self) -> tuple[BoardCorners | None, dict[Link, RigidTransform]]:

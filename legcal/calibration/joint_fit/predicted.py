@@ -9,7 +9,7 @@ information. Unknowns have names, those of a view begin with its name; unknown k
 are coordinates inside what the mechanism ties.
 
 **Errors that no fit knows**, of edges at places and of bodies in a view, move its result; their
-effect adds to the covariance (:func:`fitted_machine`). To choose images that would need
+effect adds to the covariance (:func:`fitted_covariance`). To choose images that would need
 all others: photographs of one *site*, with all legs where others of them have theirs, count as
 sharing errors at places, so that the second tells less than the first. In rows that make shared
 errors of variances s^2 independent, n photographs tell n / (1 + n s^2) of what one would without
@@ -65,10 +65,10 @@ _WEAK, _WEAK_LENGTH = 1.0, 2.5
 _RANK = 1e-7  # of the largest singular value
 
 
-def predicted_outlines(seen: Seen, row: IntArray, noise: PredictedNoise) -> Outlines:
-    """Return the outlines of visible segments; *row* of each image."""
+def predicted_outlines(seen: Seen, row: IntArray) -> Outlines:
+    """Return the outlines of visible segments, each end known to a pixel; *row* of each image."""
     n = len(seen.leg)
-    outlines = Outlines(
+    return Outlines(
         row=np.repeat(row[seen.image], 2),
         leg=np.repeat(seen.leg, 2),
         part=tuple(part for part in seen.part for _ in EPSILON),
@@ -81,7 +81,6 @@ def predicted_outlines(seen: Seen, row: IntArray, noise: PredictedNoise) -> Outl
         source=("detected",) * (2 * n),
         **unmeasured(2 * n),
     )
-    return noise.of(outlines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +118,6 @@ class Contributions:
         rows = self.gains(np.arange(len(order)), number)
         return rows.reshape(len(order) * rows.shape[1], rows.shape[2])
 
-    @property
-    def every_row(self) -> tuple[Array, Array]:
-        """All rows together, with those of no image, (q, m), and how errors move them, (q, c)."""
-        rows = self.all_gains()
-        moved = self.shifts.reshape(len(rows), self.shifts.shape[2])
-        moved = np.pad(moved, ((0, len(self.known)), (0, 0)))
-        return np.concatenate([rows, self.known]), moved
-
     def tied_by_board(self, T_base_camera: Mapping[str, RigidTransform]) -> Contributions:
         """Replace camera poses of views by the pose of a board on the base.
 
@@ -150,14 +141,14 @@ class Contributions:
         return replace(self, names=tuple(kept), rows=self.rows @ turn, known=self.known @ turn)
 
     def of_shared(self) -> Contributions:
-        """Eliminate the unknowns of single views."""
+        """Eliminate the unknowns of single views, without errors that a fit does not know."""
         is_own = np.array([": " in name for name in self.names])
         shared, with_own = np.flatnonzero(~is_own), self.known[:, is_own].any(axis=1)
-        known = self.known[~with_own][:, shared]
-        rows, shifts = marginal_rows(*replace(self, known=self.known[with_own]).every_row, shared)
-        names, site = tuple(self.names[i] for i in shared), np.zeros(1, dtype=np.intp)
+        rows = marginal_rows(np.concatenate([self.all_gains(), self.known[with_own]]), shared)
+        names, known = tuple(self.names[i] for i in shared), self.known[~with_own][:, shared]
+        nothing, site = np.zeros((1, len(rows), 0)), np.zeros(1, dtype=np.intp)
         no_errors = np.zeros((1, len(rows)))  # all rows count as those of one image
-        return Contributions(names, rows[None], known, self.basis, shifts[None], no_errors, site)
+        return Contributions(names, rows[None], known, self.basis, nothing, no_errors, site)
 
     def repeated(self, times: float) -> Contributions:
         """Return the information of *times* photographs in place of each one."""
@@ -179,10 +170,17 @@ def joined(parts: Sequence[Contributions]) -> tuple[list[IntArray], Array]:
     return columns, prior
 
 
-def fitted_machine(parts: Sequence[Contributions]) -> tuple[Array, Array]:
-    """Return the covariance (p, p) of all parameters by a fit to all images of several views.
+def fitted_covariance(
+    parts: Sequence[Contributions],
+    fitted: FittedLegs,
+    poses: Sequence[RigidTransform],  # T_Rb_Re
+    length: float,  # mean leg length [m]
+    legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
+) -> Array:
+    """Return the covariance (p, p) of all parameters that a fit to all images of views states.
 
-    And how errors that it does not know move them (p, c), by one standard deviation of each.
+    With errors that the fit does not know, as a calibration has them. Weak directions that hardly
+    move the platform at *poses* are held.
     """
     (columns, information), basis = joined(parts), parts[0].basis
     pulls = list[Array]()
@@ -192,7 +190,15 @@ def fitted_machine(parts: Sequence[Contributions]) -> tuple[Array, Array]:
         pulls.append(rows.T @ part.shifts.reshape(len(rows), part.shifts.shape[2]))
     by_all = basis @ np.linalg.inv(information)[: basis.shape[1]]
     moved = [by_all[:, at] @ pull for at, pull in zip(columns, pulls, strict=True)]
-    return by_all[:, : basis.shape[1]] @ basis.T, np.hstack(moved)
+    return covariance_as_stated(
+        by_all[:, : basis.shape[1]] @ basis.T,
+        np.hstack(moved),
+        fitted.nominal if legs is None else legs,
+        fitted.parametrization,
+        fitted.frame_legs,
+        poses,
+        length,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,24 +266,6 @@ class Predictor:
             edges=edges,
             to_choose=to_choose,
             known_length=self.machine.size,
-        )
-
-    def covariance(
-        self,
-        parts: Sequence[Contributions],
-        poses: Sequence[RigidTransform],
-        legs: Sequence[Leg] | None = None,
-    ) -> Array:
-        """Return the covariance (p, p) that a fit to all images of views, at *poses*, states."""
-        fitted, (S, moved) = self.legs, fitted_machine(parts)
-        return covariance_as_stated(
-            S,
-            moved,
-            fitted.nominal if legs is None else legs,
-            fitted.parametrization,
-            fitted.frame_legs,
-            poses,
-            self.machine.size,
         )
 
 
