@@ -41,7 +41,7 @@ from legcal.calibration.joint_fit.outline_errors import (
 )
 from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
-from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fitted_legs
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
@@ -306,9 +306,59 @@ def information_of_images(
     )
     biases = possible_biases(problem.outlines, legs.names)
     problem = problem.with_biases(biases.of_sizes(with_gamma(np.append(noise.common_px, 0.0))))
-    state = problem.begin(start)
-    images = _Images(problem.weighted(NoiseModel()), state, noise)
-    return images.contributions(measurements.view_names, known_length, to_choose=to_choose)
+    problem, state = problem.weighted(NoiseModel()), problem.begin(start)
+    linear, n = linearize(problem, state), problem.n_elements
+    tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
+    shifts = _unknown_errors(problem, noise, to_choose=to_choose)
+    n_shifts = shifts["outlines"].shape[2]
+    blocks, is_outline, known = [], [], [linear.prior_J]
+    for factor in problem.factors:
+        if not factor.n:
+            continue
+        found, where = linear[factor.name], problem.sparsity[factor.name]
+        q = found.r.shape[1]
+        J = np.zeros((factor.n, q, problem.n_kept + 1))
+        at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]
+        np.add.at(J, (*at, where.index[:, None, :]), found.J)
+        if factor.element is None:
+            known.append(J[..., :-1].reshape(-1, problem.n_kept))
+            continue
+        moved = shifts.get(factor.name, np.zeros((factor.n, q, n_shifts)))
+        every = np.concatenate([found.J_element, J[..., :-1], moved], axis=2)
+        every *= np.sqrt(problem.loss.efficiency(q)) if factor.robust else 1.0
+        blocks.append(_by_element(every, factor.element, n))
+        is_outline += [factor.name == "outlines"] * blocks[-1].shape[1]
+    stacked = np.concatenate(blocks, axis=1)
+    n_own = stacked.shape[2] - problem.n_kept - n_shifts
+    own, kept, moved = np.split(stacked, [n_own, n_own + problem.n_kept], axis=2)
+    if tangent is not None:
+        kept = kept + np.einsum("krd,mkd->krm", own, tangent.Q)
+        own = own @ tangent.Z
+    U, s, _ = np.linalg.svd(own, full_matrices=False)
+    U = U * (s > _RANK * s[:, :1])[:, None]
+    kept = _without(U, kept)
+    at_site, site = np.zeros(kept.shape[:2]), np.arange(n)
+    if not to_choose:
+        moved = _without(U, moved)
+    else:
+        if any(noise.places_px):
+            at_site, kept = _apart(kept, U, moved, np.array(is_outline))
+            site = _sites(problem.outlines, n)
+        moved = moved[..., :0]
+    names = _names(problem, measurements.view_names)
+    if known_length is not None:
+        known.append(_weak_rows(problem, np.concatenate(known), known_length))
+    k, untied = problem.n_kinematic, np.eye(problem.n_kinematic)
+    if problem.parameters.n_tied:
+        untied = null_space(problem.parameters.tie_rows(state.legs)[1])
+    basis = np.zeros((len(problem.free), untied.shape[1]))
+    # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
+    basis[problem.free] = problem.jacobian(state)[:k, :k] @ untied
+    turn = block_diag(untied, np.eye(problem.n_kept - k))
+    named = *(f"machine {i}" for i in range(untied.shape[1])), *names[k:]
+    return Contributions(
+        named, kept @ turn, np.concatenate(known) @ turn, basis, moved, at_site, site
+    )
 
 
 def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
@@ -323,85 +373,19 @@ def _as_calibrated(legs: FittedLegs, choices: Choices) -> Choices:
     return replace(choices, priors=usual | dict(choices.priors))
 
 
-@dataclass(frozen=True, eq=False)
-class _Images:
-    """The joint fit at images, to be linearised."""
+def _unknown_errors(
+    problem: FitProblem, noise: PredictedNoise, *, to_choose: bool
+) -> dict[str, Array]:
+    """Return how errors that a fit does not know move whitened rows (n, q, c), by their factor.
 
-    problem: FitProblem
-    state: State
-    noise: PredictedNoise
-
-    def contributions(
-        self, views: Sequence[str], known_length: float | None, *, to_choose: bool
-    ) -> Contributions:
-        """Return the whitened rows of every image, and the priors of all unknowns."""
-        problem, state = self.problem, self.state
-        linear, n = linearize(problem, state), problem.n_elements
-        tangent = problem.constraint.tangent(problem, state) if problem.constraint else None
-        shifts = self._shifts(to_choose=to_choose)
-        n_shifts = shifts["outlines"].shape[2]
-        blocks, is_outline, known = [], [], [linear.prior_J]
-        for factor in problem.factors:
-            if not factor.n:
-                continue
-            found, where = linear[factor.name], problem.sparsity[factor.name]
-            q = found.r.shape[1]
-            J = np.zeros((factor.n, q, problem.n_kept + 1))
-            at = np.arange(factor.n)[:, None, None], np.arange(q)[None, :, None]
-            np.add.at(J, (*at, where.index[:, None, :]), found.J)
-            if factor.element is None:
-                known.append(J[..., :-1].reshape(-1, problem.n_kept))
-                continue
-            moved = shifts.get(factor.name, np.zeros((factor.n, q, n_shifts)))
-            every = np.concatenate([found.J_element, J[..., :-1], moved], axis=2)
-            every *= np.sqrt(problem.loss.efficiency(q)) if factor.robust else 1.0
-            blocks.append(_by_element(every, factor.element, n))
-            is_outline += [factor.name == "outlines"] * blocks[-1].shape[1]
-        stacked = np.concatenate(blocks, axis=1)
-        n_own = stacked.shape[2] - problem.n_kept - n_shifts
-        own, kept, moved = np.split(stacked, [n_own, n_own + problem.n_kept], axis=2)
-        if tangent is not None:
-            kept = kept + np.einsum("krd,mkd->krm", own, tangent.Q)
-            own = own @ tangent.Z
-        U, s, _ = np.linalg.svd(own, full_matrices=False)
-        U = U * (s > _RANK * s[:, :1])[:, None]
-        kept = _without(U, kept)
-        at_site, site = np.zeros(kept.shape[:2]), np.arange(n)
-        if not to_choose:
-            moved = _without(U, moved)
-        else:
-            if any(self.noise.places_px):
-                at_site, kept = _apart(kept, U, moved, np.array(is_outline))
-                site = _sites(problem.outlines, n)
-            moved = moved[..., :0]
-        names = _names(problem, views)
-        if known_length is not None:
-            known.append(_weak_rows(problem, np.concatenate(known), known_length))
-        k, untied = problem.n_kinematic, np.eye(problem.n_kinematic)
-        if problem.parameters.n_tied:
-            untied = null_space(problem.parameters.tie_rows(state.legs)[1])
-        basis = np.zeros((len(problem.free), untied.shape[1]))
-        # Steps of an axis count in its tangent plane, parameters as angles from the nominal one.
-        basis[problem.free] = problem.jacobian(state)[:k, :k] @ untied
-        turn = block_diag(untied, np.eye(problem.n_kept - k))
-        named = *(f"machine {i}" for i in range(untied.shape[1])), *names[k:]
-        return Contributions(
-            named, kept @ turn, np.concatenate(known) @ turn, basis, moved, at_site, site
-        )
-
-    def _shifts(self, *, to_choose: bool) -> dict[str, Array]:
-        """Return how errors that a fit does not know move whitened rows (n, q, c), by their factor.
-
-        By one standard deviation of each; to choose, of bias and tilt of each outline alone.
-        """
-        problem, o, sigma = self.problem, self.problem.outlines, np.array(self.noise.places_px)
-        if to_choose:
-            whitening = np.asarray(problem.factor("outlines").whitening)
-            return {"outlines": whitening @ (shifts_of_edges(len(o)) * sigma)}
-        at_places = shifts_at_places(o, np.full(len(o), sigma.any()))
-        return problem.unknown_errors(
-            at_places * np.repeat(sigma, at_places.shape[2] // len(sigma))
-        )
+    By one standard deviation of each; to choose, of bias and tilt of each outline alone.
+    """
+    o, sigma = problem.outlines, np.array(noise.places_px)
+    if to_choose:
+        whitening = np.asarray(problem.factor("outlines").whitening)
+        return {"outlines": whitening @ (shifts_of_edges(len(o)) * sigma)}
+    at_places = shifts_at_places(o, np.full(len(o), sigma.any()))
+    return problem.unknown_errors(at_places * np.repeat(sigma, at_places.shape[2] // len(sigma)))
 
 
 def _weak_rows(problem: FitProblem, known: Array, length: float) -> Array:
