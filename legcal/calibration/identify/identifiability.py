@@ -54,7 +54,6 @@ from legcal.errors import NotIdentifiable, UsageError
 from legcal.estimation.uncertainty import compress, marginal_rows
 from legcal.files.schema import closest
 from legcal.geometry.types import Array
-from legcal.machine.equations import pose_sensitivity
 from legcal.machine.files import DATASET_YAML
 from legcal.machine.inspection import singularity_note
 from legcal.machine.leg import ARMS, JointType, LegColumns, Link, ParameterId
@@ -96,16 +95,10 @@ class Analysis:
     session: Session
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
     noise: PredictedNoise = DEFAULT_NOISE
-    # From an analysis of the same machine; None: computed here
-    same_motion: PlatformMotion | None = None
-
-    def elsewhere(self, session: Session) -> Analysis:
-        """Analyse other images of the same machine."""
-        return Analysis(session, self.choices, self.noise, self.motion)
 
     def with_board(self, link: Link = "base") -> Analysis:
         """Analyse the same images with a board on a link in all of them."""
-        return self.elsewhere(self.session.with_board(link))
+        return replace(self, session=self.session.with_board(link))
 
     @cached_property
     def contributions(self) -> Contributions:
@@ -145,7 +138,7 @@ class Analysis:
     def platform_sigma(self) -> RmsMotion | None:
         """The predicted error of the platform; None where readings do not determine its pose."""
         fitted, session = self.session.fitted, self.session
-        if self.motion.by_metres is None:
+        if session.motion is None:
             return None
         by_parameters = platform_by_parameters(
             fitted.nominal, fitted.parametrization, session.frame_legs, session.reached
@@ -178,15 +171,10 @@ class Analysis:
         return compress(np.concatenate(known))
 
     @cached_property
-    def motion(self) -> PlatformMotion:
-        """Sensitivity of the platform to the parameters."""
-        return PlatformMotion(self.session) if self.same_motion is None else self.same_motion
-
-    @cached_property
     def full(self) -> Ranks:
         """The joint fit."""
         basis = undetermined(self.session, self.information)
-        weak = weak_directions(self.session, self.motion, basis)
+        weak = weak_directions(self.session, basis)
         session = self.session
         ties = session.fitted.ties.at(session.legs)
         by_metres = by_step(ties, session.parametrization.place) * session.unit
@@ -194,29 +182,9 @@ class Analysis:
         return Ranks(n_p - len(weak), n_p, weak)
 
 
-class PlatformMotion:
-    """Sensitivity of the platform to the parameters, over the poses of a session."""
-
-    def __init__(self, session: Session) -> None:
-        self.session = session
-        self.by_metres: Array | None = None
-        self.why_not = ""
-        try:
-            moved = pose_sensitivity(
-                session.legs,
-                session.parametrization,
-                session.frame_legs,
-                session.R_reached,
-                session.t_reached,
-            )
-        except NotIdentifiable as error:
-            self.why_not = str(error)
-            return
-        self.by_metres = moved * session.unit
-
-    def split(self, basis: Array) -> tuple[Array, Array]:
-        """Split a space (w, p) into directions that move the platform and harmless ones."""
-        return split_by_motion(self.by_metres, basis, self.session.mean_length, _HARMLESS)
+def _split(session: Session, basis: Array) -> tuple[Array, Array]:
+    """Split a space (w, p) into directions that move the platform and harmless ones."""
+    return split_by_motion(session.motion, basis, session.mean_length, _HARMLESS)
 
 
 def undetermined(
@@ -229,28 +197,25 @@ def undetermined(
     return np.asarray(basis[singular <= _limit(session, sigma)])
 
 
-def missing(session: Session, rows: Array, motion: PlatformMotion) -> int:
+def missing(session: Session, rows: Array) -> int:
     """Count the open directions of rows that move the platform."""
-    return len(motion.split(undetermined(session, rows))[0])
+    return len(_split(session, undetermined(session, rows))[0])
 
 
 def weak_directions(
     session: Session,  # where names and units come from
-    motion: PlatformMotion,
     basis: Array,  # (w, p): the space, in metres
 ) -> tuple[WeakDirection, ...]:
     """Describe the directions of a space, those that move the platform first."""
-    parts = motion.split(basis)
+    parts = _split(session, basis)
     return tuple(
-        _direction(session, motion, row, harmless)
+        _direction(session, row, harmless)
         for part, harmless in zip(parts, (False, True), strict=True)
         for row in sparse_basis(part)
     )
 
 
-def _direction(
-    session: Session, motion: PlatformMotion, row: Array, harmless: bool
-) -> WeakDirection:
+def _direction(session: Session, row: Array, harmless: bool) -> WeakDirection:
     """Describe a direction, scaled to a small largest component."""
     row = row / row[np.argmax(np.abs(row))]
     shown = np.flatnonzero(np.abs(row) > SHOWN)
@@ -258,8 +223,8 @@ def _direction(
     row = row * (_ERROR * session.mean_length)
     names = tuple(session.parametrization.names[i] for i in shown)
     dX_m, dE_rad = None, None
-    if motion.by_metres is not None:
-        dX_m, dE_rad = moved_by(motion.by_metres, row[:, None]).rms
+    if session.motion is not None:
+        dX_m, dE_rad = moved_by(session.motion, row[:, None]).rms
     return WeakDirection(
         describe_direction(names, session.leg_names),
         names,
@@ -583,7 +548,7 @@ def _report_on(
     on_platform = np.unique(session.view[np.flatnonzero(session.platform_board)])
     full = analysis.full
     notes = []
-    if analysis.motion.why_not:
+    if session.motion is None:
         reason = "the machine is singular at poses inside its travel"
         if not machine.is_determined:
             reason = machine.undetermined
@@ -591,7 +556,7 @@ def _report_on(
     notes += _machine_notes(machine)
     if full.complete:
         notes += _rough_notes(analysis)
-        if analysis.noise is DEFAULT_NOISE and analysis.motion.by_metres is not None:
+        if analysis.noise is DEFAULT_NOISE and session.motion is not None:
             notes.append(
                 f"Errors of outlines are {DEFAULT_NOISE.source}; --noise RESULT takes those of an "
                 "earlier result."
@@ -622,9 +587,9 @@ def _report_on(
 
 def _rough_notes(analysis: Analysis) -> list[str]:
     """Note on directions so uncertain that calibrate may reject the dataset."""
-    session, motion = analysis.session, analysis.motion
+    session = analysis.session
     rough = undetermined(session, analysis.information, _ROUGH)
-    harmful = [w for w in weak_directions(session, motion, rough) if not w.harmless]
+    harmful = [w for w in weak_directions(session, rough) if not w.harmless]
     if not harmful:
         return []
     direction = min((weak.direction for weak in harmful), key=len)
@@ -796,7 +761,7 @@ def find_remedies(
     images, more = int(np.bincount(analysis.session.view).min()), list[_Candidate]()
     if replanned is not None and images < _ENOUGH_IMAGES:
         text = f"take {_ENOUGH_IMAGES} images a view instead of {images}"
-        more = [(text, analysis.elsewhere(replanned(_ENOUGH_IMAGES)), ())]
+        more = [(text, replace(analysis, session=replanned(_ENOUGH_IMAGES)), ())]
     kinds: list[Iterable[_Candidate]] = [
         more,
         _further_cameras(analysis),
@@ -815,11 +780,11 @@ _Candidate = tuple[str, Analysis, Sequence[int]]
 
 def _score(analysis: Analysis, known: Sequence[int] = ()) -> tuple[int, int]:
     """Count the open directions with some parameters *known*, and those that move the platform."""
-    session, motion = analysis.session, analysis.motion
+    session = analysis.session
     extra = np.zeros((len(known), len(session.unit)))
     extra[np.arange(len(known)), list(known)] = _WELL_KNOWN / session.mean_length
     rows = np.concatenate([analysis.information, extra])
-    return len(undetermined(session, rows)), missing(session, rows, motion)
+    return len(undetermined(session, rows)), missing(session, rows)
 
 
 def _try_kind(kind: Iterable[_Candidate], before: int, n_parameters: int) -> list[Remedy]:
@@ -853,7 +818,7 @@ def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
         groups.sort(key=lambda legs: -len(weak & set(legs)))
         for legs in groups:
             named = legs_in_words(legs, session.leg_names)
-            more = analysis.elsewhere(_extended(session, legs))
+            more = replace(analysis, session=_extended(session, legs))
             yield f"add a camera position ({named})", more, ()
 
 

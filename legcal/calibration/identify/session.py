@@ -32,6 +32,7 @@ from legcal.data.dataset import Dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, join_outlines
 from legcal.data.reading_units import sigmas_of_legs
+from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
@@ -39,6 +40,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator
 from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
+from legcal.machine.equations import pose_sensitivity
 from legcal.machine.kinematics import platforms_in_base
 from legcal.machine.leg import (
     LINKS,
@@ -127,6 +129,16 @@ class Session:
         """Where the camera of each view stands, T_Rb_camera."""
         places = (view.T_base_camera for view in self.cameras)
         return tuple(T for T in places if T is not None)
+
+    @cached_property
+    def motion(self) -> Array | None:
+        """Motion of the platform (w, 6, p) by parameters in metres; None if it is not known."""
+        poses = self.R_reached, self.t_reached
+        try:
+            moved = pose_sensitivity(self.legs, self.parametrization, self.frame_legs, *poses)
+        except NotIdentifiable:
+            return None
+        return moved * self.unit
 
     @property
     def reached(self) -> tuple[RigidTransform, ...]:
