@@ -306,7 +306,9 @@ def test_ranks_are_the_published_ones_and_lengths_carry_the_scale_of_arms(
 
 def test_a_free_gain_of_every_carriage_loses_the_scale_too() -> None:
     found = session("hexaglide")
-    with_gains = parametrize(found.leg_names, found.legs, found.frame_legs, twists=True)
+    with_gains = parametrize(
+        found.machine.leg_names, found.legs, found.machine.frame_legs, twists=True
+    )
     found = replace(found, parametrization=with_gains)
     gains = frozenset(x for x in with_gains.names if x.endswith(".gain"))
     assert len(gains) == 6

@@ -141,7 +141,7 @@ class Analysis:
         if session.motion is None:
             return None
         by_parameters = platform_by_parameters(
-            fitted.nominal, fitted.parametrization, session.frame_legs, session.reached
+            fitted.nominal, fitted.parametrization, session.machine.frame_legs, session.reached
         )
         return RmsMotion(*expected_error(by_parameters, self.covariance).rms)
 
@@ -226,7 +226,7 @@ def _direction(session: Session, row: Array, harmless: bool) -> WeakDirection:
     if session.motion is not None:
         dX_m, dE_rad = moved_by(session.motion, row[:, None]).rms
     return WeakDirection(
-        describe_direction(names, session.leg_names),
+        describe_direction(names, session.machine.leg_names),
         names,
         tuple(float((row * session.unit)[i]) for i in shown),
         dX_m,
@@ -478,7 +478,7 @@ def identifiability(
 
     choices = Choices.by_tolerances(mechanism, only)
     analysis = Analysis(planned(images), choices, noise=noise)
-    return _report_on(mechanism, analysis, None if hand_held else planned)
+    return _report_on(analysis, None if hand_held else planned)
 
 
 def identifiability_of_dataset(
@@ -495,7 +495,7 @@ def identifiability_of_dataset(
     analysis = _analysis_of(dataset, choices)
     session = analysis.session.with_outlines_of(dataset)
     analysis = replace(analysis, session=session, noise=noise)
-    report = _report_on(dataset.machine, analysis, None)
+    report = _report_on(analysis, None)
     if dataset.machine.is_determined:
         return report
     note = "The readings do not determine the poses of the images; random poses are used instead."
@@ -537,14 +537,11 @@ def check_identifiable(
 
 
 def _report_on(
-    machine: Machine,
     analysis: Analysis,
     replanned: Callable[[int], Session] | None,  # as :func:`find_remedies` takes it
 ) -> Identifiability:
-    session = analysis.session
-    conditions = tuple(
-        ConditionBlock.of(one, machine.leg_names) for one in conditions_of(machine, session)
-    )
+    session, machine = analysis.session, analysis.session.machine
+    conditions = tuple(ConditionBlock.of(one, machine.leg_names) for one in conditions_of(session))
     on_platform = np.unique(session.view[np.flatnonzero(session.platform_board)])
     full = analysis.full
     notes = []
@@ -572,7 +569,7 @@ def _report_on(
         conditions=conditions,
         full=full,
         identifiable=full.complete,
-        views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
+        views=tuple(tuple(session.machine.leg_names[j] for j in view) for view in session.views),
         images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
         board=bool(session.board.all()),
         platform_board=len(on_platform) == session.n_views,
@@ -617,7 +614,7 @@ def _machine_notes(machine: Machine) -> list[str]:
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 
 
-def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
+def conditions_of(session: Session) -> tuple[Condition, ...]:
     """Return the paper's conditions for a session.
 
     Counts are by views, as printed. Views of a board count as one frame for the directions of a
@@ -642,7 +639,7 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
     return (
         *counts,
         replace(directions, ok=not standing, legs=standing),
-        three_legs_at_once(session.views, geometries(machine), spatial=session.spatial),
+        three_legs_at_once(session.views, geometries(session.machine), spatial=session.spatial),
     )
 
 
@@ -809,7 +806,7 @@ def _try_kind(kind: Iterable[_Candidate], before: int, n_parameters: int) -> lis
 def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield further camera positions that show weak legs and their neighbours."""
     session, touched = analysis.session, {p for d in _harmful(analysis) for p in d.parameters}
-    names = enumerate(session.leg_names)
+    names = enumerate(session.machine.leg_names)
     weak = {j for j, name in names if any(p.startswith(f"{name}.") for p in touched)}
     ring = legs_around(session)
     largest = max(len(view) for view in session.views)
@@ -817,7 +814,7 @@ def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
         groups = [legs for legs in neighbours(ring, size) if weak & set(legs)]
         groups.sort(key=lambda legs: -len(weak & set(legs)))
         for legs in groups:
-            named = legs_in_words(legs, session.leg_names)
+            named = legs_in_words(legs, session.machine.leg_names)
             more = replace(analysis, session=_extended(session, legs))
             yield f"add a camera position ({named})", more, ()
 

@@ -64,7 +64,7 @@ from legcal.machine.rods import (
     actuators_of,
     ends_at_poses,
 )
-from legcal.machine.shapes import Occluder, bodies_of
+from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import machine_ties, on_ties
 from legcal.perception.body_edges import predicted_edges
 from legcal.vision.board import Board, FixedBoard, facing_board
@@ -86,9 +86,8 @@ _CORNER_PX = 0.1  # standard deviation of its corners
 class Session:
     """Images as they will be taken, of a machine that is nearly the nominal one."""
 
-    leg_names: tuple[str, ...]
-    legs: tuple[Leg, ...]  # in R_b and R_e
-    frame_legs: tuple[int, ...]  # those that define R_b and R_e
+    machine: Machine
+    legs: tuple[Leg, ...]  # in R_b and R_e, nearly the nominal ones
     parametrization: Parametrization
     R: Array  # R, t: (k, 3, 3) and (k, 3): platform poses: rotation and position [m] of R_e in R_b
     t: Array
@@ -108,8 +107,6 @@ class Session:
     # (n_images,): those that show a calibration board on the platform; none if it is empty
     platform_board: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     boards: Mapping[Link, Board] = field(default_factory=dict)  # those whose dimensions are known
-    home: RigidTransform | None = None  # T_Rb_Re; without it constraints tie no parameters
-    occluders: tuple[Occluder, ...] = ()  # solids of legs; bodies among them have edges
     # outlines and edges of bodies that are there; without them those that are predicted
     found: Outlines | None = None
     found_edges: Outlines | None = None
@@ -135,7 +132,9 @@ class Session:
         """Motion of the platform (w, 6, p) by parameters in metres; None if it is not known."""
         poses = self.R_reached, self.t_reached
         try:
-            moved = pose_sensitivity(self.legs, self.parametrization, self.frame_legs, *poses)
+            moved = pose_sensitivity(
+                self.legs, self.parametrization, self.machine.frame_legs, *poses
+            )
         except NotIdentifiable:
             return None
         return moved * self.unit
@@ -149,18 +148,19 @@ class Session:
     def fitted(self) -> FittedLegs:
         """The legs as the joint fit takes them; a leg without any visible part has a thin rod."""
         shortest, legs = self.length.min(axis=0).tolist(), list(self.legs)
-        bodies = bodies_of(self.occluders, self.n_legs)
+        bodies = bodies_of(self.machine.occluders, self.n_legs)
         for j, leg in enumerate(self.legs):
             if not leg.cylinders and not bodies[j]:
                 thin = Cylinder(leg.name, THIN * self.mean_length, "base", 0.0, shortest[j])
                 legs[j] = replace(leg, cylinders=(thin,))
         radii = {(j, p): r for j, leg in enumerate(legs) for p, r in leg.radius_of_part.items()}
-        return FittedLegs(self.leg_names, tuple(legs), self.frame_legs, radii, self.home)
+        m = self.machine
+        return FittedLegs(m.leg_names, tuple(legs), m.frame_legs, radii, m.home_of_frames)
 
     @property
     def radii(self) -> dict[str, float]:
         """Radii of all parts, by their names [m]."""
-        names = self.leg_names
+        names = self.machine.leg_names
         return {radius_name(names[j], part): r for (j, part), r in self.fitted.radii.items()}
 
     @cached_property
@@ -184,7 +184,8 @@ class Session:
             return self.found_edges
         views = [(view.camera, T) for view, T in zip(self.cameras, self.places, strict=True)]
         A, B = (end[self.pose] for end in self.ends)
-        return predicted_edges(self.occluders, views, self.view, (A, B), self.seen)
+        solids = [solid for solid in self.machine.occluders if solid.leg >= 0]
+        return predicted_edges(solids, views, self.view, (A, B), self.seen)
 
     @cached_property
     def measurements(self) -> Measurements:
@@ -264,7 +265,7 @@ class Session:
     @property
     def spatial(self) -> bool:
         """Whether the platform moves in space and not in a plane."""
-        return is_spatial(self.frame_legs)
+        return is_spatial(self.machine.frame_legs)
 
     @cached_property
     def views(self) -> tuple[tuple[int, ...], ...]:
@@ -357,17 +358,15 @@ def planned_session(
     """
     n_poses = images * len(views)
     (legs, rng), (R, t) = _random_sessions(machine, max(n_poses, REACHED))
-    rng, home = deepcopy(rng), machine.home_of_frames
+    rng = deepcopy(rng)
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
         seen[v, list(view)] = True
-    A, B = ends_at_pose(legs, home)
+    A, B = ends_at_pose(legs, machine.home_of_frames)
     return Session(
-        leg_names=machine.leg_names,
+        machine=machine,
         legs=legs,
-        frame_legs=machine.frame_legs,
         parametrization=parametrization_of(machine),
-        home=home,
         R=R[:n_poses],
         t=t[:n_poses],
         R_reached=R,
@@ -380,7 +379,6 @@ def planned_session(
         unread=np.zeros((n_poses, len(legs)), dtype=np.bool_),
         board=np.full(len(views), board, dtype=np.bool_),
         platform_board=np.full(n_poses, platform_board, dtype=np.bool_),
-        occluders=_solids_of_legs(machine),
     )
 
 
@@ -416,7 +414,7 @@ def recorded_session(
     Raises DatasetError if readings are out of reach of the model by more than its errors may be.
     """
     machine, m = dataset.machine, dataset.measurements
-    to_Rb, home = machine.T_base_Rb.inv(), machine.home_of_frames
+    to_Rb = machine.T_base_Rb.inv()
     legs, rng = perturbed_machine(machine)
     if machine.is_determined:
         R, t = Frames.of(nominal_poses(machine, m)[0])
@@ -431,14 +429,13 @@ def recorded_session(
         t_reached = np.concatenate([t, t_more[n_drawn:]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
-    solids = _solids_of_legs(machine)
-    bodies = bodies_of(solids, len(machine.legs))
+    bodies = bodies_of(machine.occluders, len(machine.legs))
     is_visible = [
         bool(leg.cylinders or of_leg) for leg, of_leg in zip(machine.legs, bodies, strict=True)
     ]
     of_views = [[view.uses(leg.name) for leg in machine.legs] for view in views]
     seen = np.array(of_views, dtype=np.bool_) & is_visible
-    A, B = ends_at_pose(legs, home)
+    A, B = ends_at_pose(legs, machine.home_of_frames)
     shown = [np.flatnonzero(row).tolist() for row in seen]
     placed = default_cameras(A, B, shown, machine.spatial, rng)
     cameras = tuple(
@@ -451,11 +448,9 @@ def recorded_session(
         for view, default in zip(views, placed, strict=True)
     )
     return Session(
-        leg_names=machine.leg_names,
+        machine=machine,
         legs=legs,
-        frame_legs=machine.frame_legs,
         parametrization=parametrization,
-        home=home,
         R=R,
         t=t,
         R_reached=R_reached,
@@ -469,12 +464,7 @@ def recorded_session(
         board=np.isin(used, m.view[_showing(dataset, "base")]),
         platform_board=_showing(dataset, "platform"),
         boards={fixed.link: fixed.board for fixed in dataset.boards},
-        occluders=solids,
     )
-
-
-def _solids_of_legs(machine: Machine) -> tuple[Occluder, ...]:
-    return tuple(occluder for occluder in machine.occluders if occluder.leg >= 0)
 
 
 def default_cameras(
