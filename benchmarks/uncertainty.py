@@ -121,8 +121,8 @@ def by_plan(calibration: Calibration, noise: PredictedNoise) -> float:
         parts.append(
             predictor.contributions({"here": T}, view, poses, outlines, solution.legs, edges)
         )
-    size_of_machine, legs = dataset.machine.size, predictor.legs
-    covariance = fitted_covariance(parts, legs, solution.T_Rb_Re, size_of_machine, solution.legs)
+    legs, length = predictor.legs, dataset.machine.size
+    covariance = fitted_covariance(parts, legs, solution.T_Rb_Re, length)
     return size(calibration, legs.nominal, covariance)
 
 

@@ -653,5 +653,4 @@ def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.G
         if added is not None:
             parts.append(added)
             every_pose += poses
-    legs = task.predictor.legs
-    return fitted_covariance(parts, legs, every_pose, machine.size, scene.legs)
+    return fitted_covariance(parts, task.predictor.legs, every_pose, machine.size)

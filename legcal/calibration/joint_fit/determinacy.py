@@ -15,7 +15,7 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.problem import FitNormal, FitProblem
-from legcal.calibration.joint_fit.variables import State, with_values
+from legcal.calibration.joint_fit.variables import FittedLegs, State, with_values
 from legcal.calibration.tuning import HARMLESS, HELD_SIGMA, MAX_SIGMA
 from legcal.errors import NotIdentifiable
 from legcal.estimation.problem import Frames
@@ -26,7 +26,6 @@ from legcal.machine.equations import pose_sensitivity
 from legcal.machine.leg import Leg
 from legcal.machine.parameters import (
     SHOWN,
-    Parametrization,
     describe_direction,
     sparse_basis,
     split_by_motion,
@@ -191,9 +190,7 @@ def covariance_of_held(problem: FitProblem, state: State, held: HeldDirections) 
 def covariance_as_stated(
     S: Array,  # (p, p) of steps of the parameters, by the information of a fit
     moved: Array,  # (p, c) their changes by errors that it does not know, one sigma of each
-    legs: Sequence[Leg],
-    parametrization: Parametrization,
-    frame_legs: Sequence[int],
+    legs: FittedLegs,
     T_Rb_Re: Sequence[RigidTransform],  # the poses of its images
     length: float,  # mean leg length [m]
 ) -> Array:
@@ -201,13 +198,13 @@ def covariance_as_stated(
 
     Weak directions that hardly move the platform are known then, since they are held.
     """
-    unit = np.array([1.0 if unit == "m" else 1.0 / length for unit in parametrization.units])
+    unit = np.where(np.equal(legs.parametrization.units, "m"), 1.0, 1.0 / length)
     variance, direction = np.linalg.eigh(S / unit[:, None] / unit)
     weak = direction[:, variance > (HELD_SIGMA * length) ** 2].T
     C = np.asarray(S + moved @ moved.T)
     if not len(weak):
         return C
-    motion = _motion_by(legs, parametrization, frame_legs, T_Rb_Re)
+    motion = _motion_by(legs.nominal, legs, Frames.of(T_Rb_Re))
     H = split_by_motion(None if motion is None else motion * unit, weak, length, HARMLESS)[1] / unit
     rest = np.eye(len(S)) - S @ H.T @ np.linalg.solve(H @ S @ H.T, H)
     return np.asarray(rest @ C @ rest.T)
@@ -224,8 +221,7 @@ def named_units(problem: FitProblem, state: State) -> Array:
 def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
     """Motion of the platform (k, 6, n_named) by each named unknown, scaled by *unit*."""
     legs, n = problem.legs, problem.n_kinematic
-    poses = state.platform_pose.motions
-    by_steps = _motion_by(state.legs, legs.parametrization, legs.frame_legs, poses)
+    by_steps = _motion_by(state.legs, legs, state.platform_pose.frames)
     if by_steps is None:
         return None
     motion = np.zeros((len(by_steps), 6, len(unit)))
@@ -233,15 +229,10 @@ def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
     return motion * unit
 
 
-def _motion_by(
-    legs: Sequence[Leg],
-    parametrization: Parametrization,
-    frame_legs: Sequence[int],
-    T_Rb_Re: Sequence[RigidTransform],
-) -> Array | None:
+def _motion_by(legs: Sequence[Leg], fitted: FittedLegs, poses: Frames) -> Array | None:
     """Motion of the platform (k, 6, p) by steps of parameters; None if readings do not tell it."""
     try:
-        return pose_sensitivity(legs, parametrization, frame_legs, *Frames.of(T_Rb_Re))
+        return pose_sensitivity(legs, fitted.parametrization, fitted.frame_legs, *poses)
     except NotIdentifiable:
         return None
 

@@ -175,7 +175,6 @@ def fitted_covariance(
     fitted: FittedLegs,
     poses: Sequence[RigidTransform],  # T_Rb_Re
     length: float,  # mean leg length [m]
-    legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
 ) -> Array:
     """Return the covariance (p, p) of all parameters that a fit to all images of views states.
 
@@ -190,15 +189,8 @@ def fitted_covariance(
         pulls.append(rows.T @ part.shifts.reshape(len(rows), part.shifts.shape[2]))
     by_all = basis @ np.linalg.inv(information)[: basis.shape[1]]
     moved = [by_all[:, at] @ pull for at, pull in zip(columns, pulls, strict=True)]
-    return covariance_as_stated(
-        by_all[:, : basis.shape[1]] @ basis.T,
-        np.hstack(moved),
-        fitted.nominal if legs is None else legs,
-        fitted.parametrization,
-        fitted.frame_legs,
-        poses,
-        length,
-    )
+    S = by_all[:, : basis.shape[1]] @ basis.T
+    return covariance_as_stated(S, np.hstack(moved), fitted, poses, length)
 
 
 @dataclass(frozen=True, eq=False)
