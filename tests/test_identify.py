@@ -32,12 +32,15 @@ from legcal.calibration.identify.identifiability import (
 )
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import Session, planned_session, recorded_session
+from legcal.calibration.joint_fit.determinacy import covariance_as_stated
 from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.predicted import WHITE
 from legcal.data.corners import found_corners
 from legcal.data.image_choice import dataset_at
 from legcal.descriptions.new_model import create_model
 from legcal.errors import NotIdentifiable
+from legcal.estimation.problem import Frames
+from legcal.machine.equations import pose_sensitivity
 from legcal.machine.leg import LegKind
 from legcal.machine.parameters import parametrization_of, parametrize
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
@@ -258,6 +261,25 @@ def test_identify_and_plan_predict_what_calibrate_states(name: str) -> None:
     """At the same poses, cameras and used outlines, with the noise of the result."""
     _, (stated, *predicted) = compared(Path(__file__).parent / "data/recorded" / name)
     np.testing.assert_allclose(predicted, stated, rtol=0.02)
+
+
+def test_a_prediction_holds_weak_directions_that_do_not_move_the_platform() -> None:
+    """As a fit does that knows them: with a strong prior along the direction."""
+    found, rng = planned_session(model("3-upu"), [range(3)] * 3, 8), np.random.default_rng(1)
+    legs, length = found.fitted, found.mean_length
+    unit = np.where(np.equal(legs.parametrization.units, "m"), 1.0, 1.0 / length)
+    moves = pose_sensitivity(legs.nominal, legs.parametrization, legs.frame_legs, found.R, found.t)
+    still = np.linalg.svd((moves * unit).reshape(-1, len(unit)))[2][-1]
+    root = 1e-4 * rng.normal(size=(len(unit), 40))
+    S = unit[:, None] * (root @ root.T + np.outer(still, still) * length**2) * unit
+    moved = unit[:, None] * 1e-4 * rng.normal(size=(len(unit), 3))
+    poses = Frames(found.R, found.t).motions
+    stated = covariance_as_stated(S, moved, legs, poses, length)
+    information = np.linalg.inv(S)
+    known = np.linalg.inv(information + 1e14 * np.outer(still / unit, still / unit))
+    moved = known @ information @ moved
+    np.testing.assert_allclose(stated, known + moved @ moved.T, rtol=1e-3, atol=1e-12)
+    assert np.trace(stated) < 0.01 * np.trace(S)
 
 
 # Joints at A that actuators move
