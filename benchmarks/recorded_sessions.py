@@ -53,8 +53,8 @@ WORST = 12  # rows of a table of differences
 FIT = "--no-report --workers 1"
 SESSIONS: dict[str, dict[str, str]] = {  # by session and step: the words after legcal
     "example": {
+        "identify": "identify {in}",  # before its outlines are there
         "calibrate": f"calibrate {{in}} -o {{out}}/result {FIT}",
-        "identify": "identify {in}",
         "evaluate": "evaluate hexapod {tests}/data/hexapod-truth/models/hexapod.yaml"
         " --dataset {in}",
         "locate": "locate hexapod {sets}/tool/hexapod.csv -o {out}/cell.yaml",
