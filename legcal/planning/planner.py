@@ -182,14 +182,24 @@ class Task:
         outlines = predicted_outlines(seen, np.arange(n, dtype=np.intp))
         if found is not None:
             outlines = outlines.choose(found[outlines.row, outlines.leg])
-        view = np.zeros(n, dtype=np.intp)
+        view, views = np.zeros(n, dtype=np.intp), {"here": T}
+        if self.hand_held and not to_choose:
+            view, views = np.arange(n), {f"here{k}": T for k in range(n)}
+        laid = None if to_choose else self.laid
         added = predictor.contributions(
-            {"here": T}, view, poses, outlines, self.legs, to_choose=to_choose
+            views,
+            view,
+            poses,
+            outlines,
+            self.legs,
+            board=None if laid is None else (laid.board, laid.T_base_board),
+            hand_held=self.hand_held,
+            to_choose=to_choose,
         )
         if self.board is not None:
-            added = added.tied_by_board({"here": T})
+            added = added.tied_by_board({"here": T}) if to_choose else added
             added = replace(added, rows=added.rows * np.reshape(with_board, (-1, 1, 1)))
-        if self.hand_held:  # one series of images of one camera
+        if self.hand_held and to_choose:  # one series of images of one camera
             added = replace(added, names=tuple(n.replace("here: ", "hand ") for n in added.names))
         return added
 

@@ -22,12 +22,13 @@ from legcal.calibration.joint_fit.predicted import (
     Contributions,
     PredictedNoise,
     information_of_images,
+    predicted_corners,
     predicted_outlines,
     readings_at,
 )
 from legcal.calibration.joint_fit.variables import FittedLegs, Start
 from legcal.calibration.ordered_dataset import nominal_poses
-from legcal.data.corners import Corners, found_corners, join_corners
+from legcal.data.corners import Corners, join_corners
 from legcal.data.dataset import Dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines, join_outlines
@@ -79,7 +80,6 @@ REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
 _BOARD = 0.5  # half side of a board on the platform, over the spread of its joints
 _SQUARES = 8  # along both of its sides
-_CORNER_PX = 0.1  # standard deviation of its corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,11 +248,9 @@ class Session:
             for v, k in zip(self.view[image].tolist(), self.pose[image].tolist(), strict=True):
                 in_Rb = points if link == "base" else points @ self.R[k].T + self.t[k]
                 px.append(self.cameras[v].camera.project(self.places[v].inv().apply(in_Rb)))
-            first, n = sum(one.board.n_corners for one in fixed), board.n_corners
+            first = sum(one.board.n_corners for one in fixed)
             fixed.append(FixedBoard(board, link, first=first))
-            number = first + np.tile(np.arange(n), len(image))
-            sigma = np.full(len(number), _CORNER_PX)
-            tables.append(found_corners(np.repeat(image, n), number, np.concatenate(px), sigma))
+            tables.append(predicted_corners(fixed[-1], image, np.array(px)))
         return BoardCorners(tuple(fixed), join_corners(tables)) if fixed else None, poses
 
     @cached_property

@@ -43,6 +43,7 @@ from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices, 
 from legcal.calibration.joint_fit.problem import FitProblem, arm_sigmas, build_fit
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs
 from legcal.calibration.tuning import TWIST_SIGMA_DEG
+from legcal.data.corners import Corners, found_corners
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import OUTLINE_COLUMNS, Outlines, unmeasured
@@ -56,6 +57,7 @@ from legcal.machine.leg import Leg, LegKind, ParameterId
 from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, reading_of_rod
 from legcal.perception.body_edges import predicted_edges
+from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import Seen
@@ -63,6 +65,7 @@ from legcal.vision.visibility import Seen
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
 _WEAK, _WEAK_LENGTH = 1.0, 2.5
 _RANK = 1e-7  # of the largest singular value
+CORNER_PX = 0.1  # standard deviation of a corner of a board [px]
 
 
 def predicted_outlines(seen: Seen, row: IntArray) -> Outlines:
@@ -81,6 +84,13 @@ def predicted_outlines(seen: Seen, row: IntArray) -> Outlines:
         source=("detected",) * (2 * n),
         **unmeasured(2 * n),
     )
+
+
+def predicted_corners(fixed: FixedBoard, row: IntArray, px: Array) -> Corners:
+    """Return the corners of a board in images *row* (n,), where they show them (n, k, 2) [px]."""
+    number = np.tile(fixed.first + np.arange(px.shape[1]), len(row))
+    sigma = np.full(len(number), CORNER_PX)
+    return found_corners(np.repeat(row, px.shape[1]), number, px.reshape(-1, 2), sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +175,11 @@ def joined(parts: Sequence[Contributions]) -> tuple[list[IntArray], Array]:
         local = [f"{s}/{name}" if ": " in name else name for name in part.names]
         columns.append(np.array([number.setdefault(name, len(number)) for name in local]))
     prior = np.zeros((len(number), len(number)))
-    for where, part in zip(columns, parts, strict=True):
-        prior[np.ix_(where, where)] = part.prior
+    of_views = [part.known[:, [": " in name for name in part.names]].any(axis=1) for part in parts]
+    for where, part, is_own in zip(columns, parts, of_views, strict=True):
+        prior[np.ix_(where, where)] = part.known[~is_own].T @ part.known[~is_own]
+    for where, part, is_own in zip(columns, parts, of_views, strict=True):
+        prior[np.ix_(where, where)] += part.known[is_own].T @ part.known[is_own]
     return columns, prior
 
 
@@ -217,6 +230,9 @@ class Predictor:
         legs: Sequence[Leg] | None = None,  # in R_b and R_e, if not the nominal ones
         edges: Outlines | None = None,  # of bodies; without them those that are predicted
         *,
+        # a board on the base with T_base_board, which all images show
+        board: tuple[Board, RigidTransform] | None = None,
+        hand_held: bool = False,  # views are images of one camera in a hand
         to_choose: bool = False,
     ) -> Contributions:
         """Return the contribution of images to the information of a fit, or *to_choose* some.
@@ -226,7 +242,7 @@ class Predictor:
         n, shown = len(poses), tuple(legs or self.legs.nominal)
         camera = replace(self.camera, gamma_is_given=False)
         measurements = Measurements(
-            views=tuple(View(name, camera, T) for name, T in views.items()),
+            views=tuple(View(name, camera, T, hand_held=hand_held) for name, T in views.items()),
             image=("",) * n,
             view=view,
             pose=np.arange(n, dtype=np.intp),
@@ -247,6 +263,7 @@ class Predictor:
             tuple(T.inv() * T_base_Rb for T in views.values()),
             tuple(poses),
             "plan",
+            RigidTransform.identity() if board is None else T_base_Rb.inv() * board[1],
         )
         return information_of_images(
             self.legs,
@@ -255,10 +272,23 @@ class Predictor:
             start,
             self.noise,
             self.choices,
+            board=None if board is None else self._corners(*board, views, view),
             edges=edges,
             to_choose=to_choose,
             known_length=self.machine.size,
         )
+
+    def _corners(
+        self,
+        board: Board,
+        T_base_board: RigidTransform,
+        views: Mapping[str, RigidTransform],
+        view: IntArray,
+    ) -> BoardCorners:
+        """Return the corners of a board on the base in all images."""
+        X, fixed = T_base_board.apply(board.points), FixedBoard(board, "base")
+        px = np.array([self.camera.project(T.inv().apply(X)) for T in views.values()])
+        return BoardCorners((fixed,), predicted_corners(fixed, np.arange(len(view)), px[view]))
 
 
 def readings_at(legs: Sequence[Leg], R: Array, t: Array) -> Array:
