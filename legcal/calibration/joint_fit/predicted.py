@@ -46,7 +46,7 @@ from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.corners import Corners, found_corners
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import OUTLINE_COLUMNS, Outlines, unmeasured
+from legcal.data.outlines import FIRST_EDGE, OUTLINE_COLUMNS, Outlines, unmeasured
 from legcal.data.reasons import USED
 from legcal.errors import DatasetError, UsageError
 from legcal.estimation.problem import Frames, linearize
@@ -581,6 +581,7 @@ def _noise_of_result(residuals: ResidualsBlock, file: Path) -> PredictedNoise:
     if table.is_file():
         rows = read_table(table, "table", "outline", OUTLINE_COLUMNS)
         used = np.array([verdict == "used" for verdict in rows.text("verdict")])
+        used &= rows.number("edge") < FIRST_EDGE  # not of bodies
         s00, s01, s11 = (rows.number(name)[used] for name in ("s00", "s01", "s11"))
         ends = np.stack([rows.number(n)[used] for n in ("u0", "v0", "u1", "v1")], axis=-1)
         length = np.linalg.norm(ends[:, 2:] - ends[:, :2], axis=1)
