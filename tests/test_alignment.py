@@ -12,11 +12,13 @@ from hypothesis import settings as tried
 from hypothesis import strategies as st
 from simulated import settings, small_camera, standing
 
-from legcal import detect, load_dataset, simulate
+from legcal import calibrate, detect, load_dataset, simulate
+from legcal.calibration.diagnosis.diagnosis import NONE_EXPLAINS
 from legcal.data.measurements import Measurements, View
 from legcal.data.photograph_notes import notes_on_moves
+from legcal.errors import NotVisible
 from legcal.geometry.types import Array
-from legcal.perception.alignment import camera_moves
+from legcal.perception.alignment import camera_moves, is_moved
 from legcal.progress import no_progress
 from legcal.simulation.settings import Level
 from legcal.vision.camera import Camera
@@ -118,6 +120,34 @@ def test_what_stood_still_shows_little_or_another_scene_is_left_alone() -> None:
     images = taken(background, shaken)
     images[2] = taken(texture(2), shaken)[2]
     assert sorted(found_in(images)) == [0, 1, 3, 4, 5, 6]
+
+
+def test_a_camera_in_the_hand_is_told_from_one_on_a_tripod() -> None:
+    rows, still = range(N), [move(0.0)] * N
+    in_hand = [taken(texture(seed), still)[seed] for seed in rows]
+    assert is_moved(in_hand.__getitem__, rows)
+    assert not is_moved(in_hand.__getitem__, rows[:4])
+    shaken = taken(texture(1), [move(0.7 * k) for k in rows])
+    assert not is_moved(shaken.__getitem__, rows)
+    bumped = [*taken(texture(1), still)[:4], *taken(texture(2), still)[4:]]
+    assert not is_moved(bumped.__getitem__, rows)
+    plain = taken(np.full_like(texture(0), 110.0), still)
+    assert not is_moved(plain.__getitem__, rows)
+
+
+def test_photographs_without_a_common_background_are_refused_as_taken_in_the_hand(
+    tmp_path: Path,
+) -> None:
+    views = standing("hexapod", 1, small_camera(tmp_path, WIDTH, HEIGHT))
+    shot = settings(level=Level.PHOTOGRAPHS, views=views, poses=6)
+    folder = simulate("hexapod", tmp_path / "s", shot).folder
+    for k, file in enumerate(sorted((folder / "images").iterdir())):
+        cv2.imwrite(str(file), np.rint(texture(k)).astype(np.uint8))
+    with pytest.raises(NotVisible) as refused:
+        calibrate(folder)
+    assert "in the hand" in str(refused.value)
+    assert "hand_held: true" in str(refused.value)
+    assert NONE_EXPLAINS not in refused.value.notes
 
 
 def test_the_note_on_moves_counts_the_corners() -> None:

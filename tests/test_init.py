@@ -13,6 +13,7 @@ from photograph_files import exif, jpeg
 from simulated import files_of, small_camera
 
 from legcal import load_dataset
+from legcal.vision.board import board_of
 from legcal.vision.image_file import camera_of_photographs, read_facts
 
 PICTURE = np.zeros((48, 64), np.uint8)
@@ -262,6 +263,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {}, ("--camera", str(HEXAPOD / "camera_info.yaml")), ("IMG_2.JPG", "64 x 48", "1024")),
     (FLAT, {"columns": {"time": ("10:00", "x", "10:02")}}, (), ("EXIF",)),
     (FLAT, {}, ("--encoder-sigma", "50mm"), ("50 mm", "20% of the travel", "--encoder-sigma")),
+    (FLAT, {}, ("--board", "circles:9x7:30mm:15mm"), ("--board", "circles", "charuco")),
     (("IMG_1.HEIC", "IMG_2.HEIC"), {}, (), ("2 of another format", "IMG_1.HEIC", "JPEG")),
     ((), {}, (), ("no such folder",)),
 ]  # fmt: skip
@@ -306,6 +308,19 @@ def test_readings_that_nobody_knows_stay_empty(tmp_path: Path) -> None:
     assert refused.code == 2
     assert "row 2 (line 3), column leg1_prismatic: the reading could not be used" in refused.said
     assert not (folder / "other").exists()
+
+
+def test_a_camera_in_the_hand_and_its_board_are_written(tmp_path: Path) -> None:
+    table(own_folder(tmp_path, FLAT))
+    assert "--hand-held" in init(tmp_path).said
+    spec = "charuco:7x5:36mm:27mm:DICT_4X4_50"
+    outcome = init(tmp_path, "--force", "--hand-held", "--board", spec)
+    assert outcome.code == 0
+    assert "--hand-held" not in outcome.said
+    dataset = load_dataset(tmp_path / "dataset")
+    assert len(dataset.measurements.views) == dataset.measurements.n_rows == len(FLAT)
+    (board,) = dataset.boards
+    assert (board.link, board.board) == ("base", board_of(spec))
 
 
 def test_without_a_camera_file_photographs_that_state_a_focal_length_give_a_rough_camera(

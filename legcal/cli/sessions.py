@@ -361,6 +361,11 @@ def init(
             "0.5deg for pulses of servos."
         ),
     ] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(metavar="SPEC", help="The board on the base, as for legcal camera."),
+    ] = None,
+    hand_held: HandHeldOption = False,
     force: ForceOption = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Do not show which reading each image gets.")
@@ -372,7 +377,12 @@ def init(
     from legcal.report.session import matching_table, written_lines
 
     options = SheetOptions(
-        cameras=camera or (), unit=unit, lengths=lengths, encoder_sigma=encoder_sigma
+        cameras=camera or (),
+        unit=unit,
+        lengths=lengths,
+        encoder_sigma=encoder_sigma,
+        board=board,
+        hand_held=hand_held,
     )
     dataset = plan_new_dataset(folder, readings, model, output, options)
     if not as_json and not quiet:

@@ -36,6 +36,7 @@ from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
+from legcal.vision.board import Board, board_beside_machine, board_document
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera, rough_camera_info
 from legcal.vision.image_file import (
@@ -109,6 +110,8 @@ class NewDataset:
     notes: tuple[str, ...]  # oddities, and choices that were made
     # Contents of camera files to write, from the metadata of photographs
     made_cameras: Mapping[Path, str] = field(default_factory=dict)
+    board: Board | None = None  # on the base
+    hand_held: bool = False
 
     def readings_of(self, k: int) -> dict[str, float]:
         """Return the readings of a row of the table by joint [m or rad]."""
@@ -166,12 +169,18 @@ class SheetOptions:
     encoder_sigma : float, str or mapping, optional
         One standard deviation of a reading [m], as text with its unit, or by joint [m or rad]; by
         default the last digit of the table, and half a degree for pulses of servos.
+    board : str, Path or Board, optional
+        The calibration board on the base, as for :func:`legcal.calibrate_camera`.
+    hand_held : bool
+        Whether the camera was in the hand: each photograph has a camera pose of its own.
     """
 
     cameras: Sequence[str] = ()
     unit: str | None = None
     lengths: bool = False
     encoder_sigma: float | str | Mapping[str, float] | None = None
+    board: str | Path | Board | None = None
+    hand_held: bool = False
 
 
 def init(
@@ -273,9 +282,11 @@ def plan_new_dataset(
             *matching_notes,
             *sigma_notes,
             *_made_notes(cameras, made),
-            *([] if named else _view_notes(pattern, matches)),
+            *([] if named or options.hand_held else _view_notes(pattern, matches)),
         ),
         made_cameras={path: text for path, (_, text) in made.items()},
+        board=None if options.board is None else board_beside_machine(options.board),
+        hand_held=options.hand_held,
     )
 
 
@@ -312,7 +323,8 @@ def _view_notes(pattern: str | None, photographs: Sequence[Photograph]) -> Itera
         looks = f" as the names of the files look ('{likely}')," if likely else ""
         yield (
             f"All photographs are one view, {ONE_VIEW}: if the camera stood in several places,"
-            f"{looks} put those of each place in a folder, or add a column view."
+            f"{looks} put those of each place in a folder, or add a column view; if it was in the "
+            "hand, give --hand-held and the --board on the base."
         )
 
 
@@ -340,8 +352,10 @@ def write_new_dataset(new: NewDataset, *, force: bool = False) -> list[Path]:
         [photograph.view, new.place(photograph), *poses[k], *map(new.readings_of(k).get, joints)]
         for k, photograph in new.pairs
     ]
-    views = {view: {"camera": names[camera]} for view, camera in new.cameras.items()}
-    texts = dataset_texts(new.machine, new.model, views, rows, new.encoder_sigma, {}, columns)
+    held = {"hand_held": True} if new.hand_held else {}
+    views = {view: {"camera": names[camera], **held} for view, camera in new.cameras.items()}
+    board = {} if new.board is None else {"board": board_document(new.board)}
+    texts = dataset_texts(new.machine, new.model, views, rows, new.encoder_sigma, board, columns)
     contents |= {name: text.encode() for name, text in texts.items()}
     names_to_write = [*dataset_files, *linked]
     with new_files(new.destination, "dataset", names_to_write, force=force) as folder:

@@ -45,6 +45,10 @@ WEIGHED_ROUNDS = 10
 FAR = 1e3  # standard deviation of moves before any image is seen: squares may not tell all [px]
 LEAST_MOVE, MAX_SIGMA = 0.1, 0.05  # of an image, to be corrected [px]
 SIGMAS = 10.0
+# Squares that two images share: their deviation [grey levels], and their correlation in both; the
+# share of squares below which the camera is somewhere else. At most 0.03 with a camera in the hand,
+# at least 0.25 on tripods, dark rooms and grainy photographs included
+SHOWS, ALIKE, LEAST_ALIKE = 3.0, 0.8, 0.1
 
 
 def camera_moves(
@@ -92,6 +96,23 @@ def camera_moves(
             some = rest[first : first + MOST_IMAGES]
             moves |= _known(some, _moves_of_view(read(some), size, still)[0])
     return moves
+
+
+def is_moved(load: Load, rows: Sequence[int]) -> bool:
+    """Return whether images one after the other share no background, as of a camera in the hand."""
+    if len(rows) < MIN_IMAGES:
+        return False
+    squares = [_squares(load, row)[:, MARGIN:-MARGIN, MARGIN:-MARGIN] for row in rows]
+    if len({len(own) for own in squares}) > 1:
+        return False
+    flat = np.stack([own.reshape(len(own), -1) for own in squares])
+    flat = flat - flat.mean(axis=2, keepdims=True)
+    spread = flat.std(axis=2)
+    shown = np.minimum(spread[1:], spread[:-1]) > SHOWS
+    alike = np.mean(flat[1:] * flat[:-1], axis=2) > ALIKE * spread[1:] * spread[:-1]
+    n = np.count_nonzero(shown, axis=1)
+    share = np.count_nonzero(shown & alike, axis=1)[n >= MIN_SQUARES] / n[n >= MIN_SQUARES]
+    return bool(len(share) and np.median(share) < LEAST_ALIKE)
 
 
 def _known(rows: Sequence[int], found: Sequence[Move | None]) -> dict[int, Move]:

@@ -20,6 +20,7 @@ from legcal.causes import Cause
 from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
+from legcal.perception.alignment import is_moved
 from legcal.perception.camera_search import (
     SOME_PICTURES,
     PoseCandidates,
@@ -65,6 +66,13 @@ TWO_POSES = (
     f"more between the legs, or clicks on its joints ({LANDMARKS_NAME})."
 )
 
+MOVED = Cause(
+    "its camera could not be placed: its photographs share no background, so that the camera was "
+    "in the hand or stood in several places; give each place a view of its own, or put a board on "
+    "the base and write hand_held: true for that view and board in dataset.yaml (legcal init "
+    "--hand-held --board SPEC does)."
+)
+
 
 def place_views(
     search: Search,
@@ -106,7 +114,10 @@ def place_views(
     place = run if unclear else in_turn
     for group, (one, swapped) in zip(groups, place(partial(_placed, search), tasks), strict=True):
         if swapped or not one.is_convincing:
-            cause = _why_not_placed(one, group.hint is not None, is_mirrored=swapped)
+            alone = len(group.views) == 1 and not swapped
+            moved = alone and is_moved(search.load, group.rows)
+            hinted = group.hint is not None
+            cause = MOVED if moved else _why_not_placed(one, hinted, is_mirrored=swapped)
             unplaced |= group.not_placed(search.measurements, cause)
             T |= dict.fromkeys(group.views)
             continue

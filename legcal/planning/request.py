@@ -35,7 +35,7 @@ from legcal.planning.places import (
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.planning.session import Plan
 from legcal.progress import Progress, Report, shown_progress
-from legcal.vision.board import Board, board_document, board_of, parse_board
+from legcal.vision.board import Board, board_beside_machine
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.camera_file import read_camera
 from legcal.workers import Run, Workers, worker_pool
@@ -155,9 +155,7 @@ def plan(
     choices, scale_notes = Choices.by_tolerances(machine, only), tuple[str, ...]()
     if only is None:
         choices, scale_notes = measured_length(machine, board=board is not None)
-    laid = None if board is None else board_of(board)
-    if laid is not None:
-        parse_board(board_document(laid), Path("--board"))  # as a dataset does
+    laid = None if board is None else board_beside_machine(board)
     task = Task(
         Predictor(machine, selected_camera, predicted_noise, sigma_q, choices),
         n_images,

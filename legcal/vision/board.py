@@ -452,6 +452,7 @@ def _entry(mapping: Any, path: Path) -> ChessboardEntry | CharucoEntry | Aprilgr
 def board_document(board: Board) -> dict[str, Any]:
     """Return the block of ``dataset.yaml`` for a board, without its pose."""
     values = {key: getattr(board, _FIELDS[key]) for key in _KEYS[board.kind]}
+    values = {key: round(x, 9) if isinstance(x, float) else x for key, x in values.items()}
     if not board.legacy:
         values.pop("legacy_pattern", None)
     return {"kind": board.kind, **values}
@@ -529,6 +530,13 @@ def board_of(spec: str | Path | Board) -> Board:
         return _board(_entry(block, Path(_OPTION)))
     except DatasetError as error:
         raise UsageError(error.facts) from error
+
+
+def board_beside_machine(spec: str | Path | Board) -> Board:
+    """Return the board that a word or a file describes, if a dataset may have it."""
+    board = board_of(spec)
+    parse_board(board_document(board), Path(_OPTION))
+    return board
 
 
 def read_board_file(path: Path) -> Board:

@@ -43,6 +43,7 @@ from legcal.perception.agreement import (
     compare_assumptions,
     pairs_of_outlines,
 )
+from legcal.perception.alignment import is_moved
 from legcal.perception.diagnostics import far_off
 from legcal.perception.placement import Group, Placement, Search, group_views
 
@@ -94,7 +95,8 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     """Return the likely mistakes of a session, the likeliest first; empty if none is likely.
 
     None where there is nothing to explain, or too little to judge by. Views of one or two images
-    that no board relates to others do not count: some camera pose fits them under any hypothesis.
+    that no board relates to others do not count: some camera pose fits them under any hypothesis;
+    nor do views between whose images the camera moved: none fits them.
     """
     machine = data.machine
     rows = _rows_seen(data)
@@ -106,6 +108,11 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     judge = _Judge(data, groups)
     if judge.agree_already:
         return judge.exchanged_legs() or None
+    stood = [group for group in groups if not judge.is_in_hand(group)]
+    if len(stood) < len(groups):
+        if not stood:
+            return None
+        judge = _Judge(data, stood)
     common = mistakes(data)
     tried = [
         *common,
@@ -208,6 +215,13 @@ class _Judge:
     def agree_already(self) -> bool:
         """Whether nearly all images agree as given."""
         return self.own.images > _AGREE_ALREADY * len(self.own.row)
+
+    def is_in_hand(self, group: Group) -> bool:
+        """Return whether the camera of a view moved between its photographs."""
+        files = self.data.order.rows[group.rows].tolist()
+        paths = [self.data.dataset.image_path(row) for row in files]
+        shown = [row for row, path in zip(group.rows, paths, strict=True) if path and path.exists()]
+        return len(group.views) == 1 and is_moved(self.search.load, shown)
 
     def exchanged_legs(self) -> tuple[Diagnosis, ...]:
         """Return given outlines with the names of other legs, where all else in images agrees."""
