@@ -36,16 +36,11 @@ from legcal.calibration.detection import (
     views_to_click,
     write_detection,
 )
-from legcal.calibration.diagnosis.diagnosis import (
-    MIN_IMAGES,
-    NONE_EXPLAINS,
-    diagnose,
-    notes_beside,
-)
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, notes_beside
 from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.mistake_search import MIN_IMAGES, diagnose
 from legcal.calibration.ordered_dataset import (
     OrderedDataset,
     contradicting_readings,

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from legcal.calibration.board import BoardViews
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.fit import refine
