@@ -34,7 +34,6 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.causes import Cause
 from legcal.data.corners import Corners, join_corners, write_corners
 from legcal.data.dataset import (
     CORNERS_NAME,
@@ -58,11 +57,10 @@ from legcal.data.outlines import (
     write_observations,
 )
 from legcal.data.reasons import Reason, Rejection, reason_in_words
-from legcal.errors import DatasetError, OutOfResources, UsageError, printable
+from legcal.errors import Cause, DatasetError, OutOfResources, UsageError, printable
 from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.reading import MAX_IMAGE, read_bytes, read_json
-from legcal.files.schema import Document
+from legcal.files.schema import MAX_IMAGE, Document, read_bytes, read_json
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, IntArray

@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
-from legcal.causes import Cause, by_cause
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset, rows_with_image
 from legcal.data.image_choice import dataset_at, images_to_name
@@ -31,7 +30,7 @@ from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, images_in_words, row_names
 from legcal.data.outlines import Outlines, reject_unused_legs
 from legcal.data.photograph_notes import notes_on_moves
-from legcal.errors import DatasetError
+from legcal.errors import Cause, DatasetError, by_cause
 from legcal.files.schema import few
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, BoolArray, IntArray

@@ -39,7 +39,7 @@ from legcal.errors import (
     UsageError,
 )
 from legcal.files.folder import RESULT, in_the_way, path_problem, result_folder
-from legcal.files.reading import read_json
+from legcal.files.schema import read_json
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.home import home_of_legs

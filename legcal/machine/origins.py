@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
-from legcal.geometry.motions import matrix_inverse, matrix_product
-from legcal.geometry.rotations import rotation_between
+from legcal.geometry.motions import matrix_inverse, matrix_product, rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm
 from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
