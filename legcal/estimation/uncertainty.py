@@ -287,7 +287,7 @@ class Projected:
         products = (self.projected[of] @ self.columns[by].T).toarray()
         return np.asarray(products - self.response[of] @ self.gradient[by].T)
 
-    def at(self, columns: IntArray) -> Scores:
+    def at(self, columns: IntArray | slice) -> Scores:
         """Return the scores of some columns."""
         information = self.information(columns, columns)
         return Scores(self.score[columns], information, self.size[columns])
