@@ -379,15 +379,27 @@ def size_left(scores: Scores, covariance: Array) -> Array:
     return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
 
 
-class LeftOut(NamedTuple):
-    """How well a block of eliminated elements is predicted by all else."""
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """How well blocks of eliminated elements are predicted by all else."""
 
-    squares: float  # squared Mahalanobis distance of its measurements from their prediction
-    dof: int  # independent innovations, without what only the block determines
-    information: Array  # (n_kept, n_kept) of all else
+    squares: Array  # (n_blocks,) squared Mahalanobis distances of measurements from predictions
+    n_residuals: IntArray  # (n_blocks,)
+    block: IntArray  # (n_elements,) of each element, from 0
+    everything: NormalEquations[Any, Any]
+    rest: tuple[NormalEquations[Any, Any], ...]  # without each block
+
+    @property
+    def dof(self) -> IntArray:
+        """Independent innovations (n_blocks,), without what only the block determines."""
+        of_all, *of_rest = (
+            int(_ranks(normal.reduced()[None])[0]) for normal in (self.everything, *self.rest)
+        )
+        own = np.bincount(self.block, _ranks(self.everything.V), len(self.rest)).astype(np.intp)
+        return np.asarray(self.n_residuals - (of_all - np.array(of_rest)) - own, dtype=np.intp)
 
 
-def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[LeftOut]:
+def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> LeftOut:
     """Return how well blocks of eliminated elements are predicted by all else.
 
     The block of each element is given, (n_elements,) from 0. The measurements of a block are
@@ -395,12 +407,12 @@ def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[Le
     their innovations, whitened by the covariance of these. For right models they are as large as
     their number.
     """
-    blocks = list[LeftOut]()
-    everything = normal_equations(linear)
-    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()[None])[0])
-    rank_of_elements = _ranks(everything.V)
-    for b in range(int(block.max(initial=-1)) + 1):
-        rows, squares, dof = dict(linear.rows), 0.0, 0
+    n_blocks = int(block.max(initial=-1)) + 1
+    everything, without = normal_equations(linear), list[NormalEquations[Any, Any]]()
+    gradient, squares = _reduced_gradient(everything), np.zeros(n_blocks)
+    n_residuals = np.zeros(n_blocks, dtype=np.intp)
+    for b in range(n_blocks):
+        rows = dict(linear.rows)
         for factor in linear.problem.factors:
             if factor.element is None:
                 continue
@@ -412,14 +424,13 @@ def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[Le
                 kept[..., None] * of_factor.J_element,
             )
             inside = of_factor.squared_norms[is_inside]
-            squares += float(inside.sum())
-            dof += factor.n_rows * int(np.sum(inside > 0.0))
+            squares[b] += float(inside.sum())
+            n_residuals[b] += factor.n_rows * int(np.sum(inside > 0.0))
         rest = normal_equations(replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
-        squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
-        dof -= rank - int(_ranks(rest.reduced()[None])[0]) + int(rank_of_elements[block == b].sum())
-        blocks.append(LeftOut(squares, dof, rest.reduced()))
-    return blocks
+        squares[b] += float(pull @ rest.moved_by(pull[:, None])[:, 0])
+        without.append(rest)
+    return LeftOut(squares, n_residuals, block, everything, tuple(without))
 
 
 def _reduced_gradient(normal: NormalEquations[Any, Any]) -> Array:
