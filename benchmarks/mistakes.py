@@ -35,8 +35,8 @@ from pathlib import Path
 import numpy as np
 
 from legcal import ParameterErrors, SimulationSettings, Spread, load_dataset, simulate
-from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.diagnosis.mistakes import Assumed, as_given, mistakes
+from legcal.calibration.mistake_search import diagnose
+from legcal.calibration.mistakes import Assumed, as_given, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.dataset import Dataset
 from legcal.geometry.types import Array

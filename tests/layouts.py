@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array
 
 EYE = RigidTransform.identity()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Machine, ToolPoses, inverse_kinematics, load_mechanism, random_configurations
 from legcal.calibration.location.frames import PosePairs, predicted, transforms
-from legcal.geometry.rotations import rotation_matrices
+from legcal.geometry.motions import rotation_matrices
 from legcal.geometry.types import Array
 
 SIGMA_POSITION = 0.02e-3

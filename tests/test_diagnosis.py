@@ -13,10 +13,10 @@ from simulated import settings, simulated
 from thinned import thinned
 
 from legcal import Dataset, calibrate, load_dataset, load_mechanism, simulate
-from legcal.calibration.diagnosis import diagnosis
-from legcal.calibration.diagnosis.diagnosis import diagnose
-from legcal.calibration.diagnosis.leg_names import _permuted
-from legcal.calibration.diagnosis.mistakes import Assumed, Diagnosis, Mistake, mistakes
+from legcal.calibration import mistake_search
+from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, _permuted
+from legcal.calibration.mistake_search import diagnose
+from legcal.calibration.mistakes import Assumed, Mistake, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.measurements import row_names
@@ -144,7 +144,7 @@ def _try_only(kinds: Collection[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def few(data: OrderedDataset, given: Assumed | None = None) -> list[Mistake]:
         return [one for one in mistakes(data, given) if one.kind in kinds]
 
-    monkeypatch.setattr(diagnosis, "mistakes", few)
+    monkeypatch.setattr(mistake_search, "mistakes", few)
 
 
 def _diagnosed(d: Dataset) -> Diagnosis:
@@ -226,7 +226,7 @@ def test_what_was_tried_in_vain_stands_beside_a_refusal(
     rng = np.random.default_rng(0)
     with pytest.raises((NotVisible, DidNotConverge)) as refused:
         calibrate(_with_readings(d, rng.permuted(d.measurements.q, axis=0)))
-    assert diagnosis.NONE_EXPLAINS in refused.value.notes
+    assert NONE_EXPLAINS in refused.value.notes
 
 
 @pytest.mark.parametrize(

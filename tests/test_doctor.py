@@ -14,8 +14,7 @@ from simulated import simulated
 
 from legcal import doctor
 from legcal.calibration.detection import CHECKS, Examination, Finding
-from legcal.calibration.diagnosis.diagnosis import NONE_EXPLAINS
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis
 
 pytestmark = pytest.mark.usefixtures("without_remedies")
 

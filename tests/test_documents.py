@@ -17,7 +17,7 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH
 from pydantic import BaseModel
 
 from legcal import evaluate, load_mechanism
-from legcal.cli.app import app
+from legcal.cli.app import commands
 from legcal.data.dataset_file import DatasetEntry
 from legcal.descriptions.table import TableFile
 from legcal.files.schema import parse_yaml, validate
@@ -63,7 +63,7 @@ def _words(line: str) -> list[str]:
 
 @cache
 def _root() -> Any:
-    return typer.main.get_command(app)
+    return typer.main.get_command(commands())
 
 
 def _command(words: list[str]) -> tuple[Any, list[str]]:

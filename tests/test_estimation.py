@@ -106,12 +106,12 @@ def test_blocks_that_are_left_out_are_predicted_as_by_the_rest_alone(n_open: int
         weight = np.linalg.inv(covariance)
         cross = by_own.T @ weight
         weight -= cross.T @ np.linalg.pinv(cross @ by_own, hermitian=True) @ cross
-        assert left_out[b].squares == pytest.approx(innovation @ weight @ innovation, rel=1e-6)
-        assert left_out[b].dof == np.linalg.matrix_rank(weight, tol=1e-9)
+        assert left_out.squares[b] == pytest.approx(innovation @ weight @ innovation, rel=1e-6)
+        assert left_out.dof[b] == np.linalg.matrix_rank(weight, tol=1e-9)
         H = rest.T @ rest
         shared, others = H[:N_SHARED, :N_SHARED], H[N_SHARED:, :N_SHARED]
         by_rest = shared - others.T @ np.linalg.pinv(H[N_SHARED:, N_SHARED:]) @ others
-        np.testing.assert_allclose(left_out[b].information, by_rest, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(left_out.rest[b].reduced(), by_rest, rtol=1e-6, atol=1e-6)
 
 
 def _with_prior(

@@ -8,8 +8,8 @@ import pytest
 from command_line import run
 
 from legcal import calibrate, load_dataset
-from legcal.causes import Cause
 from legcal.data import new_dataset
+from legcal.errors import Cause
 from legcal.perception.placement import NotPlaced, Placement
 from legcal.perception.recognition import place_views
 

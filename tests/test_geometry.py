@@ -8,8 +8,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.files.motions import motion_from_xyz_quat, motion_to_xyz_quat
 from legcal.geometry.lines import distance_to_line, moment, nearest_point_to_origin, normal_basis
-from legcal.geometry.motions import frame_on_points, motion_of, product
-from legcal.geometry.rotations import nearest_rotation, roll_pitch_yaw
+from legcal.geometry.motions import (
+    frame_on_points,
+    motion_of,
+    nearest_rotation,
+    product,
+    roll_pitch_yaw,
+)
 from legcal.geometry.types import Array
 
 FAST = settings(deadline=None, max_examples=25)

@@ -13,8 +13,8 @@ BESIDE = "simulation"  # it knows the truth
 # The rooms, from below to above, and the modules of each that other rooms use; all others are its
 # own affair.
 LISTED = """
-geometry: covariances lines motions rotations tables types
-files: folder motions quantity reading schema table
+geometry: covariances lines motions tables types
+files: folder motions quantity schema table
 pages: document svg
 machine: actuator closing configurations equations files home inspection
     kinematics leg loader meshes model model_writer parameters picture redundancy rods shapes
@@ -50,7 +50,6 @@ OUTSIDE = {
     "__main__",
     "arguments",
     "brief",
-    "causes",
     "errors",
     "progress",
     "signals",
@@ -155,7 +154,6 @@ def test_four_steps_and_joint_fit_do_not_know_each_other() -> None:
 
 def test_estimation_knows_no_images_and_no_robot() -> None:
     assert {_room(other) for m in _of("estimation") for other in _reachable(m)} <= {
-        "causes",
         "errors",
         "files",
         "geometry",

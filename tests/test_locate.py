@@ -51,7 +51,7 @@ from legcal.errors import (
     NotIdentifiable,
     UsageError,
 )
-from legcal.geometry.rotations import nearest_rotation, rotation_matrices
+from legcal.geometry.motions import nearest_rotation, rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine.model import platform_pose
 

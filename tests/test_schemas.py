@@ -15,7 +15,7 @@ from format_schemas import FILES, FOLDER, ROOT
 from hexapod_example import Run
 from simulated import simulated
 
-from legcal.cli.app import app
+from legcal.cli.app import commands
 from legcal.data.dataset_file import read_dataset_file
 from legcal.descriptions.table import read_description
 from legcal.errors import LegcalError
@@ -94,8 +94,8 @@ def test_printed_documents_fit_their_schemas(example_run: Run) -> None:
 
 def test_every_command_that_prints_a_document_has_a_schema() -> None:
     own = {"calibrate": "result", "camera": "camera-calibration", "detect": "doctor"}
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    parameters = {name: {p.name for p in found.params} for name, found in commands.items()}
+    every = typer.main.get_command(commands()).commands  # type: ignore[attr-defined]
+    parameters = {name: {p.name for p in found.params} for name, found in every.items()}
     printing = {name for name, found in parameters.items() if "as_json" in found} | {"study"}
     assert len(printing) > 15
     assert {own.get(name, name) for name in printing} <= set(schema_names())

@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.location.frames import PosePairs, search, transforms
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.corners import Corners, join_corners
 from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
@@ -26,8 +25,6 @@ from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
-from legcal.perception.board_adjustment import board_poses_in_images, camera_poses_by_board
-from legcal.perception.board_corners import detect_corners, require_board
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
 from legcal.perception.photographs import nominal_placement
 from legcal.perception.placement import Placement
@@ -171,6 +168,8 @@ def _hand_eye(
     T_base_platform: Sequence[RigidTransform], T_frame_board: Sequence[RigidTransform]
 ) -> RigidTransform:
     """Return T_platform_board from poses of platform and board, by hand-eye calibration."""
+    from legcal.calibration.location.frames import PosePairs, search, transforms
+
     R, t = components(T_base_platform)
     M, p = components(T_frame_board)
     length = float(np.linalg.norm(np.ptp(t, axis=0))) + float(np.linalg.norm(p, axis=1).mean())
@@ -200,6 +199,10 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
     dataset, measurements = data.dataset, data.measurements
     if not dataset.boards:
         return None
+    # most datasets have no board
+    from legcal.perception.board_adjustment import board_poses_in_images, camera_poses_by_board
+    from legcal.perception.board_corners import detect_corners, require_board
+
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     view_of_row = np.array(measurements.view_names)[measurements.view]
     hand_held = {view.name for view in used if view.hand_held}

@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
 from legcal.calibration.board import needs_rough_cameras, rough_placement
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     DiagnosisBlock,
     LeftOut,
@@ -34,7 +34,6 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.joint_fit.diagnostics import arms_of_other_widths, wrong_arms_in_words
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.causes import Cause
 from legcal.data.corners import Corners, join_corners, write_corners
 from legcal.data.dataset import (
     CORNERS_NAME,
@@ -58,11 +57,10 @@ from legcal.data.outlines import (
     write_observations,
 )
 from legcal.data.reasons import Reason, Rejection, reason_in_words
-from legcal.errors import DatasetError, OutOfResources, UsageError, printable
+from legcal.errors import Cause, DatasetError, OutOfResources, UsageError, printable
 from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
 from legcal.files.quantity import SHOWN_IN
-from legcal.files.reading import MAX_IMAGE, read_bytes, read_json
-from legcal.files.schema import Document
+from legcal.files.schema import MAX_IMAGE, Document, read_bytes, read_json
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, IntArray
@@ -89,9 +87,12 @@ from legcal.pages.document import (
 from legcal.perception.diagnostics import BEFORE_FIT, hint_notes, images_left_out
 from legcal.perception.free_poses import views_without_rough_camera
 from legcal.perception.overlays import (
+    OVERLAYS,
+    PHOTOGRAPHS,
     Mark,
     PartMarks,
     draw,
+    is_overlay,
     marks_of_corners,
     marks_of_image,
 )
@@ -113,7 +114,6 @@ from legcal.vision.camera import Camera, spline_pieces
 from legcal.vision.visibility import PredictedLeg
 from legcal.workers import Run
 
-OVERLAYS, PHOTOGRAPHS = "overlays", "photographs"  # the subfolders of pictures
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # characters not allowed in file names
 _MAX_NAME = 80  # largest length of a file name
 Severity = Literal["error", "warning", "note"]
@@ -687,11 +687,6 @@ def _own_files(destination: Path) -> list[Path]:
         if path_problem(destination, name) is None
         and (name in tables or is_overlay(Path(name)) or is_overlay(Path(name), PHOTOGRAPHS))
     ]
-
-
-def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:
-    """Return whether a relative path is that of an overlay, or another picture of an image."""
-    return ".." not in name.parts and name.parts[:1] == (folder,) and name.suffix == ".jpg"
 
 
 # The page

@@ -36,23 +36,17 @@ from legcal.calibration.detection import (
     views_to_click,
     write_detection,
 )
-from legcal.calibration.diagnosis.diagnosis import (
-    MIN_IMAGES,
-    NONE_EXPLAINS,
-    diagnose,
-    notes_beside,
-)
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, notes_beside
 from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.mistake_search import MIN_IMAGES, diagnose
 from legcal.calibration.ordered_dataset import (
     OrderedDataset,
     contradicting_readings,
     order_dataset,
 )
 from legcal.calibration.pipeline import chosen_parameters, exact_cameras
-from legcal.causes import Cause, by_cause
 from legcal.data.cache import note_on_missing_photographs
 from legcal.data.dataset import Dataset, ImageReader, inspect_files, load_dataset
 from legcal.data.image_choice import dataset_at
@@ -60,7 +54,15 @@ from legcal.data.measurements import few_views, images_in_words, row_names
 from legcal.data.outlines import Outlines, along_legs, is_edited
 from legcal.data.photograph_notes import compression_notes, notes_on_moves, notes_on_photographs
 from legcal.data.reasons import Reason, reason_in_words
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, Problem
+from legcal.errors import (
+    Cause,
+    DatasetError,
+    DidNotConverge,
+    NotIdentifiable,
+    NotVisible,
+    Problem,
+    by_cause,
+)
 from legcal.files.folder import output_path
 from legcal.files.schema import few
 from legcal.geometry.types import Array, BoolArray

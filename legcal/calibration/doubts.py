@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.held_out import CrossValidation, cross_validate

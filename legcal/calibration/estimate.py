@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from legcal.calibration.board import BoardViews
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.fit import refine
@@ -35,7 +35,6 @@ from legcal.calibration.joint_fit.solution import Solution, in_file_order
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_BIAS_PX
-from legcal.causes import Cause
 from legcal.data.corners import Corners
 from legcal.data.measurements import Measurements, few_views, image_notes
 from legcal.data.outlines import (
@@ -47,7 +46,7 @@ from legcal.data.outlines import (
 )
 from legcal.data.photograph_notes import compression_notes
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.errors import Cause, DidNotConverge, NotIdentifiable, NotVisible
 from legcal.estimation.solver import minimise
 from legcal.estimation.uncertainty import restricted_log_likelihood
 from legcal.files.schema import few

@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.parameter_choices import Choices
 from legcal.calibration.joint_fit.variables import FittedLegs, fitted_legs, start_from
-from legcal.causes import Cause, by_cause
 from legcal.data.cache import DetectionPlan, plan_dataset
 from legcal.data.dataset import Dataset, rows_with_image
 from legcal.data.image_choice import dataset_at, images_to_name
@@ -31,7 +30,7 @@ from legcal.data.landmarks import platforms_by_landmarks
 from legcal.data.measurements import Measurements, images_in_words, row_names
 from legcal.data.outlines import Outlines, reject_unused_legs
 from legcal.data.photograph_notes import notes_on_moves
-from legcal.errors import DatasetError
+from legcal.errors import Cause, DatasetError, by_cause
 from legcal.files.schema import few
 from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -46,7 +45,7 @@ from legcal.perception.alignment import camera_moves
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs
 from legcal.progress import Report
-from legcal.workers import Run
+from legcal.workers import Run, in_turn
 
 # largest leg residual that errors of a nominal model explain, relative to the mean leg length
 MAX_NOMINAL_RESIDUAL = 0.03
@@ -259,7 +258,9 @@ def _with_moves(dataset: Dataset, plan: DetectionPlan, pool: Run, progress: Repo
         is_read |= bool(dataset.boards) and dataset.corners is None
         rows = [row for row in rows_with_image(dataset).tolist() if is_read[row]]
         load = dataset.image_reader(range(m.n_rows))
-        found = camera_moves(load, m, rows, pool, progress)
+        # Photographs that stay decoded are read here: processes that are forked later have them.
+        run = in_turn if load.keeps(rows) else pool
+        found = camera_moves(load, m, rows, run, progress)
         moves = {m.image[row]: move for row, move in found.items()}
     notes = (*dataset.file_notes, *notes_on_moves(m, moves))
     return replace(dataset, moves=moves, file_notes=notes) if moves else dataset

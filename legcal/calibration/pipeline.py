@@ -27,14 +27,7 @@ from typing import get_args
 import numpy as np
 
 from legcal.calibration.board import board_notes, rough_placement
-from legcal.calibration.diagnosis.diagnosis import (
-    NONE_EXPLAINS,
-    agreement_with_zeros,
-    diagnose,
-    notes_beside,
-)
-from legcal.calibration.diagnosis.leg_names import exchanged_legs
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, exchanged_legs, notes_beside
 from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
 from legcal.calibration.estimate import (
@@ -58,7 +51,6 @@ from legcal.calibration.joint_fit.parameter_choices import (
 )
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS
-from legcal.calibration.only import RARE, estimate_group, joint_error, likely_teeth
 from legcal.calibration.ordered_dataset import Options, OrderedDataset, order_dataset
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import Beside, check_overlays, with_overlays, write_result
@@ -226,6 +218,8 @@ def calibrate(
     # 6. Judge and write.
     found, group = estimate.in_file_order(), None
     if only is not None and choices.built is not None:
+        from legcal.calibration.only import estimate_group
+
         group = estimate_group(dataset.machine, found.solution, choices.built, turned, only)
     on_images = notes_beside(
         found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
@@ -282,9 +276,13 @@ def estimate_teeth(
     Return also by how much motors stand further than they read [rad].
     """
     machine, built = data.machine, options.choices.built
-    if built is not None:  # legs are where the model has them, as well as it is built
-        data = replace(data, joint_error=joint_error(machine, built))
-    if built is None or machine.spline_teeth is None:
+    if built is None:
+        return estimate_parameters(data, file_rows, options), {}
+    from legcal.calibration.only import RARE, joint_error, likely_teeth
+
+    # Legs are where the model has them, as well as it is built.
+    data = replace(data, joint_error=joint_error(machine, built))
+    if machine.spline_teeth is None:
         return estimate_parameters(data, file_rows, options), {}
     step = 2.0 * np.pi / machine.spline_teeth
     wide = replace(built, angles_at_zero=max(step, built.angles_at_zero or 0.0))
@@ -338,6 +336,8 @@ def _guesses(data: OrderedDataset, step: float) -> Iterator[dict[str, float]]:
     motors = [machine.legs[j].motor_label for j in machine.motors if machine.legs[j].reads_angle]
     tried = [{motor: side * step} for motor in motors for side in (1.0, -1.0)]
     if len(data.photographs.detect):
+        from legcal.calibration.mistake_search import agreement_with_zeros
+
         shown = agreement_with_zeros(data, tried)
         yield from (tried[k] for k in np.argsort(-np.array(shown), kind="stable")[:_GUESSES])
 
@@ -350,7 +350,7 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
 
     Raises NotVisible, NotIdentifiable or DidNotConverge, as the phases.
     """
-    rows, diagnosed = data.rows_of(file_rows), cache(diagnose)
+    rows, diagnosed = data.rows_of(file_rows), cache(_diagnosis)
     try:
         try:
             return _estimate(data, rows, options, diagnosed)
@@ -377,6 +377,13 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
             refusal.diagnosis = tuple(mistake.document() for mistake in diagnosis)
             refusal.consequences = error.facts
         raise refusal from error
+
+
+def _diagnosis(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
+    """Return the likely mistakes; a session that agrees with itself loads none of the search."""
+    from legcal.calibration.mistake_search import diagnose
+
+    return diagnose(data)
 
 
 def _with_notes(

@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     AxisInLink,
     BoardPose,
@@ -48,7 +48,6 @@ from legcal.calibration.joint_fit.parameter_choices import board_scale, dataset_
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, PlatformError, poses_at_readings
 from legcal.calibration.joint_fit.scale import single_witness
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.only import GroupEstimate
 from legcal.calibration.summary import Summarised, few_lines
 from legcal.data.corners import Corners
 from legcal.data.dataset import Dataset
@@ -72,6 +71,9 @@ from legcal.machine.parameters import (
 from legcal.machine.rods import actuators_of
 from legcal.perception.diagnostics import images_left_out
 from legcal.vision.camera import camera_numbers
+
+if TYPE_CHECKING:
+    from legcal.calibration.only import GroupEstimate
 
 REFUSED = "Do not load this into the controller"  # how the sentence begins where a doubt is grave
 

@@ -13,15 +13,10 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from legcal.calibration.detection import (
-    OVERLAYS,
-    Detection,
-    draw_images,
-    is_overlay,
-)
 from legcal.calibration.documents import (
     ParameterRow,
     Result,
@@ -44,7 +39,7 @@ from legcal.errors import (
     UsageError,
 )
 from legcal.files.folder import RESULT, in_the_way, path_problem, result_folder
-from legcal.files.reading import read_json
+from legcal.files.schema import read_json
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.home import home_of_legs
@@ -62,9 +57,13 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.pages.document import PAGE
+from legcal.perception.overlays import OVERLAYS, is_overlay
 from legcal.progress import Report, no_progress
 from legcal.vision.camera import Camera, camera_numbers, intrinsic_names, intrinsic_values
 from legcal.workers import Run, in_turn
+
+if TYPE_CHECKING:
+    from legcal.calibration.detection import Detection
 
 Beside = Callable[[Calibration, Path], None]
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
@@ -116,6 +115,8 @@ def write_result(
                 for path in (folder / STAGED_NAME, _urdf_of(folder / STAGED_NAME)):
                     path.unlink(missing_ok=True)
         if calibration.overlays:
+            from legcal.calibration.detection import draw_images
+
             try:
                 detection = replace(
                     _as_detection(dataset, solution),
@@ -445,6 +446,8 @@ def earlier_overlays(destination: Path) -> list[Path]:
 
 def _as_detection(dataset: Dataset, solution: Solution) -> Detection:
     """Return the outlines, legs and cameras of a fit as a detection."""
+    from legcal.calibration.detection import Detection
+
     placed = solution.placement(dataset.machine, dataset.measurements)
     return Detection(
         dataset=dataset,

@@ -899,12 +899,13 @@ class _Scores:
     """Rao's scores of all hypotheses in each block of images."""
 
     scores: Projected
-    column: Sequence[IntArray]  # (d, n_blocks) columns of each hypothesis, -1 without any
+    column: Sequence[IntArray]  # (d, n_blocks) columns of each hypothesis in turn, -1 without any
 
     @cached_property
     def _of_hypotheses(self) -> list[Scores]:
         """The scores of each hypothesis in all blocks."""
-        return [self.scores.at(column[column >= 0]) for column in self.column]
+        ends = [0, *(int(column.max(initial=-1)) + 1 for column in self.column)]
+        return [self.scores.at(slice(*own)) for own in pairwise(np.maximum.accumulate(ends))]
 
     def of_single(
         self, group: Sequence[tuple[int, int]], sigma: Sequence[Array]

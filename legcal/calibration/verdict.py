@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.doubts import (
     CAMERA,
@@ -25,7 +26,6 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_acc
 from legcal.calibration.joint_fit.scale import ALL_READINGS, SCALE, scale_witnesses
 from legcal.calibration.joint_fit.sensitivity import EXACT_CAMERAS, SIGMA_EXACT
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.only import GroupEstimate
 from legcal.calibration.result import REFUSED, Calibration, Verdict
 from legcal.calibration.session_changes import MIN_IMAGES, SessionTests, session_tests
 from legcal.calibration.summary import mm_deg
@@ -40,6 +40,9 @@ from legcal.files.schema import few
 from legcal.files.table import Column, read_table
 from legcal.geometry.types import IntArray
 from legcal.machine.tolerance import Tolerance
+
+if TYPE_CHECKING:
+    from legcal.calibration.only import GroupEstimate
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 NEGLIGIBLE = 0.3  # of the predicted error: it adds less than a twentieth to that

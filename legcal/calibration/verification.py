@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from legcal.brief import brief
-from legcal.calibration.diagnosis.diagnosis import notes_beside
+from legcal.calibration.diagnosis import notes_beside
 from legcal.calibration.documents import (
     CheckDocument,
     ExplanationBlock,

@@ -1,6 +1,7 @@
 """The command line: parses, calls, prints. The work of the commands is elsewhere.
 
-Heavy imports happen inside the commands, so that ``legcal --help`` answers at once.
+Heavy imports happen inside the commands, so that ``legcal --help`` answers at once, and a command
+loads no other.
 """
 
 from __future__ import annotations
@@ -9,28 +10,15 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from importlib import import_module
 from itertools import pairwise
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from legcal.cli.calibrate import calibrate
-from legcal.cli.machines import (
-    evaluate,
-    example,
-    export,
-    identify,
-    inspect,
-    locate,
-    new,
-    schema,
-    view,
-)
 from legcal.cli.options import print_failure
-from legcal.cli.sessions import camera, detect, doctor, import_, init, plan, shoot
-from legcal.cli.simulated import simulate, study
 from legcal.errors import LegcalError, UsageError, printable
 from legcal.signals import INTERRUPTED, raise_if_stopped
 from legcal.version import __version__
@@ -74,23 +62,12 @@ class _Group(_PlainHelp, TyperGroup):
     pass
 
 
-app = typer.Typer(
-    name="legcal",
-    help="Calibrate parallel robots from photographs of their legs.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    cls=_Group,
-    rich_markup_mode=None,
-)
-
-
 def _print_version(is_given: bool) -> None:
     if is_given:
         typer.echo(f"legcal {__version__}")
         raise typer.Exit
 
 
-@app.callback()
 def _root(
     version: Annotated[
         bool,
@@ -102,18 +79,41 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-PANELS: dict[str, Sequence[Callable[..., None]]] = {
-    "Your machine": (new, inspect, identify),
-    "Photographs": (camera, plan, shoot, init, import_, doctor, detect),
-    "Calibrate": (calibrate,),
-    "Results": (evaluate, locate, export, view),
-    "No machine yet": (example, simulate),
-    "For programs": (schema,),
+# By panel of the help, and the module that has them
+COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
+    "Your machine": {"machines": ("new", "inspect", "identify")},
+    "Photographs": {"sessions": ("camera", "plan", "shoot", "init", "import", "doctor", "detect")},
+    "Calibrate": {"calibrate": ("calibrate",)},
+    "Results": {"machines": ("evaluate", "locate", "export", "view")},
+    "No machine yet": {"machines": ("example",), "simulated": ("simulate",)},
+    "For programs": {"machines": ("schema",), "simulated": ("study",)},
 }
-for panel, commands in PANELS.items():
-    for command in commands:
-        app.command(command.__name__.rstrip("_"), cls=_Command, rich_help_panel=panel)(command)
-app.add_typer(study, name="study", cls=_Group, rich_help_panel="For programs")
+
+
+def commands(words: Sequence[str] = ()) -> typer.Typer:
+    """Return the command line: of all commands, or of the one that the words begin with."""
+    app = typer.Typer(
+        name="legcal",
+        help="Calibrate parallel robots from photographs of their legs.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        cls=_Group,
+        rich_markup_mode=None,
+    )
+    app.callback()(_root)
+    known = [
+        (panel, module, name)
+        for panel, modules in COMMANDS.items()
+        for module, names in modules.items()
+        for name in names
+    ]
+    for panel, module, name in [one for one in known if one[2] in words[:1]] or known:
+        loaded = import_module(f"legcal.cli.{module}")
+        if isinstance(found := getattr(loaded, {"import": "import_"}.get(name, name)), typer.Typer):
+            app.add_typer(found, name=name, cls=_Group, rich_help_panel=panel)
+        else:
+            app.command(name, cls=_Command, rich_help_panel=panel)(found)
+    return app
 
 
 def _refuse_empty(words: Sequence[str]) -> None:
@@ -176,7 +176,7 @@ def run(*, as_json: bool) -> int:
     try:
         _refuse_empty(sys.argv[1:])
         _refuse_replaced(sys.argv[1:])
-        code = app(standalone_mode=False, prog_name="legcal")
+        code = commands(sys.argv[1:])(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error
     except Exception as error:  # allowed only here, at the boundary to the shell

@@ -26,8 +26,7 @@ from legcal.data.outlines import (
     write_observations,
 )
 from legcal.files.folder import write_atomically
-from legcal.files.reading import MAX_DOCUMENT, MAX_IMAGE, read_bytes
-from legcal.files.schema import FileSchema, few
+from legcal.files.schema import MAX_DOCUMENT, MAX_IMAGE, FileSchema, few, read_bytes
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.version import __version__
 from legcal.vision.board import board_document

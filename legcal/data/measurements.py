@@ -18,7 +18,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.causes import Cause, by_cause
 from legcal.data.reading_units import (
     ReadingUnit,
     UnitPlace,
@@ -28,7 +27,7 @@ from legcal.data.reading_units import (
     likely_cause,
     readings_of_lengths,
 )
-from legcal.errors import Problem
+from legcal.errors import Cause, Problem, by_cause
 from legcal.files.folder import path_problem
 from legcal.files.schema import closest, describe, few
 from legcal.files.table import Column, Table, read_table

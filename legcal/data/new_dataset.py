@@ -30,8 +30,16 @@ from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_destination, check_path, new_files, result_folder
-from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import NAME_NEEDED, Document, Number, describe, few, is_name
+from legcal.files.schema import (
+    MAX_IMAGE,
+    NAME_NEEDED,
+    Document,
+    Number,
+    describe,
+    few,
+    is_name,
+    read_bytes,
+)
 from legcal.machine.files import DATASET_YAML, shipped_folder, shipped_names
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism

@@ -17,8 +17,17 @@ from pathlib import Path, PurePosixPath
 
 from legcal.data.image_choice import DAY, seconds_in, seconds_of_column
 from legcal.errors import Code, DatasetError, Problem
-from legcal.files.reading import FOREIGN_SUFFIXES, HEIC_SUFFIXES, MAX_IMAGE, read_bytes
-from legcal.files.schema import NAME_NEEDED, closest, describe, few, is_name
+from legcal.files.schema import (
+    FOREIGN_SUFFIXES,
+    HEIC_SUFFIXES,
+    MAX_IMAGE,
+    NAME_NEEDED,
+    closest,
+    describe,
+    few,
+    is_name,
+    read_bytes,
+)
 from legcal.files.table import Table
 from legcal.vision.image_file import (
     CONVERT,

@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from legcal.causes import Cause
+from legcal.errors import Cause
 
 
 class Reason(StrEnum):

@@ -20,8 +20,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csc_array
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry.motions import components, motions_of
-from legcal.geometry.rotations import turned
+from legcal.geometry.motions import components, motions_of, turned
 from legcal.geometry.types import Array, IntArray
 
 S = TypeVar("S")  # the state: a dataclass with one field for each block of variables

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_array, vstack
+from scipy.sparse import csc_array, csr_array, hstack
 
 from legcal.estimation.problem import Linearization, Residuals
 from legcal.estimation.solver import (
@@ -174,46 +174,50 @@ def response(normal: NormalEquations[Any, Any], changes: Mapping[str, Array]) ->
     *changes* has (n, q, c) for factors by name.
     """
     kept, _, _ = _gradients(normal, changes)
-    return -normal.moved_by(kept)
+    return -normal.moved_by(kept.T)
 
 
 def _gradients(
     normal: NormalEquations[Any, Any], columns: Mapping[str, Any]
-) -> tuple[Array, Array, csc_array]:
-    """Return J^T times whitened columns (n, q, c) of factors by name, and the columns, stacked.
+) -> tuple[Array, csr_array, csr_array]:
+    """Return J^T times whitened columns (n, q, c) of factors by name, and the columns (c, n q).
 
-    For kept unknowns with elements at their minimum (n_kept, c), and for elements in the tangent
-    space of their constraints (n_elements, d, c). Columns are sparse, and may be given so (n q, c):
+    For kept unknowns with elements at their minimum (c, n_kept), and for elements in the tangent
+    space of their constraints (c, n_elements d). Columns are sparse, and may be given so (n q, c):
     there may be thousands, each of which acts on few measurements.
     """
-    problem, c = normal.problem, next(iter(columns.values())).shape[-1]
-    kept = np.zeros((problem.n_kept + 1, c))
-    elements = np.zeros((problem.n_elements * problem.d_element, c))
+    problem, c, d = normal.problem, next(iter(columns.values())).shape[-1], normal.problem.d_element
+    kept = csr_array((c, problem.n_kept + 1))
+    elements = csr_array((c, problem.n_elements * d))
     stacked = []
     for name, of_factor in columns.items():
         sparsity, rows = problem.sparsity[name], normal.linear[name]
         n, q = rows.r.shape
-        flat = csc_array(of_factor.reshape(n * q, c))
+        flat = csr_array(csc_array(of_factor.reshape(n * q, c)).T)
         stacked.append(flat)
-        number = np.arange(n * q).reshape(n, q)
-        for rows_of_group, unknowns in sparsity.members:
-            J, own = rows.J[rows_of_group], number[rows_of_group].ravel()
-            products = np.asarray(flat[own].T @ J.reshape(len(own), J.shape[2]))
-            np.add.at(kept, unknowns, products.T)
+        kept += flat @ _scattered(rows.J, sparsity.index, kept.shape[1])
         if sparsity.element is not None:
-            d = problem.d_element
-            unknown, measured = np.broadcast_arrays(
-                sparsity.element[:, None, None] * d + np.arange(d), number[..., None]
-            )
-            place = unknown.ravel(), measured.ravel()
-            by = csc_array((rows.J_element.ravel(), place), (len(elements), n * q))
-            elements += (by @ flat).toarray()
+            unknown = sparsity.element[:, None] * d + np.arange(d)
+            elements += flat @ _scattered(rows.J_element, unknown, elements.shape[1])
     following = _element_derivatives(normal).reshape(-1, problem.n_kept)
-    kept = kept[:-1] + following.T @ elements
-    of_elements = elements.reshape(problem.n_elements, problem.d_element, c)
+    of_kept = elements @ following
+    of_kept += kept[:, :-1].toarray()
     if normal.tangent is not None:
-        of_elements = np.swapaxes(normal.tangent.Z, 1, 2) @ of_elements
-    return kept, of_elements, vstack(stacked, "csc")
+        elements = elements @ _block_diagonal(normal.tangent.Z)
+    return of_kept, elements, hstack(stacked, "csr")
+
+
+def _block_diagonal(blocks: Array) -> csr_array:
+    """Return blocks (n, d, f) as a sparse matrix (n d, n f)."""
+    n, _, f = blocks.shape
+    return _scattered(blocks, np.arange(n * f).reshape(n, f), n * f)
+
+
+def _scattered(J: Array, unknown: IntArray, size: int) -> csr_array:
+    """Return derivatives (n, q, m) by unknowns (n, m) of *size*, as a sparse matrix (n q, size)."""
+    n, q, m = J.shape
+    starts, place = m * np.arange(n * q + 1), np.repeat(unknown, q, axis=0)
+    return csr_array((J.ravel(), place.ravel(), starts), shape=(n * q, size))
 
 
 def restricted_log_likelihood(minimum: Minimum[Any]) -> float:
@@ -253,33 +257,40 @@ class Projected:
     """
 
     score: Array  # (c,)
-    columns: Any  # sparse, (n, c), of the measurements of all factors
-    response: Array  # (k, c)
-    gradient: Array  # (k, c)
+    size: Array  # (c,) squares of the columns before the fit absorbs its part
+    # sparse, (c, m): the measurements of all factors, and the gradients by the elements, which
+    # take their responses off
+    columns: csr_array
+    projected: csr_array
+    response: Array  # (c, k) of the kept unknowns
+    gradient: Array  # (c, k)
 
     @classmethod
     def of(cls, normal: NormalEquations[Any, Any], columns: Mapping[str, Any]) -> Projected:
         """Project *columns* (n, q, c) of factors by name; *normal* is of plain squares."""
-        kept, elements, stacked = _gradients(normal, columns)
-        c = stacked.shape[1]
-        moved = normal.V_inverse @ elements
-        gradient = np.concatenate([kept, elements.reshape(-1, c)])
-        response = np.concatenate([normal.moved_by(kept), moved.reshape(-1, c)])
-        residual = np.concatenate([normal.linear[name].r.ravel() for name in columns])
-        of_fit = np.concatenate([_reduced_gradient(normal), normal.g_elements.ravel()])
-        score = stacked.T @ residual - response.T @ of_fit
-        return cls(np.asarray(score), stacked, response, gradient)
+        gradient, elements, stacked = _gradients(normal, columns)
+        response = normal.moved_by(gradient.T).T
+        projected = hstack([stacked, -(elements @ _block_diagonal(normal.V_inverse))], "csr")
+        residual = [normal.linear[name].r.ravel() for name in columns]
+        score = projected @ np.concatenate([*residual, normal.g_elements.ravel()])
+        return cls(
+            score - response @ _reduced_gradient(normal),
+            np.asarray(stacked.multiply(stacked).sum(axis=1)),
+            hstack([stacked, elements], "csr"),
+            projected,
+            response,
+            gradient,
+        )
 
     def information(self, of: IntArray | slice, by: IntArray | slice) -> Array:
         """Return v^T M v of some columns by others."""
-        products = (self.columns[:, of].T @ self.columns[:, by]).toarray()
-        return np.asarray(products - self.response[:, of].T @ self.gradient[:, by])
+        products = (self.projected[of] @ self.columns[by].T).toarray()
+        return np.asarray(products - self.response[of] @ self.gradient[by].T)
 
-    def at(self, columns: IntArray) -> Scores:
+    def at(self, columns: IntArray | slice) -> Scores:
         """Return the scores of some columns."""
-        own = self.columns[:, columns]
-        size = np.asarray(own.multiply(own).sum(axis=0))
-        return Scores(self.score[columns], self.information(columns, columns), size)
+        information = self.information(columns, columns)
+        return Scores(self.score[columns], information, self.size[columns])
 
     def given(self, numbers: Estimated) -> Projected:
         """Return the columns less what a fit that has these numbers as well absorbs."""
@@ -291,8 +302,8 @@ class Projected:
         return replace(
             self,
             score=self.score - score,
-            response=np.concatenate([self.response, response.T]),
-            gradient=np.concatenate([self.gradient, gradient.T]),
+            response=np.concatenate([self.response, response], axis=1),
+            gradient=np.concatenate([self.gradient, gradient], axis=1),
         )
 
 
@@ -368,15 +379,27 @@ def size_left(scores: Scores, covariance: Array) -> Array:
     return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
 
 
-class LeftOut(NamedTuple):
-    """How well a block of eliminated elements is predicted by all else."""
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """How well blocks of eliminated elements are predicted by all else."""
 
-    squares: float  # squared Mahalanobis distance of its measurements from their prediction
-    dof: int  # independent innovations, without what only the block determines
-    information: Array  # (n_kept, n_kept) of all else
+    squares: Array  # (n_blocks,) squared Mahalanobis distances of measurements from predictions
+    n_residuals: IntArray  # (n_blocks,)
+    block: IntArray  # (n_elements,) of each element, from 0
+    everything: NormalEquations[Any, Any]
+    rest: tuple[NormalEquations[Any, Any], ...]  # without each block
+
+    @property
+    def dof(self) -> IntArray:
+        """Independent innovations (n_blocks,), without what only the block determines."""
+        of_all, *of_rest = (
+            int(_ranks(normal.reduced()[None])[0]) for normal in (self.everything, *self.rest)
+        )
+        own = np.bincount(self.block, _ranks(self.everything.V), len(self.rest)).astype(np.intp)
+        return np.asarray(self.n_residuals - (of_all - np.array(of_rest)) - own, dtype=np.intp)
 
 
-def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[LeftOut]:
+def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> LeftOut:
     """Return how well blocks of eliminated elements are predicted by all else.
 
     The block of each element is given, (n_elements,) from 0. The measurements of a block are
@@ -384,12 +407,12 @@ def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[Le
     their innovations, whitened by the covariance of these. For right models they are as large as
     their number.
     """
-    blocks = list[LeftOut]()
-    everything = normal_equations(linear)
-    gradient, rank = _reduced_gradient(everything), int(_ranks(everything.reduced()[None])[0])
-    rank_of_elements = _ranks(everything.V)
-    for b in range(int(block.max(initial=-1)) + 1):
-        rows, squares, dof = dict(linear.rows), 0.0, 0
+    n_blocks = int(block.max(initial=-1)) + 1
+    everything, without = normal_equations(linear), list[NormalEquations[Any, Any]]()
+    gradient, squares = _reduced_gradient(everything), np.zeros(n_blocks)
+    n_residuals = np.zeros(n_blocks, dtype=np.intp)
+    for b in range(n_blocks):
+        rows = dict(linear.rows)
         for factor in linear.problem.factors:
             if factor.element is None:
                 continue
@@ -401,14 +424,13 @@ def left_out_blocks(linear: Linearization[Any, Any], block: IntArray) -> list[Le
                 kept[..., None] * of_factor.J_element,
             )
             inside = of_factor.squared_norms[is_inside]
-            squares += float(inside.sum())
-            dof += factor.n_rows * int(np.sum(inside > 0.0))
+            squares[b] += float(inside.sum())
+            n_residuals[b] += factor.n_rows * int(np.sum(inside > 0.0))
         rest = normal_equations(replace(linear, rows=rows))
         pull = _reduced_gradient(rest) - gradient
-        squares += float(pull @ rest.moved_by(pull[:, None])[:, 0])
-        dof -= rank - int(_ranks(rest.reduced()[None])[0]) + int(rank_of_elements[block == b].sum())
-        blocks.append(LeftOut(squares, dof, rest.reduced()))
-    return blocks
+        squares[b] += float(pull @ rest.moved_by(pull[:, None])[:, 0])
+        without.append(rest)
+    return LeftOut(squares, n_residuals, block, everything, tuple(without))
 
 
 def _reduced_gradient(normal: NormalEquations[Any, Any]) -> Array:

@@ -22,8 +22,7 @@ from importlib.resources import files
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
-from legcal.files.reading import read_json
-from legcal.files.schema import few, read_yaml
+from legcal.files.schema import few, read_json, read_yaml
 from legcal.signals import held_back_signals, raise_if_stopped
 
 TEMPORARY_SUFFIX = ".legcal-part"

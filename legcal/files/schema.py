@@ -1,6 +1,8 @@
-"""Files that people write: YAML read safely, and the errors of a schema in sentences."""
+"""Files that people write: read up to a size, YAML safely, errors of a schema in sentences."""
 
 import difflib
+import errno
+import json
 import os
 import re
 import reprlib
@@ -25,10 +27,16 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from legcal.brief import brief
-from legcal.causes import Cause
-from legcal.errors import BadValue, Code, DatasetError, LegcalError, Problem
-from legcal.files.reading import MAX_TEXT, TooLarge, read_bytes
+from legcal.errors import BadValue, Cause, Code, DatasetError, LegcalError, Problem
 
+MAX_TEXT = 16_000_000  # bytes of a table, YAML or URDF: enough for the largest table of outlines
+MAX_DOCUMENT = 32_000_000  # bytes of a JSON document from legcal
+MAX_IMAGE = 256_000_000
+# Endings of photographs: read, read with pi-heif, and of other formats
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+FOREIGN_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".webp", ".gif", ".bmp", ".jp2", ".jxl",
+                    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")  # fmt: skip
 MAX_NAMED = 5  # maximum number of names in one sentence
 _MOST_NAMES = 30  # maximum number of names in a hint that lists all
 _NEAREST_NAMES = 10  # in a hint that does not
@@ -57,9 +65,27 @@ _NEEDED = {
     "too_short": "at least {min_length} entries",
     "too_long": "at most {max_length} entries",
 }
-
-
 NAME_NEEDED = "printable characters without spaces at the ends, the first none of = + - @"
+
+
+class TooLarge(OSError):
+    """A file of more bytes than its kind can have."""
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """Return the bytes of a file; OSError where it cannot be read or has more than *most*."""
+    n_bytes = os.path.getsize(path)
+    if n_bytes > most:
+        raise TooLarge(errno.EFBIG, f"{n_bytes} bytes", str(path))
+    return path.read_bytes()
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file; OSError or ValueError where there is none."""
+    try:
+        return json.loads(read_bytes(path, MAX_DOCUMENT))
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def is_name(name: str) -> bool:

@@ -28,9 +28,10 @@ import numpy as np
 
 from legcal.errors import HEADER, Code, DatasetError, Place, Problem
 from legcal.files.quantity import ANGLE, LENGTH
-from legcal.files.reading import FOREIGN_SUFFIXES, SUFFIXES
 from legcal.files.schema import (
+    FOREIGN_SUFFIXES,
     NAME_NEEDED,
+    SUFFIXES,
     closest,
     content_of,
     describe,

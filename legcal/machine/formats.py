@@ -37,7 +37,6 @@ from legcal.machine.files import (
     read_mechanism_file,
     yaml_of_urdf,
 )
-from legcal.machine.mjcf import read_mjcf_source
 from legcal.machine.solver import Equations, solve
 from legcal.machine.spanning_tree import (
     Source,
@@ -147,6 +146,8 @@ def _read_xml(path: Path) -> Source:
     content = content_of(path, FILE_KIND, ModelError)
     root = parse_xml(path, content, "mechanism file")
     if root.tag == "mujoco":
+        from legcal.machine.mjcf import read_mjcf_source
+
         return read_mjcf_source(path, content)
     if root.tag != "robot":
         sdf = "an SDF file of Gazebo"

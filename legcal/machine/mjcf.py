@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.geometry.lines import cross
-from legcal.geometry.rotations import rotation_between
+from legcal.geometry.motions import rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.chain import Closure
 from legcal.machine.spanning_tree import (

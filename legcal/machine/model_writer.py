@@ -18,7 +18,7 @@ from legcal.errors import DidNotConverge, ModelError
 from legcal.files.folder import new_files
 from legcal.files.motions import motion_to_xyz_quat
 from legcal.files.schema import read_yaml
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.machine.files import (
     FILE_KIND,
     FOLDER_YAML,

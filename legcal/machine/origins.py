@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import OutOfClass
-from legcal.geometry.motions import matrix_inverse, matrix_product
-from legcal.geometry.rotations import rotation_between
+from legcal.geometry.motions import matrix_inverse, matrix_product, rotation_between
 from legcal.geometry.types import Array
 from legcal.machine.actuator import Actuator, Arm
 from legcal.machine.chain import Bodies, Closure, Connection, rigid_bodies
@@ -47,7 +46,9 @@ def _moved_origins(
     def move(handle: Handle, motion: Motion, body: str) -> None:
         """Move a joint by a motion given in a link of its body."""
         joint, T_body_link = handle.joint, handles.bodies.T_body_link
-        T_parent_origin, is_turned = origins.get(joint.name, (joint.T_parent_origin, False))
+        T_parent_origin, is_turned = origins.setdefault(joint.name, (joint.T_parent_origin, False))
+        if motion.turn is None and not motion.shift.any():
+            return
         there = RigidTransform.from_matrix(
             matrix_product(matrix_inverse(T_body_link[joint.parent]), T_body_link[body])
         )

@@ -17,8 +17,7 @@ from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import axis_angles, cross, normal_basis, turned_axis
-from legcal.geometry.motions import frame_on_points, matrix_applied
-from legcal.geometry.rotations import rotation_between
+from legcal.geometry.motions import frame_on_points, matrix_applied, rotation_between
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import ActuatorColumns
 from legcal.machine.leg import (

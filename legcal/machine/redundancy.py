@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
-from legcal.causes import Cause
+from legcal.errors import Cause
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.closing import solve_poses

@@ -31,8 +31,14 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.lines import cross, distance_to_line
-from legcal.geometry.motions import matrix_applied, matrix_inverse, matrix_of, matrix_product
-from legcal.geometry.rotations import nearest_rotation, rotation_between
+from legcal.geometry.motions import (
+    matrix_applied,
+    matrix_inverse,
+    matrix_of,
+    matrix_product,
+    nearest_rotation,
+    rotation_between,
+)
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.actuator import Actuator, Arm, Line
 from legcal.machine.chain import Bodies, Connection

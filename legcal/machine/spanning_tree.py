@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.chain import Closure, ClosureKind
 from legcal.machine.files import MAX_LOOPS, LegcalBlock

@@ -15,8 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.brief import brief
 from legcal.errors import Code, ModelError, Problem, Problems
 from legcal.files.schema import NAME_NEEDED, content_of, describe, is_name
-from legcal.geometry.motions import matrix_of
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import matrix_of, roll_pitch_yaw
 from legcal.geometry.types import Array
 
 MAX_ELEMENTS = 50_000

@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from legcal.geometry.lines import normal_basis, turned_axis
-from legcal.geometry.rotations import turned
+from legcal.geometry.motions import turned
 from legcal.geometry.types import Array
 from legcal.machine.equations import VectorOps, axis_in_leg, twist_residual
 from legcal.machine.leg import JointType

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.causes import Cause, by_cause
 from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, View, few_views, images_in_words
 from legcal.data.outlines import Outlines, is_edited
 from legcal.data.reasons import USED, Reason, Rejection
+from legcal.errors import Cause, by_cause
 from legcal.geometry.motions import pose_distance
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped, shrunk

@@ -36,8 +36,7 @@ from legcal.estimation.problem import (
 )
 from legcal.estimation.solver import information
 from legcal.geometry.lines import cross
-from legcal.geometry.motions import motions_of
-from legcal.geometry.rotations import rotation_matrices
+from legcal.geometry.motions import motions_of, rotation_matrices
 from legcal.geometry.tables import Table, first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.equations import is_constrained, machine_equations

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from legcal.causes import Cause
 from legcal.data.reasons import USED, Reason, Rejection
+from legcal.errors import Cause
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.vision.image_file import Grey, shrink
 

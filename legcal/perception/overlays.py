@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
@@ -23,6 +24,7 @@ from legcal.vision.visibility import PredictedLeg
 
 MarkKind = Literal["edge 1", "edge 2", "axis", "body", "rejected", "predicted", "corner"]
 N_POINTS = 40  # of a curve
+OVERLAYS, PHOTOGRAPHS = "overlays", "photographs"  # the subfolders of pictures
 
 Canvas = NDArray[np.uint8]
 
@@ -57,6 +59,11 @@ _DASH, _GAP = 9.0, 7.0  # in widths of a line
 _CROSS = 5.0  # arms of a corner, in widths of a line
 
 _PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # of texts along a curve
+
+
+def is_overlay(name: Path, folder: str = OVERLAYS) -> bool:
+    """Return whether a relative path is that of an overlay, or another picture of an image."""
+    return ".." not in name.parts and name.parts[:1] == (folder,) and name.suffix == ".jpg"
 
 
 class Mark(NamedTuple):

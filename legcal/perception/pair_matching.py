@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import cross
-from legcal.geometry.rotations import cross_matrices, rotation_matrices
+from legcal.geometry.motions import cross_matrices, rotation_matrices
 from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, Image, IntArray
 from legcal.machine.leg import Cylinder

@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.causes import Cause, by_cause
 from legcal.data.measurements import Measurements, few_views, image_notes
-from legcal.errors import NotVisible
+from legcal.errors import Cause, NotVisible, by_cause
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder, Leg, cylinder_of_arm
 from legcal.machine.rods import arms_at

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.causes import Cause
 from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.outlines import Outlines
+from legcal.errors import Cause
 from legcal.geometry.types import Array, IntArray
 from legcal.perception.alignment import is_moved
 from legcal.perception.camera_search import (

@@ -20,10 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.causes import Cause
 from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
-from legcal.errors import NotVisible
+from legcal.errors import Cause, NotVisible
 from legcal.estimation.loss import cauchy_weights
 from legcal.estimation.problem import (
     EstimationProblem,

@@ -36,7 +36,7 @@ from legcal.files.motions import Pose, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import Document, Number, SparseDocument, Version
 from legcal.files.table import format_table
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.configurations import Configurations
 from legcal.machine.model import Machine

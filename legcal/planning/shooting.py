@@ -31,7 +31,6 @@ from legcal.calibration.joint_fit.predicted import (
     fitted_covariance,
 )
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.causes import Cause
 from legcal.data.dataset import POSES_NAME, Dataset, inspect_files, load_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.image_tables import measurements_at
@@ -39,7 +38,14 @@ from legcal.data.measurements import measurement_table, measurements_in
 from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import DatasetError, DidNotConverge, LegcalError, OutOfResources, UsageError
+from legcal.errors import (
+    Cause,
+    DatasetError,
+    DidNotConverge,
+    LegcalError,
+    OutOfResources,
+    UsageError,
+)
 from legcal.files.folder import takes_no_files, write_atomically
 from legcal.files.table import format_table
 from legcal.geometry.types import Array, BoolArray

@@ -28,8 +28,7 @@ from legcal.data.image_choice import seconds_in, unix_seconds
 from legcal.data.photograph_matching import find_photographs, photograph_time
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.reading import HEIC_SUFFIXES, MAX_IMAGE, SUFFIXES, read_bytes
-from legcal.files.schema import describe
+from legcal.files.schema import HEIC_SUFFIXES, MAX_IMAGE, SUFFIXES, describe, read_bytes
 from legcal.files.table import is_number
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine

@@ -10,7 +10,6 @@ import numpy as np
 from markupsafe import Markup
 from scipy.special import ndtri
 
-from legcal.calibration.evaluation import evaluate
 from legcal.calibration.joint_fit.platform import PlatformMap, platform_map
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
@@ -212,6 +211,8 @@ def _maps(workspace: PlatformMap) -> list[Block]:
 
 def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) -> list[Block]:
     """Return the errors of the nominal and the calibrated model."""
+    from legcal.calibration.evaluation import evaluate
+
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
     sigma = {row.name: row.sigma for row in calibration.result.parameters}

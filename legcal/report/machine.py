@@ -13,7 +13,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from legcal.files.quantity import SHOWN_IN
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.machine.model import Machine
 from legcal.machine.parameters import leg_labels, legs_in_words, list_in_words
 from legcal.pages.document import Table

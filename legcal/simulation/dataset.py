@@ -28,8 +28,7 @@ from legcal.files.folder import (
     result_folder,
 )
 from legcal.files.motions import motion_to_xyz_quat
-from legcal.files.reading import MAX_DOCUMENT, read_bytes
-from legcal.files.schema import Document, describe
+from legcal.files.schema import MAX_DOCUMENT, Document, describe, read_bytes
 from legcal.geometry.types import Array
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine

@@ -25,8 +25,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.reading_units import sigmas_of_legs
 from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
-from legcal.files.reading import read_json
-from legcal.files.schema import validate
+from legcal.files.schema import read_json, validate
 from legcal.files.table import Column
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.closing import singularities, singularity

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
-from legcal.files.reading import MAX_TEXT, read_bytes
+from legcal.files.schema import MAX_TEXT, read_bytes
 from legcal.machine.home import home_of_legs
 from legcal.machine.leg import Leg, ParameterId
 from legcal.machine.loader import load_mechanism

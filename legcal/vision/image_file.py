@@ -30,9 +30,8 @@ from PIL.Image import Exif
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from legcal.causes import Cause
-from legcal.errors import BadValue, Code, DatasetError, Place, Problem
-from legcal.files.reading import HEIC_SUFFIXES, MAX_IMAGE, SUFFIXES, read_bytes
+from legcal.errors import BadValue, Cause, Code, DatasetError, Place, Problem
+from legcal.files.schema import HEIC_SUFFIXES, MAX_IMAGE, SUFFIXES, read_bytes
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, intrinsic_names
 

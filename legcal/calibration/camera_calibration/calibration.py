@@ -34,8 +34,7 @@ from legcal.calibration.camera_calibration.document import (
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.data.photograph_notes import differences, recorded
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
-from legcal.files.reading import MAX_IMAGE, read_bytes
-from legcal.files.schema import describe, few
+from legcal.files.schema import MAX_IMAGE, describe, few, read_bytes
 from legcal.perception.board_adjustment import SHEET, BoardImages
 from legcal.perception.board_corners import (
     NumberedCorners,

@@ -232,7 +232,8 @@ class ObservedOutlines:
             radius, xy = state.radii[self.radius], np.ascontiguousarray(points[0].T)
             r, slope, by_xy = outline_offsets(ends.A, ends.B, radius, self.epsilon, xy, lens)
             if keys:
-                by_key = _distances_by_intrinsics(self, keys, state.cameras, points, r, by_xy)
+                off = r, by_xy
+                by_key = _distances_by_intrinsics(self, keys, state.cameras, points, lens, *off)
                 slope = np.concatenate([slope, by_key])
             return r, slope, ends
 
@@ -459,14 +460,14 @@ class ObservedEdges:
         u = D / length
         along = u + np.einsum("ijn,nj->in", ends.R_camera, lean)
         points = _on_sensor(self, state.cameras) if keys else (self.feet, self.lens)
-        lens = _transposed_inverses(points[1][:, 1])
-        r, by_along, by_xy = edge_offsets(along, points[0].T, lens)
+        lens = _transposed_inverses(points[1])
+        r, by_along, by_xy = edge_offsets(along, points[0].T, lens[:, :, 1])
         by_B = (by_along - np.einsum("in,in->n", by_along, u) * u) / length
         by_lean = np.einsum("ijn,in->jn", ends.R_camera, by_along)
         slope = np.concatenate([-by_B, by_B, by_lean])
         if keys:  # the line begins at the first end, as it was measured
-            of_ends = np.stack([np.zeros_like(r), r])
-            by_key = _distances_by_intrinsics(self, keys, state.cameras, points, of_ends, by_xy)
+            off = np.stack([np.zeros_like(r), r]), by_xy
+            by_key = _distances_by_intrinsics(self, keys, state.cameras, points, lens, *off)
             slope = np.concatenate([slope, by_key.sum(axis=1)])
 
         def chain(slope: Array) -> tuple[Array, Array]:
@@ -969,15 +970,15 @@ def _distances_by_intrinsics(
     keys: tuple[str, ...],
     cameras: Sequence[Camera],
     points: tuple[Array, Array],
+    inverse: Array,
     r: Array,
     by_xy: Array,
 ) -> Array:
     """Return derivatives (n_keys, 2, n) of distances of points from lines by intrinsics.
 
-    *points* are those of :func:`_on_sensor`, *r* (2, n) are the distances [px] of both, *by_xy*
-    (2, 2, n) are their derivatives by the coordinates of the points.
+    *points* are those of :func:`_on_sensor`, *inverse* are J^-T there (2, 2, 2, n), *r* (2, n) the
+    distances [px] of both, *by_xy* (2, 2, n) their derivatives by the coordinates of the points.
     """
-    inverse = _transposed_inverses(points[1])
     normal = np.einsum("ijen,jen->ien", inverse, by_xy)
     off = r * np.einsum("ijen,ien->jen", inverse, normal)
     moved = _pixels_by_intrinsics(seen, keys, cameras, *points, off.T)

@@ -189,8 +189,6 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     problem = with_weights(problem, state)
     block = _blocks(state)
     left_out = left_out_blocks(linearize(problem, state), block)
-    squares = np.array([one.squares for one in left_out])
-    dof = np.array([one.dof for one in left_out], dtype=np.intp)
     held = problem.changed(held_directions=np.eye(problem.n_kinematic))
     begin = replace(state, legs=problem.parameters.at_fixed(problem.legs.nominal))
     gain, gain_sigma = None, 0.0
@@ -199,11 +197,11 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
             _squares_near(measured, begin, block) for measured in (held, _as_if_true(held, state))
         )
         if claimed > 0.0:
-            gain = (of_nominal - float(squares.sum())) / claimed
+            gain = (of_nominal - float(left_out.squares.sum())) / claimed
             gain_sigma = 2.0 / float(np.sqrt(claimed))
     except DidNotConverge:  # the nominal model does not close at these readings
         pass
-    return CrossValidation(squares, dof, gain, gain_sigma)
+    return CrossValidation(left_out.squares, left_out.dof, gain, gain_sigma)
 
 
 def _squares_near(problem: FitProblem, begin: State, block: IntArray) -> float:
@@ -211,7 +209,7 @@ def _squares_near(problem: FitProblem, begin: State, block: IntArray) -> float:
     minimum = minimise(
         problem, begin, max_iterations=_STEPS_TO_NOMINAL, tolerance=_NEARLY, must_converge=False
     )
-    return float(sum(one.squares for one in left_out_blocks(minimum.linear, block)))
+    return float(left_out_blocks(minimum.linear, block).squares.sum())
 
 
 def _as_if_true(problem: FitProblem, state: State) -> FitProblem:

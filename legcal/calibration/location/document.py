@@ -21,7 +21,7 @@ from legcal.errors import ModelError, UsageError
 from legcal.files.folder import OutputFile, with_schema
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.schema import FileSchema, Number, Version
-from legcal.geometry.rotations import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import write_model

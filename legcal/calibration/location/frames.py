@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.motions import moved_poses
-from legcal.geometry.rotations import cross_matrices, nearest_rotation
+from legcal.geometry.motions import cross_matrices, moved_poses, nearest_rotation
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.solver import solve
 

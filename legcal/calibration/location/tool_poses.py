@@ -30,7 +30,7 @@ from legcal.data.readings_sheet import ReadingsSheet
 from legcal.errors import Code, DatasetError, DidNotConverge, NotIdentifiable, Problem, UsageError
 from legcal.files.motions import QUATERNION_TOLERANCE
 from legcal.files.table import Column, Table, header_problem
-from legcal.geometry.rotations import cross_matrices
+from legcal.geometry.motions import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.files import RESULT_YAML
 from legcal.machine.kinematics import forward_kinematics_many, platforms_in_base

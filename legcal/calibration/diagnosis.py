@@ -1,6 +1,8 @@
-"""Outlines that were given under the names of other legs, as exchanged in one view.
+"""What a diagnosis says of the likely mistake of a session, and the mistake that a fit shows.
 
-Where the legs and a camera are known, nearly, it is seen which leg each outline belongs to.
+:mod:`.mistake_search` finds what images say of the others. Outlines that were given under the names
+of other legs, as exchanged in one view, need no search: where the legs and a camera are known,
+nearly, it is seen which leg each outline belongs to.
 """
 
 from __future__ import annotations
@@ -8,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.diagnosis.mistakes import Diagnosis
+from legcal.calibration.documents import DiagnosisBlock
 from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import Outlines, along_legs
 from legcal.files.schema import few
@@ -18,8 +21,64 @@ from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.leg import Leg
 
+MIN_SHARE = 0.5  # of the images, that agree with a mistake corrected
+NONE_EXPLAINS = (
+    "Tried without success, each alone and the likeliest beside others: wrong columns, rows, "
+    "units, directions and zeros of readings, joints of the model in another order or mirrored, "
+    "diameters as radii, focal lengths, mirrored or turned photographs. More may be wrong, or "
+    "photographs show too little: click some joints in a photograph of each view (legcal detect "
+    "DATASET -o OUT --edit), see in its overlays which legs stand elsewhere, mend that, and "
+    "calibrate again."
+)
 _NEARER = 0.2  # of the distance from the leg that they name: to the one that they belong to
 _MIN_OUTLINES = 4  # of each leg
+
+
+class Diagnosis(DiagnosisBlock):
+    """The likely mistake of a session, with what its sentence says besides."""
+
+    mended: str = Field(exclude=True)  # the correction, as a clause: "with the columns swapped"
+    images: int = Field(exclude=True)  # that were judged
+    # tests that distinguish it from the mistakes of ``same_as``
+    tests: tuple[str, ...] = Field(default=(), exclude=True)
+    # of ``same_as`` in the sentence: one of each kind stands before more of these kinds
+    n_kinds: int = Field(default=0, exclude=True)
+
+    @property
+    def finding(self) -> str:
+        """The mistake and the number of images that agree, as a clause."""
+        more = len(self.same_as) - self.n_kinds
+        others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
+        others += f", or {more} similar mistake{'s' * (more > 1)}" * (more > 0)
+        n, rest = self.images_after, " (the other images may have a further problem)"
+        return (
+            f"{self.what}{others}: {self.mended}, {n} of {self.images} images agree"
+            f"{rest * (n < MIN_SHARE * self.images)}, against {self.images_before} now"
+        )
+
+    @property
+    def remedies(self) -> str:
+        """What to do, and the tests that distinguish it from similar mistakes."""
+        tell = f". To distinguish them, {', or '.join(self.tests)}" if self.tests else ""
+        return f"{self.remedy}{tell}"
+
+    @property
+    def sentence(self) -> str:
+        """The diagnosis as a message."""
+        return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
+
+
+def notes_beside(diagnosis: Sequence[Diagnosis], notes: Sequence[str], job: str) -> list[str]:
+    """Return notes on images; only their number beside a diagnosis, from which most follow.
+
+    They would blame the wrong images. *job* is the command to run again: ``legcal doctor``.
+    """
+    if not (diagnosis and notes):
+        return list(notes)
+    return [
+        f"{len(notes)} further problem{'s' * (len(notes) != 1)} may have the same cause: correct "
+        f"the problem above first, then run {job} again."
+    ]
 
 
 def exchanged_legs(

@@ -8,10 +8,8 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.documents import DiagnosisBlock
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.image_tables import inverse
 from legcal.data.measurements import row_names
@@ -24,7 +22,6 @@ from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, readings_at
 from legcal.perception.camera_search import LEFT_RIGHT, UPSIDE_DOWN
 
-MIN_SHARE = 0.5  # of the images, that agree with a mistake corrected
 _STEP = 1.0 / 16.0  # smallest step from home to readings, relative to the way
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 _MIRROR_4 = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -101,40 +98,6 @@ class Mistake:
     # Hypothesis with the opposite correction, which has to agree worse with the images than the
     # data as given. None if it may agree as well.
     opposite: Assumed | None = None
-
-
-class Diagnosis(DiagnosisBlock):
-    """The likely mistake of a session, with what its sentence says besides."""
-
-    mended: str = Field(exclude=True)  # the correction, as a clause: "with the columns swapped"
-    images: int = Field(exclude=True)  # that were judged
-    # tests that distinguish it from the mistakes of ``same_as``
-    tests: tuple[str, ...] = Field(default=(), exclude=True)
-    # of ``same_as`` in the sentence: one of each kind stands before more of these kinds
-    n_kinds: int = Field(default=0, exclude=True)
-
-    @property
-    def finding(self) -> str:
-        """The mistake and the number of images that agree, as a clause."""
-        more = len(self.same_as) - self.n_kinds
-        others = "".join(f", or {other}" for other in self.same_as[: self.n_kinds])
-        others += f", or {more} similar mistake{'s' * (more > 1)}" * (more > 0)
-        n, rest = self.images_after, " (the other images may have a further problem)"
-        return (
-            f"{self.what}{others}: {self.mended}, {n} of {self.images} images agree"
-            f"{rest * (n < MIN_SHARE * self.images)}, against {self.images_before} now"
-        )
-
-    @property
-    def remedies(self) -> str:
-        """What to do, and the tests that distinguish it from similar mistakes."""
-        tell = f". To distinguish them, {', or '.join(self.tests)}" if self.tests else ""
-        return f"{self.remedy}{tell}"
-
-    @property
-    def sentence(self) -> str:
-        """The diagnosis as a message."""
-        return f"{self.finding[0].upper()}{self.finding[1:]}; {self.remedies}."
 
 
 def joints_of(parts: Sequence[tuple[Assumed, Sequence[int]]]) -> list[tuple[Array, Array]]:

@@ -18,12 +18,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.board import observe_board
-from legcal.calibration.diagnosis.leg_names import exchanged_legs
-from legcal.calibration.diagnosis.mistakes import (
-    MIN_SHARE,
+from legcal.calibration.diagnosis import MIN_SHARE, Diagnosis, exchanged_legs
+from legcal.calibration.mistakes import (
     TURNS,
     Assumed,
-    Diagnosis,
     Mistake,
     as_given,
     both,
@@ -50,14 +48,6 @@ from legcal.perception.placement import Group, Placement, Search, group_views
 _Judged = tuple[Mistake, Agreement]  # with what all images say of it
 
 STAGE = "Trying common mistakes"
-NONE_EXPLAINS = (
-    "Tried without success, each alone and the likeliest beside others: wrong columns, rows, "
-    "units, directions and zeros of readings, joints of the model in another order or mirrored, "
-    "diameters as radii, focal lengths, mirrored or turned photographs. More may be wrong, or "
-    "photographs show too little: click some joints in a photograph of each view (legcal detect "
-    "DATASET -o OUT --edit), see in its overlays which legs stand elsewhere, mend that, and "
-    "calibrate again."
-)
 
 _AGREE_ALREADY = 0.9  # of the images: then nothing common is wrong
 MIN_IMAGES = 3  # of a group of views
@@ -145,19 +135,6 @@ def agreement_with_zeros(data: OrderedDataset, zeros: Sequence[Mapping[str, floa
     judge = _Judge(data, groups)
     assumed = (replace(judge.given, q=data.turned(one).measurements.q) for one in zeros)
     return [_total(judge.all(one)) for one in assumed]
-
-
-def notes_beside(diagnosis: Sequence[Diagnosis], notes: Sequence[str], job: str) -> list[str]:
-    """Return notes on images; only their number beside a diagnosis, from which most follow.
-
-    They would blame the wrong images. *job* is the command to run again: ``legcal doctor``.
-    """
-    if not (diagnosis and notes):
-        return list(notes)
-    return [
-        f"{len(notes)} further problem{'s' * (len(notes) != 1)} may have the same cause: correct "
-        f"the problem above first, then run {job} again."
-    ]
 
 
 def _rows_seen(data: OrderedDataset) -> IntArray:
