@@ -417,10 +417,6 @@ class ImageSearch:
         return index if index < self.n_legs else self.arms[index - self.n_legs]
 
 
-Method = Callable[[ImageSearch], tuple[Outlines, float]]
-"""Finds the outlines of all parts in one image, and the blur of the image [px] or NaN."""
-
-
 class PartVerdict(NamedTuple):
     """Which outlines of a part are used."""
 
@@ -439,10 +435,11 @@ class JudgedPart(NamedTuple):
     band: Band | None = None  # their frame
 
 
-def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, float]:
+def measure(search: ImageSearch, *, in_brief: bool = False) -> tuple[Outlines, float]:
     """Find, measure and judge the outlines of all parts in one image; return its blur too [px].
 
-    Two outlines for every part of every leg that is looked for, found or not.
+    Two outlines for every part of every leg that is looked for, found or not. In brief, in half the
+    time, blocks are fitted alone: to a few hundredths of a pixel.
     """
     parts, lines = find_parts(search)
     blur = math.nan
@@ -463,7 +460,7 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
         ]
         parts, edges = _at_limbs(search, parts, edges)
         measured, blur = measure_edges(
-            search.grey, search.camera, edges, together, search.blur, near_fit=near
+            search.grey, search.camera, edges, search.blur, near_fit=near, in_brief=in_brief
         )
         for part, first, second in zip(parts, measured[::2], measured[1::2], strict=True):
             of_leg = near and part.leg.leg < search.n_legs
@@ -501,11 +498,6 @@ def _at_limbs(
         ]
         parts[i] = replace(parts[i], pair=replace(parts[i].edges, v=v))
     return parts, edges
-
-
-def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:
-    """Do the same in half the time, to a few hundredths of a pixel: blocks are fitted alone."""
-    return measure(search, together=False)
 
 
 def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
@@ -851,7 +843,7 @@ def measure_outlines(
     placement: Placement,
     rows: Sequence[int],
     *,
-    method: Method = measure,
+    in_brief: bool = False,
     run: Run = in_turn,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Outlines, Array]:
@@ -865,7 +857,7 @@ def measure_outlines(
         rows = [row for row in rows if not np.isnan(placement.window[row]).all()]
     search = replace(search, edge_pairs={}, still={})  # of no use to worker processes
     blur, tables = np.full(search.measurements.n_rows, np.nan), []
-    task = partial(_of_image, search, placement, method)
+    task = partial(_of_image, search, placement, in_brief)
     for row, (outlines, blur[row]) in zip(rows, run(task, rows), strict=True):
         tables.append(outlines)
         if progress is not None:
@@ -874,7 +866,7 @@ def measure_outlines(
 
 
 def _of_image(
-    search: Search, placement: Placement, method: Method, row: int
+    search: Search, placement: Placement, in_brief: bool, row: int
 ) -> tuple[Outlines, float]:
     """Find and measure the outlines of all wanted legs of an image; return its blur too [px]."""
     view = int(search.measurements.view[row])
@@ -917,7 +909,7 @@ def _of_image(
         occluders=occluders,
         polished=placement.polished,
     )
-    found, blur = (no_outlines(), np.nan) if T is None else method(one)
+    found, blur = (no_outlines(), np.nan) if T is None else measure(one, in_brief=in_brief)
     seen = {leg.leg for leg in predicted}
     why = Rejection(Reason.NOT_PLACED if T is None else Reason.OUTSIDE)
     # The longest part stands for a leg that is not looked for.
