@@ -464,7 +464,10 @@ def measure(search: ImageSearch, *, in_brief: bool = False) -> tuple[Outlines, f
         )
         for part, first, second in zip(parts, measured[::2], measured[1::2], strict=True):
             of_leg = near and part.leg.leg < search.n_legs
-            lines.append(_with_verdict(part, (first, second), near_fit=of_leg))
+            reach = part.window if part.guided else None
+            pair, band = (first, second), part.band
+            judged = verdict(part.edges, part.predicted, band.length, pair, reach, near_fit=of_leg)
+            lines.append(JudgedPart(part.leg.leg, part.segment.link, judged, pair, band))
     return outline_table(search, lines), blur
 
 
@@ -681,18 +684,6 @@ def _beside(part: LegPart, edges: Array, window: float) -> BoolArray:
     is_there = is_parallel & (share > 0.0) & (share < 1.0)
     offset = v[:, :1] + share * across - outlines[:, None]
     return np.asarray(np.any(is_there & (np.abs(offset) < window), axis=1))
-
-
-def _with_verdict(
-    part: LegPart,
-    measured: tuple[MeasuredEdge | LostEdge, MeasuredEdge | LostEdge],
-    *,
-    near_fit: bool,
-) -> JudgedPart:
-    """Return the measured edges of a part with verdicts and how well they were seen."""
-    length, window = part.band.length, part.window if part.guided else None
-    judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
-    return JudgedPart(part.leg.leg, part.segment.link, judged, measured, part.band)
 
 
 def _quality(edge: MeasuredEdge, length: float) -> tuple[float, ...]:

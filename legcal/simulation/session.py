@@ -14,7 +14,6 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -131,15 +130,6 @@ def simulate_session(
     )
 
 
-class _Setup(NamedTuple):
-    """The true machine in its poses, among boards and cameras."""
-
-    posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
-    boards: tuple[FixedBoard, ...]
-    views: tuple[Viewpoint, ...]
-    groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
-
-
 @dataclass(frozen=True, eq=False)
 class _Simulator:
     """The inputs of a simulated session, and the steps: poses, set-up, images."""
@@ -211,8 +201,15 @@ class _Simulator:
         settings.check_images(n_views, len(poses.poses) // n_sets)
         return poses
 
-    def set_up(self, poses: Configurations) -> _Setup:
-        """Return boards and cameras around the machine, according to plan and settings."""
+    def set_up(
+        self, poses: Configurations
+    ) -> tuple[
+        tuple[PosedMachine, ...], tuple[FixedBoard, ...], tuple[Viewpoint, ...], tuple[str, ...]
+    ]:
+        """Return the machine in its poses with boards, these, cameras, and the view of each.
+
+        According to plan and settings. Fixed cameras are views themselves: there are no others.
+        """
         # Meshes are beside the nominal URDF; the URDF of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
         has_images = self.settings.level == Level.PHOTOGRAPHS
@@ -271,7 +268,7 @@ class _Simulator:
                 for view in views
             }
             views = tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
-        return _Setup(posed, boards, views, groups)
+        return posed, boards, views, groups
 
     def _in_hand(
         self, posed: tuple[PosedMachine, ...]

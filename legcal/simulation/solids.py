@@ -407,11 +407,12 @@ class PosedMachine:
 
     def encloses(self, centre: Array) -> bool:
         """Return whether a point (3,) is in a solid, or between the joints of the machine."""
-        if any(
-            _is_in(shape.solid.shape, shape.T_base_solid.inv().apply(centre))
-            for shape in self.solids
-        ):
-            return True
+        for placed_solid in self.solids:
+            shape, point = placed_solid.solid.shape, placed_solid.T_base_solid.inv().apply(centre)
+            (middle, reach), mesh = holding_sphere(shape), triangles(shape)
+            is_near = np.linalg.norm(point - middle) < reach
+            if is_near and mesh.is_watertight and mesh.contains(point[None])[0]:
+                return True
         joints = np.concatenate([self.A, self.B])
         size = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
         if len(joints) < 5 or size[2] < _FLAT_JOINTS * size[0]:
@@ -465,14 +466,9 @@ def triangles(shape: Shape) -> Any:
     return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
 
 
-def _is_in(shape: Shape, point: Array) -> bool:
-    """Return whether a point (3,) in the frame of a shape is inside it."""
-    if isinstance(shape, SolidCylinder):
-        beside = np.hypot(point[0], point[1]) < shape.radius
-        return bool(beside and abs(point[2]) < 0.5 * shape.length)
-    if isinstance(shape, Sphere):
-        return bool(np.linalg.norm(point) < shape.radius)
-    if isinstance(shape, Box):
-        return bool(np.all(np.abs(point) < 0.5 * np.asarray(shape.size)))
-    mesh = triangles(shape)
-    return bool(mesh.is_watertight and mesh.contains(point[None])[0])
+@lru_cache(maxsize=256)
+def holding_sphere(shape: Shape) -> tuple[Array, float]:
+    """Return middle (3,) and radius of a sphere around a shape, in the shape's frame [m]."""
+    vertices = np.asarray(triangles(shape).vertices)
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    return middle, float(np.linalg.norm(vertices - middle, axis=1).max())

@@ -13,7 +13,16 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.meshes import ray_caster
-from legcal.simulation.solids import Box, Material, Mesh, PlacedSolid, Shape, SolidCylinder, Sphere
+from legcal.simulation.solids import (
+    Box,
+    Material,
+    Mesh,
+    PlacedSolid,
+    Shape,
+    SolidCylinder,
+    Sphere,
+    holding_sphere,
+)
 from legcal.vision.camera import Camera
 
 Single = NDArray[np.float32]
@@ -142,19 +151,6 @@ def in_view(solids: Sequence[PlacedSolid], T_camera_base: RigidTransform) -> lis
         middle, reach = holding_sphere(shape)
         in_camera.append(SolidInView(shape, placed.solid.material, R, w, R @ middle + w, reach))
     return in_camera
-
-
-def holding_sphere(shape: Shape) -> tuple[Array, float]:
-    """Return middle (3,) and radius of a sphere around a shape, in the shape's frame [m]."""
-    if isinstance(shape, Mesh):
-        low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
-        middle = 0.5 * (low + high)
-        return middle, float(np.linalg.norm(shape.vertices - middle, axis=1).max())
-    if isinstance(shape, SolidCylinder):
-        return np.zeros(3), float(np.hypot(shape.radius, 0.5 * shape.length))
-    if isinstance(shape, Sphere):
-        return np.zeros(3), shape.radius
-    return np.zeros(3), 0.5 * float(np.linalg.norm(shape.size))
 
 
 def first_triangle(solid: SolidInView, mesh: Mesh, x: Single, y: Single) -> tuple[Single, IntArray]:

@@ -20,7 +20,6 @@ from legcal.simulation.rendering.rays import (
     Single,
     SolidInView,
     footprint,
-    holding_sphere,
     in_view,
     intersect,
     is_hidden,
@@ -38,6 +37,8 @@ from legcal.simulation.solids import (
     Solid,
     SolidCylinder,
     Sphere,
+    holding_sphere,
+    triangles,
 )
 from legcal.vision.camera import Camera
 
@@ -423,15 +424,7 @@ def _table(
 
 def _lowest(placed: PlacedSolid, up: Array) -> float:
     """Return the height of the lowest point of a solid."""
-    shape, T = placed.solid.shape, placed.T_base_solid
-    if isinstance(shape, SolidCylinder):
-        c = abs(float(T.rotation.as_matrix()[:, 2] @ up))
-        down = 0.5 * shape.length * c + shape.radius * max(1.0 - c * c, 0.0) ** 0.5
-        return float(T.translation @ up) - float(down)
-    middle, reach = holding_sphere(shape)
-    if isinstance(shape, Box):
-        reach = 0.5 * float(np.abs(T.rotation.as_matrix().T @ up) @ np.array(shape.size))
-    return float(T.apply(middle) @ up) - reach
+    return float((placed.T_base_solid.apply(triangles(placed.solid.shape).vertices) @ up).min())
 
 
 def _piece(
@@ -632,8 +625,11 @@ class Painter:
 
     def _is_thin(self, solid: SolidInView) -> bool:
         """Return whether rays through the centres of pixels may miss a solid."""
+        if isinstance(solid.shape, Mesh):
+            return False
         farthest = float(solid.centre[2]) + solid.reach
-        return _thickness(solid) * float(self.rays.camera.K[0, 0]) < _THIN * farthest
+        thickness = float(triangles(solid.shape).extents.min())
+        return thickness * float(self.rays.camera.K[0, 0]) < _THIN * farthest
 
     def _paint_edge(
         self,
@@ -699,18 +695,6 @@ def _some_of_each(
     kept = (np.arange(len(rays)) - np.repeat(first, count)) % _SHADED == 0
     n_kept = -(-count // _SHADED)
     return rays[kept], np.cumsum(n_kept) - n_kept, (count / n_kept).astype(np.float32)
-
-
-def _thickness(solid: SolidInView) -> float:
-    """Return the least size of a solid [m]."""
-    shape = solid.shape
-    if isinstance(shape, Box):
-        return min(shape.size)
-    if isinstance(shape, SolidCylinder):
-        return min(2.0 * shape.radius, shape.length)
-    if isinstance(shape, Sphere):
-        return 2.0 * shape.radius
-    return np.inf
 
 
 @dataclass(frozen=True, eq=False)
