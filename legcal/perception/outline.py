@@ -51,6 +51,7 @@ MAX_BLOCKS = 80  # of a part
 EDGE_MARGIN = 6  # columns beyond the search window, to judge edges [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
+MAX_WINDOW = 0.05  # of the longer side of an image
 MOST_VOTES = 2_000_000  # that are added at once, of a few patches
 OUTER_GAP, OUTER_PART = 2, 0.5  # columns between parallel lines; and what the outer one takes
 LEAST_LEFT = 1e-3  # of the score of a line
@@ -883,7 +884,9 @@ def _of_image(
             depths = leg.A_camera[2], leg.B_camera[2]
             length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
             nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)
-            window[leg.leg] += placement.pixel_error + joint_error * float(leg.band.scale / nearest)
+            error_px = placement.pixel_error + joint_error * float(leg.band.scale / nearest)
+            # A leg right before a camera that stands nowhere would be searched all over the image.
+            window[leg.leg] += min(error_px, MAX_WINDOW * max(camera.width, camera.height))
     known = placement.blur[view] if placement.blur else np.nan
     blur = search.blur.get(row, 0.0) if np.isnan(known) else known
     one = ImageSearch(

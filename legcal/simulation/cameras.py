@@ -178,7 +178,7 @@ def board_and_cameras(
         if len(good) == _N_BOARD_CANDIDATES:
             break
     if not good:
-        raise _nowhere(board, "every camera around the machine", "use a smaller board")
+        raise _nowhere(board, "every camera around the machine")
     _, placed, views = max(good, key=lambda scored: scored[0])
     return placed, views
 
@@ -202,7 +202,7 @@ def board_on_platform(
             for p, body in zip(placed, _some(posed_machines), strict=True)
         ):
             return T
-    raise _nowhere(board, "the cameras", "use a smaller board", "platform")
+    raise _nowhere(board, "the cameras", "platform")
 
 
 def _few(posed_machines: Sequence[PosedMachine]) -> list[int]:
@@ -325,11 +325,11 @@ def _lying(
                 break
 
 
-def _nowhere(board: Board, who: str, remedy: str, link: Link = "base") -> NotVisible:
+def _nowhere(board: Board, who: str, link: Link = "base") -> NotVisible:
     """Return the error of a board without a suitable place."""
     width, height = np.ptp(board.extent, axis=0)[:2].tolist()
     return NotVisible(
         f"The board could not be placed: found no place near the {link} at which {who} would see a "
         f"{board.kind} of {1000 * width:.0f} x {1000 * height:.0f} mm well enough, needed one in "
-        f"all images; {remedy}."
+        "all images; use a smaller board."
     )

@@ -135,19 +135,6 @@ class Band:
         value = np.sum(h[..., :2] * on_axis, axis=-1) + h[..., 2]
         return np.asarray(-self.scale * value / (h[..., :2] @ self.normal))
 
-    def line(self, v0: Array | float, v1: Array | float) -> Array:
-        """Return the unit (a, b, c) of the line through (0, v0) and (length, v1), eq (2).
-
-        The sign follows eq (3): positive on the side of greater v.
-        """
-        ends = np.stack([np.asarray(v0, dtype=np.float64), np.asarray(v1, dtype=np.float64)], -1)
-        (x0, y0), (x1, y1) = np.moveaxis(
-            self.points(np.array([0.0, self.length]), ends), (-2, -1), (0, 1)
-        )
-        h = np.stack([y0 - y1, x1 - x0, x0 * y1 - x1 * y0], axis=-1)  # the vector product of rays
-        h /= np.linalg.norm(h, axis=-1, keepdims=True)
-        return np.asarray(h * np.sign(h[..., :2] @ self.normal)[..., None])
-
 
 def bands_of_legs(
     camera: Camera,
