@@ -110,13 +110,8 @@ class ViewFit:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the outlines determine the pose: else legs may be others."""
-        return bool(self.turn_sigma <= MAX_TURN_SIGMA)
-
-    @property
-    def turn_sigma(self) -> float:
-        """Standard deviation of the rotation about the axis that is known worst [rad]."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+        """Whether the outlines determine the pose about every axis: else legs may be others."""
+        return bool(np.linalg.eigvalsh(self.covariance[:3, :3])[-1] <= MAX_TURN_SIGMA**2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -301,7 +301,10 @@ def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
     hull = _cut(hull, rays.low - spare, rays.high + spare)
     if not len(hull):
         return np.zeros(0, dtype=np.intp)
-    return _filled(_hull(rays.camera.distort(_dense(hull))), rays.width, rays.height)
+    # More points along its sides: the lens bends them.
+    along, side = np.arange(_PIECES)[:, None] / _PIECES, np.roll(hull, -1, axis=0) - hull
+    dense = (hull[:, None] + along * side[:, None]).reshape(-1, 2)
+    return _filled(_hull(rays.camera.distort(dense)), rays.width, rays.height)
 
 
 def surrounding_points(solid: SolidInView) -> Array:
@@ -347,13 +350,6 @@ def _cut(polygon: Array, low: Array, high: Array) -> Array:
                 return np.zeros((0, 2))
             polygon = np.array(kept)
     return polygon
-
-
-def _dense(polygon: Array) -> Array:
-    """Return more points along the sides of a polygon: the lens bends them."""
-    t = np.arange(_PIECES)[:, None] / _PIECES
-    side = np.roll(polygon, -1, axis=0) - polygon
-    return np.asarray((polygon[:, None] + t * side[:, None]).reshape(-1, 2))
 
 
 def _filled(hull: Array, width: int, height: int) -> IntArray:

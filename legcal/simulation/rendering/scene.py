@@ -354,7 +354,10 @@ def shares_of_lamps(
                 shares.append(None)
             continue
         lit = [np.flatnonzero(part.faces(k)) for part in parts]
-        points = [_traced(part, some) for part, some in zip(parts, lit, strict=True)]
+        points = [
+            part.shaded.P[:, some if part.first is None else part.first[some]]
+            for part, some in zip(parts, lit, strict=True)
+        ]
         small = [len(some) <= _LARGE for some in lit]
         together = [P for P, is_small in zip(points, small, strict=True) if is_small]
         owners = [np.full(P.shape[1], p.solid) for p, P in zip(parts, points, strict=True)]
@@ -377,11 +380,6 @@ def shares_of_lamps(
                 share[some] = surface.seen(lamp, occluders, part.solid).take(pixels)
             shares.append(share)
     return shares_by_part
-
-
-def _traced(part: VisibleSolid, some: IntArray) -> Single:
-    """Return a point of each of some pixels, (3, n)."""
-    return part.shaded.P[:, some if part.first is None else part.first[some]]
 
 
 _TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=0.08,
