@@ -1,6 +1,6 @@
 """Corners of the calibration board in images: searched, fitted as saddles of grey levels, judged.
 
-:func:`find_corners` is for one image, :func:`detect_corners` for those of a dataset; where no image
+:func:`search_board` is for one image, :func:`detect_corners` for those of a dataset; where no image
 shows the board, :func:`require_board` says what they show instead.
 """
 
@@ -114,22 +114,13 @@ class NumberedCorners(Table):
     certain: bool  # whether the numbers could be no others
 
 
-def find_corners(
-    board: Board,
-    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
-) -> tuple[IntArray, Array, Array]:
-    """Return the corners of a board that an image shows, and whose numbers are certain.
+def certain_corners(board: Board, seen: SeenBoard) -> tuple[IntArray, Array, Array]:
+    """Return the corners of a seen board if their numbers are certain.
 
-    Corners whose surroundings are not those of a board, or partly hidden, are left out. Of a
-    chessboard some corner of each outer line must be seen.
+    Of a chessboard some corner of each outer line must be seen.
 
     Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
     """
-    return certain_corners(board, search_board(board, image))
-
-
-def certain_corners(board: Board, seen: SeenBoard) -> tuple[IntArray, Array, Array]:
-    """Return the corners of a seen board if their numbers are certain, as :func:`find_corners`."""
     detection = seen.numbered(board)
     if not detection.certain or len(detection.number) < MIN_CORNERS:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0)
@@ -140,7 +131,10 @@ def search_board(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> SeenBoard:
-    """Detect a board in an image; a chessboard of any extent."""
+    """Detect a board in an image; a chessboard of any extent.
+
+    Corners whose surroundings are not those of a board, or partly hidden, are left out.
+    """
     grey = np.ascontiguousarray(image, dtype=np.float32)
     tags = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     if board.has_circles:

@@ -346,7 +346,7 @@ def _with_free_poses(
     machine = photographs.machine
     if machine.is_determined or len(rows) == 0:
         return nominal, {}
-    poses = find_free_poses(
+    found, cameras = find_free_poses(
         photographs.search(nominal, pairs),
         machine,
         rows.tolist(),
@@ -355,9 +355,8 @@ def _with_free_poses(
         _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
         photographs.clicked_poses,
     )
-    nominal = replace(nominal, T_base_camera=poses.T_base_camera)
-    first = {pose: choices[0] for pose, choices in poses.T_base_platform.items()}
-    return _at_poses(photographs, nominal, first), poses.T_base_platform
+    first = {pose: choices[0] for pose, choices in found.items()}
+    return _at_poses(photographs, replace(nominal, T_base_camera=cameras), first), found
 
 
 def _at_poses(

@@ -22,6 +22,7 @@ from legcal.data.reasons import USED
 from legcal.errors import NotVisible, UsageError
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import matrix_applied
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg, cylinder_of_arm
 from legcal.machine.shapes import Occluder
@@ -96,7 +97,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True, eq=False)
-class Images:
+class Images(Table):
     """The images of a dataset, in the order of its rows."""
 
     # view, pose, repeat: (n_rows,) indices; ``repeat`` counts the images of one pose in one view
@@ -105,9 +106,6 @@ class Images:
     repeat: IntArray
     # visible legs and arms by row; equal for all images of one pose in one view
     shown: tuple[Seen, ...]
-
-    def __len__(self) -> int:
-        return len(self.view)
 
     def seen(self, row: int) -> list[int]:
         """Return the legs that are measurable in an image."""
@@ -119,12 +117,6 @@ class Images:
         rows = np.flatnonzero(self.view == view).tolist()
         counts = Counter(j for row in rows for j in self.seen(row))
         return sorted(j for j, n in counts.items() if n > least * len(rows))
-
-    def chosen(self, rows: Sequence[int]) -> Images:
-        """Return some of the images."""
-        index = np.asarray(rows, dtype=np.intp)
-        shown = tuple(self.shown[row] for row in rows)
-        return Images(self.view[index], self.pose[index], self.repeat[index], shown)
 
 
 def take_images(

@@ -112,7 +112,7 @@ def simulate_session(
     rows = list(range(len(images)))
     if settings.level != Level.PHOTOGRAPHS:  # tables need a leg in every row
         rows = [row for row in rows if images.seen(row)]
-    left_out, images = len(images) - len(rows), images.chosen(rows)
+    left_out, images = len(images) - len(rows), images.choose(np.array(rows, dtype=np.intp))
     if groups:
         images, views, groups = _numbered(images, views, groups)
     A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
