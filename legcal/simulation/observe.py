@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.corners import Corners, found_corners, join_corners
-from legcal.data.outlines import Outlines, join_outlines, unmeasured
-from legcal.data.reasons import USED
+from legcal.data.outlines import Outlines, join_outlines, outlines_in_sight
 from legcal.errors import NotVisible, UsageError
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import matrix_applied
@@ -232,33 +231,18 @@ def outlines_of(
     either case.
     """
     claimed = replace(noise, sigma_px=max(noise.sigma_px, EXACT_PX))
-    images = scene.images
-    rows, h, ends, covariances = [], list[Array](), list[Array](), []
-    for row, seen in enumerate(images.shown):
-        camera = scene.views[images.view[row]].camera
-        for line, pixels, length in zip(seen.h, seen.ends, seen.length_px.tolist(), strict=True):
-            covariance = claimed.covariance(length)
-            if rng is not None and noise.sigma_px > 0.0:
-                errors = rng.multivariate_normal(np.zeros(2), covariance, size=2)
-                line, pixels = shifted_outlines(camera, line, pixels, errors)
-            rows.append(row)
-            h.append(line)
-            ends.append(pixels)
-            covariances.append(covariance)
-    n, no_legs = 2 * len(rows), np.zeros(0, dtype=np.intp)
-    return Outlines(
-        row=np.repeat(np.array(rows, dtype=np.intp), 2),
-        leg=np.repeat(np.concatenate([no_legs, *(seen.leg for seen in images.shown)]), 2),
-        part=tuple(part for seen in images.shown for part in seen.part for _ in range(2)),
-        edge=np.tile(np.array([1, 2], dtype=np.intp), len(rows)),
-        h=np.array(h).reshape(n, 3),
-        ends=np.array(ends).reshape(n, 2, 2),
-        covariance=np.repeat(np.array(covariances).reshape(-1, 2, 2), 2, axis=0),
-        used=np.ones(n, dtype=np.bool_),
-        reason=(USED,) * n,
-        source=("detected",) * n,
-        **unmeasured(n),
-    )
+    images, seen = scene.images, Seen.joined(scene.images.shown)
+    row = np.repeat(np.arange(len(images)), [len(shown) for shown in images.shown])
+    covariance = [claimed.covariance(length) for length in seen.length_px.tolist()]
+    outlines = outlines_in_sight(seen, row, np.array(covariance).reshape(-1, 2, 2))
+    if rng is None or noise.sigma_px == 0.0:
+        return outlines
+    errors = [rng.multivariate_normal(np.zeros(2), C, size=2) for C in covariance]
+    offsets, h, ends = np.reshape(errors, (-1, 2)), outlines.h.copy(), outlines.ends.copy()
+    for v, view in enumerate(scene.views):
+        some = images.view[outlines.row] == v
+        h[some], ends[some] = shifted_outlines(view.camera, h[some], ends[some], offsets[some])
+    return replace(outlines, h=h, ends=ends)
 
 
 def edges_of_bodies(

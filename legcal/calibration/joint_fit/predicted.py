@@ -42,8 +42,7 @@ from legcal.calibration.joint_fit.variables import FittedLegs, Start, State, fit
 from legcal.calibration.tuning import EDGE_SHARE, TWIST_SIGMA_DEG
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import OUTLINE_COLUMNS, Outlines, unmeasured
-from legcal.data.reasons import USED
+from legcal.data.outlines import OUTLINE_COLUMNS, Outlines, outlines_in_sight
 from legcal.errors import DatasetError, UsageError
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.uncertainty import marginal_rows
@@ -54,7 +53,6 @@ from legcal.machine.model import Machine
 from legcal.machine.rods import ends_in_base, reading_of_rod
 from legcal.perception.body_edges import predicted_edges
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import Seen
 
 KINEMATIC = "machine"  # names of coordinates of the machine begin so
@@ -66,21 +64,7 @@ _RANK = 1e-7  # of the largest singular value
 
 def predicted_outlines(seen: Seen, row: IntArray, noise: PredictedNoise) -> Outlines:
     """Return the outlines of visible segments; *row* of each image."""
-    n = len(seen.leg)
-    outlines = Outlines(
-        row=np.repeat(row[seen.image], 2),
-        leg=np.repeat(seen.leg, 2),
-        part=tuple(part for part in seen.part for _ in EPSILON),
-        edge=np.tile(np.array([1, 2], dtype=np.intp), n),
-        h=seen.h.reshape(-1, 3),
-        ends=seen.ends.reshape(-1, 2, 2),
-        covariance=np.tile(np.eye(2), (2 * n, 1, 1)),
-        used=np.ones(2 * n, dtype=np.bool_),
-        reason=(USED,) * (2 * n),
-        source=("detected",) * (2 * n),
-        **unmeasured(2 * n),
-    )
-    return noise.of(outlines)
+    return noise.of(outlines_in_sight(seen, row[seen.image], np.tile(np.eye(2), (len(seen), 1, 1))))
 
 
 @dataclass(frozen=True, eq=False)
