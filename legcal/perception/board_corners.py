@@ -165,20 +165,15 @@ def _circles(board: Board, grey: Grey) -> SeenBoard:
 def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
     """Return columns and rows of the corners of a chessboard, and where they are."""
     board = Print(None, None, 0.5 * _STRAIGHT_AROUND, 1.0, 1.0)
-    best, scale_of_best, done = None, 1.0, set[float]()
-    for pixels in _SEARCHED:
-        scale = possible_scale(grey, 1.0, pixels)
-        if scale in done:
-            continue
-        done.add(scale)
-        lattice = find_lattice(rescaled(grey, scale))
-        if best is None or len(lattice.ij) > len(best.ij):
-            best, scale_of_best = lattice, scale
-        columns, rows = best.extent
-        if len(best.ij) >= columns * rows and min(columns, rows) >= _MIN_SIDE:
+    ij, px, scale_of_best = np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)), 1.0
+    for scale in dict.fromkeys(possible_scale(grey, 1.0, pixels) for pixels in _SEARCHED):
+        found = find_lattice(rescaled(grey, scale))
+        if len(found[0]) > len(ij):
+            (ij, px), scale_of_best = found, scale
+        columns, rows = np.ptp(ij, axis=0) + 1 if len(ij) else (0, 0)
+        if len(ij) >= columns * rows and min(columns, rows) >= _MIN_SIDE:
             break
-    assert best is not None
-    ij, saddles = _measured_twice(grey, board, best.ij, best.px, scale_of_best)
+    ij, saddles = _measured_twice(grey, board, ij, px, scale_of_best)
     kept = _without_loose_lines(ij)
     return ij[kept] - (ij[kept].min(axis=0) if kept.any() else 0), saddles.choose(kept)
 
