@@ -43,7 +43,7 @@ from legcal.machine.model import Machine, platform_pose
 from legcal.machine.redundancy import contradictions
 from legcal.planning.places import LaidBoard, Setting
 from legcal.planning.request import difference
-from legcal.planning.session import PlanDocument
+from legcal.planning.session import PlanDocument, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
@@ -58,6 +58,7 @@ from legcal.simulation.cameras import (
 )
 from legcal.simulation.observe import Images, Scene, Viewpoint, take_images
 from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.rays import divided
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
 from legcal.simulation.settings import Distribution, Level, Sampling, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
@@ -108,7 +109,13 @@ def simulate_session(
     simulator = _Simulator(truth, nominal, settings, rngs, progress)
     poses, plan = simulator.poses(), simulator.plan
     posed, boards, views, groups = simulator.set_up(poses)
-    images = simulator.shoot(posed, views, groups)
+    poses_of: Sequence[Sequence[int]] = [
+        [v % len(posed)] if groups else simulator.poses_of(v, len(posed)) for v in range(len(views))
+    ]
+    images = take_images(
+        truth.legs, posed, views, poses_of if plan is None else plan.poses_of, settings.images,
+        progress, all_views=plan is None or not plan.hand,
+    )  # fmt: skip
     rows = list(range(len(images)))
     if settings.level != Level.PHOTOGRAPHS:  # tables need a leg in every row
         rows = [row for row in rows if images.seen(row)]
@@ -117,8 +124,7 @@ def simulate_session(
         images, views, groups = _numbered(images, views, groups)
     A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
     scene = Scene(A, B, views, images)
-    width = max(2, len(str(len(posed))))
-    labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(posed)))
+    labels = tuple(pose_labels(len(posed)))
     hints = settings.hints and not groups
     measurements = _recorded(truth, poses, labels, scene, settings, rngs, hints=hints)
     if plan is not None and hints:  # hints are the planned poses of the tripods
@@ -291,24 +297,6 @@ class _Simulator:
                 groups.append(name)
         self.progress("Camera places", n_images, n_images)
         return tuple(views), tuple(groups)
-
-    def shoot(
-        self,
-        posed: Sequence[PosedMachine],
-        views: Sequence[Viewpoint],
-        groups: Sequence[str],
-    ) -> Images:
-        """Return the images that the views take of the machine in their poses."""
-        plan, n_poses = self.plan, len(posed)
-        poses_of: Sequence[Sequence[int]] = [
-            [v % n_poses] if groups else self.poses_of(v, n_poses) for v in range(len(views))
-        ]
-        if plan is not None:
-            poses_of = plan.poses_of
-        return take_images(
-            self.truth.legs, posed, views, poses_of, self.settings.images, self.progress,
-            all_views=plan is None or not plan.hand,
-        )  # fmt: skip
 
 
 def _numbered(
@@ -685,11 +673,7 @@ def preview(
     board: LaidBoard | None = None,
 ) -> bytes:
     """Return a JPEG of a machine in the first of some poses, without noise and clutter."""
-    scale = min(_WIDTH / camera.width, 1.0)
-    K = camera.K * [[scale], [scale], [1.0]]
-    small = replace(
-        camera, K=K, width=round(camera.width * scale), height=round(camera.height * scale)
-    )
+    small = divided(camera, min(_WIDTH / camera.width, 1.0))
     (posed,) = pose_machine(machine, dressed(machine, meshes_needed=False), poses.chosen([0]))
     if board is not None:
         posed = PlacedBoard(board.board, board.T_base_board).beside(posed)

@@ -107,11 +107,11 @@ def pixel_rays(camera: Camera, fineness: int = 1) -> PixelRays:
     return PixelRays(camera if fineness == 1 else divided(camera, fineness))
 
 
-def divided(camera: Camera, fineness: int) -> Camera:
-    """Return a camera with each pixel divided into ``fineness`` x ``fineness`` pixels."""
+def divided(camera: Camera, fineness: float) -> Camera:
+    """Return a camera with ``fineness`` x ``fineness`` pixels in place of each pixel."""
     K = camera.K * [[fineness], [fineness], [1.0]]
     K[:2, 2] += 0.5 * (fineness - 1)
-    width, height = fineness * camera.width, fineness * camera.height
+    width, height = round(fineness * camera.width), round(fineness * camera.height)
     return replace(camera, K=K, width=width, height=height)
 
 

@@ -201,16 +201,6 @@ class Lighting:
     look: Appearance  # ambient light, factors on the properties of materials, colour
 
 
-@dataclass(frozen=True, eq=False)
-class Shaded:
-    """Light from points of a surface, apart by where it comes from."""
-
-    P: Single  # (3, n) the points in the camera frame [m]
-    fixed: Single  # (n_channels, n) light that shadows do not affect
-    of_lamp: list[Single]  # (n_channels, n) the light of each lamp, without shadows
-    faces_lamp: list[BoolArray]  # (n,) whether the surface faces the lamp
-
-
 def shade(
     solid: SolidInView,
     x: Single,
@@ -219,8 +209,8 @@ def shade(
     face: Faces,
     light: Lighting,
     ink: Single | None = None,
-) -> Shaded:
-    """Return the light that points of a solid send to the camera."""
+) -> tuple[Single, Single, list[Single], list[BoolArray]]:
+    """Return the light that points of a solid send to the camera, as VisibleSolid has it."""
     material = solid.material
     P = np.stack([x * z, y * z, z])
     n = normals(solid, P, face)
@@ -262,7 +252,7 @@ def shade(
             glint *= np.minimum(np.maximum(cosine, 0.0) * 8.0, 1.0)  # none beyond the terminator
         of_lamp.append(_channels(albedo * lit, glint, material.tint, light))
         faces_lamp.append(cosine > 0.0)
-    return Shaded(P, fixed, of_lamp, faces_lamp)
+    return P, fixed, of_lamp, faces_lamp
 
 
 def _channels(
@@ -307,26 +297,29 @@ class CoarseSurface:
 
 @dataclass(frozen=True, eq=False)
 class VisibleSolid:
-    """The visible part of one solid."""
+    """The visible part of one solid, and the light from its points by where it comes from."""
 
     solid: int  # the solid, as an index
     pixels: IntArray  # (n_pixels,) its pixels, ascending
-    shaded: Shaded  # the light from its points
     # (n_pixels,) the first point of each pixel where a pixel has several
-    first: IntArray | None = None
+    first: IntArray | None
+    P: Single  # (3, n) the points in the camera frame [m]
+    fixed: Single  # (n_channels, n) light that shadows do not affect
+    of_lamp: list[Single]  # (n_channels, n) the light of each lamp, without shadows
+    faces_lamp: list[BoolArray]  # (n,) whether the surface faces the lamp
 
     def faces(self, lamp: int) -> BoolArray:
         """Return a mask (n_pixels,) of the pixels where the surface faces a lamp."""
-        faces = self.shaded.faces_lamp[lamp]
+        faces = self.faces_lamp[lamp]
         return faces if self.first is None else np.logical_or.reduceat(faces, self.first)
 
     def radiance(self, shares: Sequence[Single | None], n_terms: int) -> Single:
         """Return the light summed over points, (n_terms, n_channels, n_pixels)."""
         lit = [
             light if share is None else light * self._spread(share)
-            for light, share in zip(self.shaded.of_lamp, shares, strict=True)
+            for light, share in zip(self.of_lamp, shares, strict=True)
         ]
-        fixed = self.shaded.fixed
+        fixed = self.fixed
         terms = np.stack([fixed, *lit]) if n_terms > 1 else np.asarray(sum(lit, fixed))[None]
         if self.first is None:
             return terms
@@ -336,7 +329,7 @@ class VisibleSolid:
         """Return the shares of pixels, repeated for all of their points."""
         if self.first is None:
             return share
-        return np.repeat(share, np.diff(self.first, append=self.shaded.P.shape[1]))
+        return np.repeat(share, np.diff(self.first, append=self.P.shape[1]))
 
 
 def shares_of_lamps(
@@ -355,7 +348,7 @@ def shares_of_lamps(
             continue
         lit = [np.flatnonzero(part.faces(k)) for part in parts]
         points = [
-            part.shaded.P[:, some if part.first is None else part.first[some]]
+            part.P[:, some if part.first is None else part.first[some]]
             for part, some in zip(parts, lit, strict=True)
         ]
         small = [len(some) <= _LARGE for some in lit]
@@ -556,7 +549,7 @@ class Painter:
                 x, y = self.rays.x.take(inside), self.rays.y.take(inside)
                 ink = printed_inside(solid, self.rays, inside, face[inside], self.samples)
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light, ink)
-                parts.append(VisibleSolid(i, inside, shaded))
+                parts.append(VisibleSolid(i, inside, None, *shaded))
         lamp_shares = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares in zip(parts, lamp_shares, strict=True):
             canvas.terms[:, :, part.pixels] = part.radiance(shares, len(canvas.terms))
@@ -672,7 +665,7 @@ class Painter:
                 x, y, face = X.take(hit_rays), Y.take(hit_rays), faces.take(hit_rays)
                 ink = printed(solids[i], x, y, face)
                 shaded = shade(solids[i], x, y, Z.take(hit_rays), face, self.light, ink)
-                parts.append(VisibleSolid(i, hit_rays[first] // S, shaded, first))
+                parts.append(VisibleSolid(i, hit_rays[first] // S, first, *shaded))
                 weights.append(weight)
         lamp_shares = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares, weight in zip(parts, lamp_shares, weights, strict=True):
