@@ -238,7 +238,7 @@ def camera(model: str) -> Camera:
 def predicted(cam: Camera) -> list[PredictedLeg]:
     length = float(np.linalg.norm(B - A))
     cylinders = [(Cylinder("leg1_rod", RADIUS, "base", 0.0, length),)]
-    return predict_legs(cam, RigidTransform.identity(), A[None], B[None], cylinders, 0)
+    return predict_legs(cam, RigidTransform.identity(), A[None], B[None], cylinders)
 
 
 def outlines(cam: Camera) -> Outlines:

@@ -158,7 +158,7 @@ def predict_legs_and_arms(
         for k, of_legs in enumerate(ends)
     )
     every = [*cylinders, *([arm.cylinder] for arm in arms.values())]
-    return predict_legs(camera, T_base_camera, A, B, every, row)
+    return predict_legs(camera, T_base_camera, A, B, every)
 
 
 def placed_arms(

@@ -215,7 +215,6 @@ def longest_runs(flags: BoolArray) -> tuple[IntArray, IntArray]:
 class PredictedLeg:
     """The predicted appearance of one leg in one image."""
 
-    row: int  # of the image
     leg: int  # index of the leg
     A_camera: Array  # (3,) its base joint in the camera frame [m]
     B_camera: Array  # (3,) its platform joint [m]
@@ -251,7 +250,6 @@ def predict_legs(
     A_base: Array,  # (n_legs, 3)
     B_base: Array,  # (n_legs, 3)
     cylinders: Sequence[Sequence[Cylinder]],
-    row: int,
 ) -> list[PredictedLeg]:
     """Predict every leg that an image should show."""
     T = T_base_camera.as_matrix()
@@ -282,7 +280,6 @@ def predict_legs(
     of_leg = np.split(outlines, np.cumsum([len(segments[leg]) for leg in visible_bands])[:-1])
     return [
         PredictedLeg(
-            row,
             leg,
             A_camera[leg],
             B_camera[leg],

@@ -410,7 +410,7 @@ def _table(
     size = 4.0 * radius, 3.2 * radius, 0.06 * radius
     foot = centre + (lowest - float(centre @ _UP) - 0.5 * size[2]) * _UP
     T = RigidTransform.from_components(foot, Rotation.from_euler("z", 0.3))
-    return (_placed("table", Box(size), T, _TABLE),)
+    return (_placed(Box(size), T, _TABLE),)
 
 
 def _lowest(placed: PlacedSolid, up: Array) -> float:
@@ -419,7 +419,6 @@ def _lowest(placed: PlacedSolid, up: Array) -> float:
 
 
 def _piece(
-    number: int,
     centre: Array,
     radius: float,
     camera: Camera,
@@ -454,17 +453,11 @@ def _piece(
         texture=float(rng.uniform(0.0, 0.2)),
         tint=_tint(rng),
     )
-    return _placed(
-        f"clutter{number + 1}", shape, RigidTransform.from_components(position, turn), material
-    )
+    return _placed(shape, RigidTransform.from_components(position, turn), material)
 
 
 def _cable(
-    number: int,
-    centre: Array,
-    radius: float,
-    T_base_camera: RigidTransform,
-    rng: np.random.Generator,
+    centre: Array, radius: float, T_base_camera: RigidTransform, rng: np.random.Generator
 ) -> PlacedSolid:
     """Return a thin dark cylinder that crosses the picture between camera and machine."""
     eye = T_base_camera.translation
@@ -478,14 +471,12 @@ def _cable(
     )
     position = eye + t * way + width * aside
     shape = SolidCylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
-    return _placed(
-        f"cable{number + 1}", shape, RigidTransform.from_components(position, turn), _CABLE
-    )
+    return _placed(shape, RigidTransform.from_components(position, turn), _CABLE)
 
 
-def _placed(name: str, shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
+def _placed(shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
     """Return a placed solid outside the machine."""
-    return PlacedSolid(Solid(name, None, shape, T, material), T)
+    return PlacedSolid(Solid(None, shape, T, material), T)
 
 
 def _tint(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -746,9 +737,9 @@ def prepare_view(
     centre, radius = _around(placed)
     floor = _table(placed, centre, radius, T_base_camera.translation) if appearance.table else ()
     clutter = [
-        _piece(i, centre, radius, camera, T_base_camera, rng) for i in range(appearance.clutter)
+        _piece(centre, radius, camera, T_base_camera, rng) for _ in range(appearance.clutter)
     ]
-    cables = [_cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)]
+    cables = [_cable(centre, radius, T_base_camera, rng) for _ in range(appearance.cables)]
     light = _lighting(centre, radius, T_camera_base, appearance)
     painter = Painter(rays, light, samples)
     canvas = _empty(rays, light, rng)
