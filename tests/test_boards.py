@@ -207,7 +207,7 @@ def _shows(columns: int, rows: int) -> SeenBoard:
     j, i = np.indices((rows, columns))
     ij = np.column_stack([i.ravel(), j.ravel()])
     black = np.where(ij.sum(axis=1) % 2 == 0, 1, -1)
-    return SeenBoard("chessboard", ij, 20.0 * ij.astype(np.float64), np.full(len(ij), 0.1), black)
+    return SeenBoard(ij, 20.0 * ij.astype(np.float64), np.full(len(ij), 0.1), black)
 
 
 @pytest.mark.parametrize(

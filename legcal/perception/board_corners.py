@@ -55,7 +55,6 @@ _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
 class SeenBoard:
     """The corners of a board in an image."""
 
-    kind: str  # of the board
     # (k, 2) columns and rows of the corners: those of the board, but of a chessboard from the first
     # that is seen
     ij: IntArray
@@ -144,7 +143,7 @@ def search_board(
     else:
         (ij, saddles), tags = _tags_and_corners(board, grey)
     black = np.where(saddles.contrast > 0.0, 1, -1)
-    return SeenBoard(board.kind, ij, saddles.px, saddles.sigma_px, black, *tags)
+    return SeenBoard(ij, saddles.px, saddles.sigma_px, black, *tags)
 
 
 def _circles(board: Board, grey: Grey) -> SeenBoard:
@@ -159,7 +158,7 @@ def _circles(board: Board, grey: Grey) -> SeenBoard:
     k = np.arange(board.n_corners if found else 0)
     ij = np.column_stack([k % board.columns, k // board.columns])
     at = np.reshape(px, (-1, 2)).astype(np.float64) if found else np.zeros((0, 2))
-    return SeenBoard(board.kind, ij, at, np.full(len(k), _SIGMA_CIRCLE), np.ones_like(k))
+    return SeenBoard(ij, at, np.full(len(k), _SIGMA_CIRCLE), np.ones_like(k))
 
 
 def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
@@ -636,8 +635,8 @@ def _other_markers(board: Board, grey: Grey) -> str | None:
     if len(numbers) < _MIN_MARKERS and tags_are_mirrored(board, grey):
         return f"its {thing} mirrored (left and right exchanged)"
     none = np.zeros((0, 2))
-    seen = SeenBoard(board.kind, none.astype(np.intp), none, none[:, 0], none[:, 0].astype(np.intp),
-                     numbers, places.mean(axis=1))  # fmt: skip
+    ij = none.astype(np.intp)
+    seen = SeenBoard(ij, none, none[:, 0], ij[:, 0], numbers, places.mean(axis=1))
     if (layout := _shown_by_tags(board, [seen], ""))[0] is None:
         return layout[1].removesuffix(" in 1 ")
     if (numbers >= n_tags).any():
