@@ -31,7 +31,7 @@ from legcal.calibration.camera_calibration.consensus import RobustFit, robust_fi
 from legcal.calibration.camera_calibration.starts import from_scratch, part_of
 from legcal.geometry.types import Array
 from legcal.perception.board_adjustment import BoardImages, Sheet
-from legcal.perception.board_corners import find_corners
+from legcal.perception.board_corners import certain_corners, search_board
 from legcal.simulation.cameras import mild_lens
 from legcal.simulation.rendering.appearance import CAMERAS, Appearance
 from legcal.vision.board import Board
@@ -132,7 +132,10 @@ def photographs(args: argparse.Namespace, seed: int, folder: Path) -> tuple[Boar
     camera, pipeline = mild_lens(), CAMERAS[args.kind]
     look = Appearance(camera=args.kind, colour=pipeline.colour, gamma=2.2)
     paths = photograph_boards(folder, printed, camera, look, args.images, seed, pipeline)
-    found = [find_corners(BOARD, np.asarray(read_image(path, camera))) for path in paths]
+    found = [
+        certain_corners(BOARD, search_board(BOARD, np.asarray(read_image(path, camera))))
+        for path in paths
+    ]
     found = [one for one in found if len(one[0]) == BOARD.n_corners]
     return (
         BoardImages(

@@ -286,7 +286,7 @@ def _occluders(
     seen = int((_shares(free, truth.n_legs) >= VISIBLE).sum())
     for _ in range(TRIES):
         solids = tuple(
-            _occluder(i, machines[0], camera, T, rng) for i in range(int(rng.integers(1, 4)))
+            _occluder(machines[0], camera, T, rng) for _ in range(int(rng.integers(1, 4)))
         )
         shown = _shown(truth, tuple(_beside(m, solids) for m in machines), camera, T)
         left = int((_shares(shown, truth.n_legs) >= VISIBLE).sum())
@@ -296,7 +296,6 @@ def _occluders(
 
 
 def _occluder(
-    number: int,
     machine: PosedMachine,
     camera: Camera,
     T: RigidTransform,
@@ -326,7 +325,7 @@ def _occluder(
         texture=float(rng.uniform(0.0, 0.2)),
     )
     where = RigidTransform.from_components(T.apply(P * z / P[2]), turn)
-    return PlacedSolid(Solid(f"occluder{number + 1}", None, shape, where, material), where)
+    return PlacedSolid(Solid(None, shape, where, material), where)
 
 
 def _beside(machine: PosedMachine, solids: tuple[PlacedSolid, ...]) -> PosedMachine:

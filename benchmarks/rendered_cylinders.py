@@ -149,7 +149,7 @@ def photograph(looks: Looks, rng: np.random.Generator, times: int = PHOTOGRAPHS)
     towards = Rotation.align_vectors(u[None], np.array([[0.0, 0.0, 1.0]]))[0]
     pose = RigidTransform.from_components(middle, towards)
     solid = PlacedSolid(
-        Solid("leg", None, SolidCylinder(radius, 2.0 * reach), RigidTransform.identity(), material),
+        Solid(None, SolidCylinder(radius, 2.0 * reach), RigidTransform.identity(), material),
         pose,
     )
     dark, bright = (

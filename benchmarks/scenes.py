@@ -42,11 +42,10 @@ from legcal.perception.candidate_pairs import (
 )
 from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import CameraPoses, Picture, Pictures, leg_segments
-from legcal.perception.placement import Placement, Search, group_views
+from legcal.perception.placement import Placement, Search, group_views, sensor_extent
 from legcal.perception.recognition import TWO_POSES, place_views
 from legcal.perception.tuning import JOINT_ERROR
 from legcal.perception.view_fit import refine_views
-from legcal.simulation.cameras import field_of_view
 from legcal.vision.cylinder import outlines_of_axis
 from legcal.workers import worker_pool
 
@@ -188,7 +187,7 @@ def ideal_pictures(scene: Scene) -> list[Picture]:
             pixel,
         )
         targets = leg_segments(given.A_base[row], given.B_base[row], given.cylinders, legs)
-        corners = np.array(field_of_view(camera))
+        corners = sensor_extent(camera)
         pictures.append(Picture(pairs, targets, corners, given.size))
     return pictures
 

@@ -41,7 +41,7 @@ from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.machine.kinematics import forward_kinematics
 from legcal.perception.image_quality import measure_exposure
-from legcal.perception.outline import measure_in_brief, measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.photographs import Photographs, measure_photographs
 from legcal.perception.placement import Placement, group_views
 from legcal.perception.recognition import place_views
@@ -120,12 +120,12 @@ def measure_speed() -> None:
     rough = {row: exposure.blur for row, exposure in zip(rows, exposures, strict=True)}
     search = photographs.search(scene, blur=rough)
     once, blur = watch(
-        "outlines in brief", lambda: measure_outlines(search, near, rows, method=measure_in_brief)
+        "outlines in brief", lambda: measure_outlines(search, near, rows, in_brief=True)
     )
     groups = group_views(photographs.measurements, photographs.detect, scene.T_base_camera, None)
     watch(
         "views fitted, and missing legs",
-        lambda: refine_views(search, groups, near, once, method=measure_in_brief),
+        lambda: refine_views(search, groups, near, once, in_brief=True),
     )
     watch("outlines with all care", lambda: measure_photographs(photographs, near, no_progress))
     view = photographs.measurements.view

@@ -37,7 +37,7 @@ def picture(
     placed = [PlacedBoard(board, RigidTransform.identity()).plate]
     if hidden is not None:
         T = RigidTransform.from_translation(hidden)
-        box = Solid("box", None, Box((0.02, 0.02, 0.02)), T, Material(albedo=0.2))
+        box = Solid(None, Box((0.02, 0.02, 0.02)), T, Material(albedo=0.2))
         placed.append(PlacedSolid(box, T))
     how = {
         "blur": 0.5,

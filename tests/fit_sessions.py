@@ -28,9 +28,8 @@ from legcal.calibration.joint_fit.variables import (
 )
 from legcal.data.corners import Corners, found_corners
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, unmeasured
+from legcal.data.outlines import LegAxes, Outlines, axes_from_outlines, found_outlines
 from legcal.data.reading_units import sigmas_of_legs
-from legcal.data.reasons import USED
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
@@ -473,16 +472,12 @@ def body_edges(session: MachineSession, sigma_px: float = 0.1, seed: int | None 
         normal /= np.linalg.norm(normal, axis=1)[:, None]
         noise = np.random.default_rng(seed).standard_normal((n, 2, 1))
         pixels = pixels + sigma_px * noise * normal[:, None]
-    return Outlines(
-        row=np.array([row for row, _ in rows]),
-        leg=np.array([j for _, j in rows]),
-        part=tuple(f"{session.legs.names[j]}_body" for _, j in rows),
-        edge=np.tile([3, 4], n // 2),
-        h=np.full((n, 3), np.nan),
-        ends=pixels,
-        covariance=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)),
-        used=np.ones(n, dtype=np.bool_),
-        reason=(USED,) * n,
-        source=("detected",) * n,
-        **unmeasured(n),
+    return found_outlines(
+        np.array([row for row, _ in rows]),
+        np.array([j for _, j in rows]),
+        tuple(f"{session.legs.names[j]}_body" for _, j in rows),
+        np.tile([3, 4], n // 2),
+        np.full((n, 3), np.nan),
+        pixels,
+        np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)),
     )

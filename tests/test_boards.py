@@ -24,13 +24,13 @@ from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import Reason
 from legcal.errors import DatasetError, NotVisible
-from legcal.geometry.types import Image
+from legcal.geometry.types import Array, Image, IntArray
 from legcal.perception.board_adjustment import camera_poses_by_board, plane_poses
 from legcal.perception.board_corners import (
     SeenBoard,
+    certain_corners,
     describe_image,
     detect_corners,
-    find_corners,
     require_board,
     search_board,
     shown_board,
@@ -48,6 +48,10 @@ FISHEYE = replace(LENS, distortion=np.array([0.02, -0.01, 0.0, 0.0]), model="equ
 
 
 # What a board is, and how files describe it.
+
+
+def find_corners(board: Board, image: Image) -> tuple[IntArray, Array, Array]:
+    return certain_corners(board, search_board(board, image))
 
 
 def test_corners_are_numbered_as_opencv_and_kalibr_number_them() -> None:
@@ -203,7 +207,7 @@ def _shows(columns: int, rows: int) -> SeenBoard:
     j, i = np.indices((rows, columns))
     ij = np.column_stack([i.ravel(), j.ravel()])
     black = np.where(ij.sum(axis=1) % 2 == 0, 1, -1)
-    return SeenBoard("chessboard", ij, 20.0 * ij.astype(np.float64), np.full(len(ij), 0.1), black)
+    return SeenBoard(ij, 20.0 * ij.astype(np.float64), np.full(len(ij), 0.1), black)
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ from legcal.calibration.camera_calibration.projection import compare_cameras, pr
 from legcal.errors import LegcalError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array, BoolArray
 from legcal.perception.board_adjustment import BoardImages
-from legcal.perception.board_corners import find_corners
+from legcal.perception.board_corners import certain_corners, search_board
 from legcal.vision.board import board_of
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 from legcal.vision.camera_file import read_camera
@@ -459,7 +459,7 @@ def test_an_image_with_one_row_of_corners_is_left_out_by_name(tmp_path: Path) ->
     board = board_of("charuco:9x6:30mm:22mm:DICT_5X5_100")
     paths = photographs(tmp_path, PINHOLE, 4, board=board)
     image = np.asarray(cv2.imread(str(paths[3]), cv2.IMREAD_GRAYSCALE))
-    number, px, _ = find_corners(board, image)
+    number, px, _ = certain_corners(board, search_board(board, image))
     rows = [px[number // board.grid[0] == k] for k in range(2)]
     below = [np.polyfit(row[:, 0], row[:, 1], 1) for row in rows]
     u, v = np.meshgrid(np.arange(PINHOLE.width), np.arange(PINHOLE.height))

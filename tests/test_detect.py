@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor
 from legcal.calibration.detection import Detection, Examination
-from legcal.data.outlines import Outlines, unmeasured
+from legcal.data.outlines import Outlines, found_outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
@@ -238,7 +238,7 @@ def camera(model: str) -> Camera:
 def predicted(cam: Camera) -> list[PredictedLeg]:
     length = float(np.linalg.norm(B - A))
     cylinders = [(Cylinder("leg1_rod", RADIUS, "base", 0.0, length),)]
-    return predict_legs(cam, RigidTransform.identity(), A[None], B[None], cylinders, 0)
+    return predict_legs(cam, RigidTransform.identity(), A[None], B[None], cylinders)
 
 
 def outlines(cam: Camera) -> Outlines:
@@ -248,19 +248,9 @@ def outlines(cam: Camera) -> Outlines:
     points = np.array([A + 0.1 * u, B - 0.1 * u])
     touching = points - RADIUS * EPSILON[:, None, None] * h[:, None, :]
     two = np.zeros(2, dtype=np.intp)
-    return Outlines(
-        row=two,
-        leg=two,
-        part=("leg1_rod",) * 2,
-        edge=np.array([1, 2]),
-        h=h,
-        ends=cam.project(touching),
-        covariance=np.tile(1e-4 * np.eye(2), (2, 1, 1)),
-        used=np.ones(2, dtype=np.bool_),
-        reason=(USED, USED),
-        source=("detected",) * 2,
-        **unmeasured(2),
-    )
+    covariance = np.tile(1e-4 * np.eye(2), (2, 1, 1))
+    ends = cam.project(touching)
+    return found_outlines(two, two, ("leg1_rod",) * 2, np.array([1, 2]), h, ends, covariance)
 
 
 def curves(cam: Camera, found: Outlines) -> dict[str, Array]:

@@ -15,7 +15,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
-from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import DETECTOR_VERSION, Photographs, measure_photographs
 from legcal.perception.placement import Placement
 from legcal.progress import no_progress
@@ -51,7 +50,7 @@ def measured() -> dict[str, list[Any]]:
     """Return the outlines of the six photographs, measured in three ways."""
     photographs, rough, near = six_photographs()
     tables = {
-        "quickly": measure_photographs(photographs, rough, no_progress, method=measure_in_brief),
+        "quickly": measure_photographs(photographs, rough, no_progress, in_brief=True),
         "with care": measure_photographs(photographs, rough, no_progress),
         "near a fit": measure_photographs(photographs, near, no_progress),
     }

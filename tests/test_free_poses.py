@@ -128,13 +128,15 @@ def test_poses_are_found_by_clicks(tmp_path: Path) -> None:
         machine.size,
         pairs,
     )
-    found = find_free_poses(search, machine, range(4), rough, in_turn, lambda _: None, clicked)
+    T_base_platform, T_base_camera = find_free_poses(
+        search, machine, range(4), rough, in_turn, lambda _: None, clicked
+    )
     off, off_at_home = [], []
     for row in range(4):
         X = np.concatenate([A[row], B[row]])
-        camera = found.T_base_camera[view[row]]
+        camera = T_base_camera[view[row]]
         assert camera is not None
-        B_found = found.T_base_platform[int(pose[row])][0].apply(machine.B_platform)
+        B_found = T_base_platform[int(pose[row])][0].apply(machine.B_platform)
         seen = CAMERA.project(camera.inv().apply(np.concatenate([A[row], B_found])))
         truth = CAMERA.project(true[view[row]].inv().apply(X))
         B_home = machine.home.apply(machine.B_platform)

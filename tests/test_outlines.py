@@ -15,7 +15,8 @@ from legcal.data.reasons import Reason, Rejection
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
 from legcal.machine.shapes import Carrier, Occluder
-from legcal.perception.outline import LONE_SCORE, _alone, measure_outlines
+from legcal.perception import outline
+from legcal.perception.outline import LONE_SCORE, ImageSearch, _alone, measure, measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
@@ -218,6 +219,25 @@ def test_legs_behind_others_end_where_they_are_hidden() -> None:
     gap = np.linalg.norm(np.diff(found.ends, axis=1)[:, 0], axis=1) - found.length
     assert np.all(gap > -1.0)
     assert np.all(gap[2:] > 20.0)  # the leg in front hides the middle
+
+
+def test_a_leg_right_before_the_camera_is_not_searched_all_over_the_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A camera that stands nowhere puts joints there; the votes of such a window fill a memory."""
+    windows = list[Array]()
+
+    def asked(search: ImageSearch, *, in_brief: bool) -> tuple[Outlines, float]:
+        windows.append(search.window)
+        return measure(search, in_brief=in_brief)
+
+    monkeypatch.setattr(outline, "measure", asked)
+    cam, seen = camera(), bar(0.0, 0.03, 150.0)
+    near = Bar(np.array([0.03, 0.06, 1e-4]), np.array([0.12, -0.1, 0.9]), 0.006, 150.0)
+    image = render(cam, [seen], 40.0, blur=0.5, supersample=3).astype(np.uint8)
+    found = detect(cam, [seen, near], image)
+    assert found.used.tolist() == [True, True, False, False]
+    assert windows[0].max() <= 0.05 * cam.width
 
 
 def test_what_is_not_there_is_rejected_with_the_reason() -> None:

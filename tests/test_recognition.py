@@ -15,8 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import inverse_kinematics, load_mechanism, random_configurations
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import Outlines, unmeasured
-from legcal.data.reasons import USED
+from legcal.data.outlines import Outlines, found_outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
 from legcal.perception import recognition
@@ -384,11 +383,9 @@ def _outlines(T: RigidTransform, A: Array, B: Array) -> Outlines:
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     steps = steps_to_outlines(outlines_of_axis(u, X[:, 0], lp.TUBE), lp.TUBE)
     ends = X[:, :1] + np.array([0.03, 0.2])[:, None] * u[:, None] + steps[np.arange(n), edge, None]
-    return Outlines(
-        row, leg, ("tube",) * n, edge + 1, np.full((n, 3), np.nan), CAMERA.project(ends),
-        np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n, dtype=np.bool_), (USED,) * n,
-        ("detected",) * n, **unmeasured(n),
-    )  # fmt: skip
+    covariance = np.tile(SIGMA**2 * np.eye(2), (n, 1, 1))
+    h, px = np.full((n, 3), np.nan), CAMERA.project(ends)
+    return found_outlines(row, leg, ("tube",) * n, edge + 1, h, px, covariance)
 
 
 def _fitted(

@@ -48,7 +48,7 @@ LENSES = {
 
 
 def solid(shape: Shape, T: RigidTransform, **looks: Any) -> PlacedSolid:
-    return PlacedSolid(Solid("solid", None, shape, T, Material(**looks)), T)
+    return PlacedSolid(Solid(None, shape, T, Material(**looks)), T)
 
 
 def bar(angle: float, radius: float, tilt: float = 0.1) -> tuple[PlacedSolid, Array, Array]:

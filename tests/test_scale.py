@@ -13,7 +13,6 @@ from legcal.calibration.board import rough_placement
 from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import place_and_measure
 from legcal.progress import no_progress
 from legcal.workers import in_turn
@@ -26,9 +25,7 @@ SIZES = 0.03, 30.0  # of the usual one
 def _recognised(folder: Path) -> tuple[Outlines, Array]:
     """Return the outlines of the photographs, and where their cameras are, in leg lengths."""
     data = order_dataset(load_dataset(folder), in_turn, no_progress, fingerprint="")
-    seen = place_and_measure(
-        data.photographs, rough_placement(data)[0], no_progress, method=measure_in_brief
-    )
+    seen = place_and_measure(data.photographs, rough_placement(data)[0], no_progress, in_brief=True)
     places = [T.translation for T in seen.placement.T_base_camera if T is not None]
     return seen.outlines, np.array(places) / data.machine.size
 

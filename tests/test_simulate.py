@@ -32,7 +32,7 @@ from legcal.files.motions import motion_from_xyz_quat
 from legcal.geometry.types import Array
 from legcal.machine.parameters import geometries
 from legcal.perception.board_adjustment import camera_poses_by_board
-from legcal.perception.board_corners import find_corners
+from legcal.perception.board_corners import certain_corners, search_board
 from legcal.simulation.cameras import mild_lens
 from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset
 from legcal.simulation.observe import OutlineNoise
@@ -357,7 +357,7 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     dataset = load_dataset(tmp_path / "seen")
     assert dataset.corners is None
     board = dataset.boards[0].board
-    number, px, sigma = find_corners(board, dataset.image_reader([0])(0))
+    number, px, sigma = certain_corners(board, search_board(board, dataset.image_reader([0])(0)))
     error = px - _exact_corners(dataset)[number]
     assert len(number) >= 20
     assert np.sqrt(np.mean(error**2)) < 0.04

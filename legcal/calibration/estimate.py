@@ -54,7 +54,7 @@ from legcal.geometry.types import Array
 from legcal.machine.model import Machine
 from legcal.perception.body_edges import has_bodies, measure_body_edges
 from legcal.perception.diagnostics import is_visible, reject_images
-from legcal.perception.outline import measure_in_brief, used_as_before
+from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
     MeasuredImages,
     Photographs,
@@ -208,7 +208,7 @@ def more_views(
     ]
     near = replace(near, T_base_camera=tuple(hints))
     search = replace(seen.photographs.narrowed(rows, seen.outlines), joint_error=0.0)
-    again = place_and_measure(search, near, data.progress, joined, method=measure_in_brief)
+    again = place_and_measure(search, near, data.progress, joined, in_brief=True)
     cameras = tuple(
         found if T is None else T
         for T, found in zip(

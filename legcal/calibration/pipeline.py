@@ -82,7 +82,6 @@ from legcal.geometry.types import BoolArray, IntArray
 from legcal.machine.leg import ParameterId
 from legcal.paper.criteria import Criteria
 from legcal.perception.diagnostics import hint_notes, is_measurable
-from legcal.perception.outline import measure_in_brief
 from legcal.perception.photographs import (
     MeasuredImages,
     detection_settings,
@@ -430,9 +429,7 @@ def _estimate(
         )
     # 2. Recognise, and measure the outlines.
     T_board_camera = None if board is None else board.T_board_camera
-    seen = place_and_measure(
-        photographs, placement, data.progress, T_board_camera, method=measure_in_brief
-    )
+    seen = place_and_measure(photographs, placement, data.progress, T_board_camera, in_brief=True)
     seen.placement.require_one()
     other_radii = seen.photographs.machine is not photographs.machine
     if other_radii:

@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from legcal.data.measurements import (
     find_rows,
     places,
 )
-from legcal.data.reasons import Reason, Rejection, read_rejection
+from legcal.data.reasons import USED, Reason, Rejection, read_rejection
 from legcal.errors import NotVisible
 from legcal.files.folder import write_atomically
 from legcal.files.schema import closest, describe
@@ -32,7 +33,15 @@ from legcal.geometry.lines import cross, nearest_point_to_line, normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import axis_of_outlines, direction_derivative, direction_of_angles
+from legcal.vision.cylinder import (
+    EPSILON,
+    axis_of_outlines,
+    direction_derivative,
+    direction_of_angles,
+)
+
+if TYPE_CHECKING:
+    from legcal.vision.visibility import Seen
 
 QUALITY = ("contrast", "length", "residual")  # how well an outline was seen
 ENCODING = ("gamma", "by_gamma")  # how an outline depends on the gamma of the camera
@@ -82,7 +91,7 @@ class Outlines(ImageTable):
     """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).
 
     The quality of an outline and its dependence on the gamma are NaN where detection failed
-    and for outlines that were given or edited (:func:`unmeasured`).
+    and for outlines that were given or edited.
     """
 
     keys = "row", "leg", "part", "edge"
@@ -108,9 +117,38 @@ class Outlines(ImageTable):
         return {key for key, is_used in pairs if is_used}
 
 
-def unmeasured(n: int) -> dict[str, Array]:
-    """Return the columns of quality (n,) of outlines without a measurement: NaN."""
-    return {name: np.full(n, np.nan) for name in MEASURED}
+def found_outlines(
+    row: IntArray,
+    leg: IntArray,
+    part: tuple[str, ...],
+    edge: IntArray,
+    h: Array,
+    ends: Array,
+    covariance: Array,
+    **measured: Array,
+) -> Outlines:
+    """Return detected outlines, all used; what was not measured of them is NaN."""
+    n = len(row)
+    columns = {name: np.full(n, np.nan) for name in MEASURED} | measured
+    used, source = np.ones(n, dtype=np.bool_), ("detected",) * n
+    return Outlines(row, leg, part, edge, h, ends, covariance, used, (USED,) * n, source, **columns)
+
+
+def outlines_in_sight(seen: Seen, row: IntArray, covariance: Array) -> Outlines:
+    """Return both outlines of visible segments (n,) in images *row*, exact.
+
+    Their offsets have covariances (n, 2, 2).
+    """
+    n = len(row)
+    return found_outlines(
+        np.repeat(row, 2),
+        np.repeat(seen.leg, 2),
+        tuple(part for part in seen.part for _ in EPSILON),
+        np.tile(np.array([1, 2], dtype=np.intp), n),
+        seen.h.reshape(2 * n, 3),
+        seen.ends.reshape(2 * n, 2, 2),
+        np.repeat(covariance, 2, axis=0),
+    )
 
 
 def polished_parts(outlines: Outlines) -> frozenset[tuple[int, str]]:
@@ -154,19 +192,8 @@ def through_cameras(
 def no_outlines() -> Outlines:
     """Return an empty table."""
     none = np.zeros(0, dtype=np.intp)
-    return Outlines(
-        row=none,
-        leg=none,
-        part=(),
-        edge=none,
-        h=np.zeros((0, 3)),
-        ends=np.zeros((0, 2, 2)),
-        covariance=np.zeros((0, 2, 2)),
-        used=np.zeros(0, dtype=np.bool_),
-        reason=(),
-        source=(),
-        **unmeasured(0),
-    )
+    pairs = np.zeros((0, 2, 2))
+    return found_outlines(none, none, (), none, np.zeros((0, 3)), pairs, pairs)
 
 
 def join_outlines(tables: Sequence[Outlines]) -> Outlines:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.perception.camera_search import flipped, place_camera
 from legcal.perception.candidate_pairs import CandidatePairs
@@ -24,8 +25,10 @@ _MIN_EXPECTED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class Agreement(Table):
     """Agreement of images with one hypothesis."""
+
+    common = ("cameras",)
 
     row: IntArray  # (n,) of the images
     support: Array  # (n,) legs that agree with each, less its share of the cost of shifted joints
@@ -35,12 +38,8 @@ class Agreement:
     @classmethod
     def joined(cls, parts: Sequence["Agreement"]) -> "Agreement":
         """Return the agreement of several groups together."""
-        return cls(
-            np.concatenate([part.row for part in parts]),
-            np.concatenate([part.support for part in parts]),
-            np.concatenate([part.expected for part in parts]),
-            tuple(T for part in parts for T in part.cameras),
-        )
+        cameras = tuple(T for part in parts for T in part.cameras)
+        return replace(super().joined(parts), cameras=cameras)
 
     @classmethod
     def of_places(cls, parts: Sequence["Agreement"], rows: Sequence[int]) -> "Agreement":
@@ -50,18 +49,13 @@ class Agreement:
         """
         if len(parts) == 1:
             return parts[0]
-        joined = cls.joined(parts)
+        joined = super().joined(parts)
         place = {row: i for i, row in enumerate(joined.row.tolist())}
-        order = [place[row] for row in rows]
-        return cls(
-            joined.row[order], joined.support[order], joined.expected[order], parts[0].cameras
-        )
+        return joined.choose(np.array([place[row] for row in rows], dtype=np.intp))
 
     def at(self, rows: Sequence[int]) -> "Agreement":
         """Return the agreement of some images."""
-        chosen = np.isin(self.row, rows)
-        row, support, expected = self.row[chosen], self.support[chosen], self.expected[chosen]
-        return replace(self, row=row, support=support, expected=expected)
+        return self.choose(np.isin(self.row, rows))
 
     @property
     def share(self) -> Array:

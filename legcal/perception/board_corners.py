@@ -1,6 +1,6 @@
 """Corners of the calibration board in images: searched, fitted as saddles of grey levels, judged.
 
-:func:`find_corners` is for one image, :func:`detect_corners` for those of a dataset; where no image
+:func:`search_board` is for one image, :func:`detect_corners` for those of a dataset; where no image
 shows the board, :func:`require_board` says what they show instead.
 """
 
@@ -55,7 +55,6 @@ _MIN_SIDE = 3  # corners along the sides of a chessboard whose extent counts
 class SeenBoard:
     """The corners of a board in an image."""
 
-    kind: str  # of the board
     # (k, 2) columns and rows of the corners: those of the board, but of a chessboard from the first
     # that is seen
     ij: IntArray
@@ -114,22 +113,13 @@ class NumberedCorners(Table):
     certain: bool  # whether the numbers could be no others
 
 
-def find_corners(
-    board: Board,
-    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
-) -> tuple[IntArray, Array, Array]:
-    """Return the corners of a board that an image shows, and whose numbers are certain.
+def certain_corners(board: Board, seen: SeenBoard) -> tuple[IntArray, Array, Array]:
+    """Return the corners of a seen board if their numbers are certain.
 
-    Corners whose surroundings are not those of a board, or partly hidden, are left out. Of a
-    chessboard some corner of each outer line must be seen.
+    Of a chessboard some corner of each outer line must be seen.
 
     Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
     """
-    return certain_corners(board, search_board(board, image))
-
-
-def certain_corners(board: Board, seen: SeenBoard) -> tuple[IntArray, Array, Array]:
-    """Return the corners of a seen board if their numbers are certain, as :func:`find_corners`."""
     detection = seen.numbered(board)
     if not detection.certain or len(detection.number) < MIN_CORNERS:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0)
@@ -140,7 +130,10 @@ def search_board(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> SeenBoard:
-    """Detect a board in an image; a chessboard of any extent."""
+    """Detect a board in an image; a chessboard of any extent.
+
+    Corners whose surroundings are not those of a board, or partly hidden, are left out.
+    """
     grey = np.ascontiguousarray(image, dtype=np.float32)
     tags = np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     if board.has_circles:
@@ -150,7 +143,7 @@ def search_board(
     else:
         (ij, saddles), tags = _tags_and_corners(board, grey)
     black = np.where(saddles.contrast > 0.0, 1, -1)
-    return SeenBoard(board.kind, ij, saddles.px, saddles.sigma_px, black, *tags)
+    return SeenBoard(ij, saddles.px, saddles.sigma_px, black, *tags)
 
 
 def _circles(board: Board, grey: Grey) -> SeenBoard:
@@ -165,26 +158,21 @@ def _circles(board: Board, grey: Grey) -> SeenBoard:
     k = np.arange(board.n_corners if found else 0)
     ij = np.column_stack([k % board.columns, k // board.columns])
     at = np.reshape(px, (-1, 2)).astype(np.float64) if found else np.zeros((0, 2))
-    return SeenBoard(board.kind, ij, at, np.full(len(k), _SIGMA_CIRCLE), np.ones_like(k))
+    return SeenBoard(ij, at, np.full(len(k), _SIGMA_CIRCLE), np.ones_like(k))
 
 
 def _chessboard(grey: Grey) -> tuple[IntArray, Saddles]:
     """Return columns and rows of the corners of a chessboard, and where they are."""
     board = Print(None, None, 0.5 * _STRAIGHT_AROUND, 1.0, 1.0)
-    best, scale_of_best, done = None, 1.0, set[float]()
-    for pixels in _SEARCHED:
-        scale = possible_scale(grey, 1.0, pixels)
-        if scale in done:
-            continue
-        done.add(scale)
-        lattice = find_lattice(rescaled(grey, scale))
-        if best is None or len(lattice.ij) > len(best.ij):
-            best, scale_of_best = lattice, scale
-        columns, rows = best.extent
-        if len(best.ij) >= columns * rows and min(columns, rows) >= _MIN_SIDE:
+    ij, px, scale_of_best = np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)), 1.0
+    for scale in dict.fromkeys(possible_scale(grey, 1.0, pixels) for pixels in _SEARCHED):
+        found = find_lattice(rescaled(grey, scale))
+        if len(found[0]) > len(ij):
+            (ij, px), scale_of_best = found, scale
+        columns, rows = np.ptp(ij, axis=0) + 1 if len(ij) else (0, 0)
+        if len(ij) >= columns * rows and min(columns, rows) >= _MIN_SIDE:
             break
-    assert best is not None
-    ij, saddles = _measured_twice(grey, board, best.ij, best.px, scale_of_best)
+    ij, saddles = _measured_twice(grey, board, ij, px, scale_of_best)
     kept = _without_loose_lines(ij)
     return ij[kept] - (ij[kept].min(axis=0) if kept.any() else 0), saddles.choose(kept)
 
@@ -647,8 +635,8 @@ def _other_markers(board: Board, grey: Grey) -> str | None:
     if len(numbers) < _MIN_MARKERS and tags_are_mirrored(board, grey):
         return f"its {thing} mirrored (left and right exchanged)"
     none = np.zeros((0, 2))
-    seen = SeenBoard(board.kind, none.astype(np.intp), none, none[:, 0], none[:, 0].astype(np.intp),
-                     numbers, places.mean(axis=1))  # fmt: skip
+    ij = none.astype(np.intp)
+    seen = SeenBoard(ij, none, none[:, 0], ij[:, 0], numbers, places.mean(axis=1))
     if (layout := _shown_by_tags(board, [seen], ""))[0] is None:
         return layout[1].removesuffix(" in 1 ")
     if (numbers >= n_tags).any():

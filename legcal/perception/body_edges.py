@@ -26,11 +26,10 @@ from legcal.data.outlines import (
     FIRST_EDGE,
     QUALITY,
     Outlines,
+    found_outlines,
     join_outlines,
     no_outlines,
-    unmeasured,
 )
-from legcal.data.reasons import USED
 from legcal.geometry.lines import cross
 from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -207,19 +206,15 @@ def _table(row: int, leg: int, link: str, camera: Camera, edges: Sequence[BodyEd
     ones = np.ones((n, 2, 1))
     rays = np.concatenate([camera.undistort(ends), ones], axis=2)
     h = cross(rays[:, 0], rays[:, 1])
-    return Outlines(
-        row=np.full(n, row),
-        leg=np.full(n, leg),
-        part=(link,) * n,
-        edge=np.arange(n) + FIRST_EDGE,
-        h=h / np.linalg.norm(h, axis=1, keepdims=True),
-        ends=ends,
-        covariance=np.array([edge.covariance for edge in edges]),
-        used=np.ones(n, dtype=np.bool_),
-        reason=(USED,) * n,
-        source=("detected",) * n,
-        **unmeasured(n)
-        | {name: np.array([getattr(edge, name) for edge in edges]) for name in QUALITY},
+    return found_outlines(
+        np.full(n, row),
+        np.full(n, leg),
+        (link,) * n,
+        np.arange(n) + FIRST_EDGE,
+        h / np.linalg.norm(h, axis=1, keepdims=True),
+        ends,
+        np.array([edge.covariance for edge in edges]),
+        **{name: np.array([getattr(edge, name) for edge in edges]) for name in QUALITY},
     )
 
 

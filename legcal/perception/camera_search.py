@@ -492,13 +492,6 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
     return [replace(p, pairs=flipped(p.pairs, p.corners, LEFT_RIGHT)) for p in pictures]
 
 
-def may_be_mirrored(original: PoseCandidates) -> bool:
-    """Return whether a placed view needs to be compared with its mirror image."""
-    if original.is_given:
-        return False
-    return not original.is_convincing or original.share < NOT_MIRRORED_SUPPORT
-
-
 def is_mirrored(original: PoseCandidates, other: PoseCandidates) -> bool:
     """Return whether mirrored images explain a view better than the original ones.
 

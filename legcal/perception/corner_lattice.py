@@ -421,22 +421,12 @@ _MIN_LATTICE = 6  # corners
 _STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], dtype=np.intp)
 
 
-@dataclass(frozen=True, eq=False)
-class Lattice:
-    """Crossings that hang together."""
+def find_lattice(grey: Grey) -> tuple[IntArray, Array]:
+    """Return the largest lattice of crossings in an image (height, width), maybe of none.
 
-    ij: IntArray  # (k, 2) their columns and rows; the first ones are 0
-    px: Array  # (k, 2) where they are [px]; x, y and the line of sight are right-handed
-
-    @property
-    def extent(self) -> tuple[int, int]:
-        """Columns and rows between the outermost corners."""
-        x, y = (np.ptp(self.ij, axis=0) + 1).tolist() if len(self.ij) else (0, 0)
-        return x, y
-
-
-def find_lattice(grey: Grey) -> Lattice:
-    """Return the largest lattice of crossings in an image (height, width), maybe of none."""
+    Columns and rows (k, 2), the first ones being 0, and places (k, 2) [px]; x, y and the line of
+    sight are right-handed.
+    """
     places, angles, contrast = _candidates(grey)
     near, ray = _neighbours(grey, places, angles, contrast)
     return _largest(places, near, ray)
@@ -569,7 +559,7 @@ def _wrapped(angle: Array) -> Array:
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _largest(px: Array, near: IntArray, back: IntArray) -> Lattice:
+def _largest(px: Array, near: IntArray, back: IntArray) -> tuple[IntArray, Array]:
     """Return the largest set of candidates that are neighbours of each other, as a lattice."""
     n = len(px)
     turn = np.full(n, -1, dtype=np.intp)  # quarter turns of the lattice against each one's rays
@@ -600,11 +590,11 @@ def _largest(px: Array, near: IntArray, back: IntArray) -> Lattice:
         if len(place) > len(best):
             best = list(place.items())
     if len(best) < _MIN_LATTICE:
-        return Lattice(np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2)))
+        return np.zeros((0, 2), dtype=np.intp), np.zeros((0, 2))
     members = np.array([k for k, _ in best], dtype=np.intp)
     ij = np.array([at for _, at in best], dtype=np.intp)
     # Rays turn from x to y of the image, and so do the steps of the lattice: it is right-handed.
-    return Lattice(ij - ij.min(axis=0), px[members])
+    return ij - ij.min(axis=0), px[members]
 
 
 _NEAR = 1.5  # pitches within which corners give how the board lies around a place

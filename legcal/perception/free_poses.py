@@ -76,15 +76,6 @@ ALL_ALIKE = 30  # so many or fewer poses in a step of the search differ
 
 
 @dataclass(frozen=True, eq=False)
-class FreePoses:
-    """Where platforms and cameras are by the edge pairs of the images."""
-
-    # Of every pose that images show, the likeliest first
-    T_base_platform: dict[int, tuple[RigidTransform, ...]]
-    T_base_camera: tuple[RigidTransform | None, ...]  # of every view
-
-
-@dataclass(frozen=True, eq=False)
 class _Scene:
     """Constants of the machine; they travel to worker processes."""
 
@@ -206,12 +197,13 @@ def find_free_poses(
     run: Run,
     progress: Callable[[int], None],
     clicked: Mapping[int, Sequence[RigidTransform]] = MappingProxyType({}),
-) -> FreePoses:
+) -> tuple[dict[int, tuple[RigidTransform, ...]], tuple[RigidTransform | None, ...]]:
     """Find the platform poses that the images of rows show, and their cameras, near rough ones.
 
     Where clicks have the platform at a pose, T_base_platform, it is looked for there alone.
 
-    Raises NotIdentifiable if a view has no rough camera pose, or joints at A move.
+    Returns T_base_platform of every pose that images show, the likeliest first; T_base_camera of
+    every view. Raises NotIdentifiable if a view has no rough camera pose, or joints at A move.
     """
     m = search.measurements
     require_standing_joints(machine)
@@ -235,7 +227,7 @@ def find_free_poses(
         others = _stepped_often(scene, None, k, others, FITTED[1:])
         poses = np.concatenate([best[k][None], others.poses])
         T[k] = _motions(poses[_apart(machine, poses, CHOICES)])
-    return FreePoses(T, _placed(hints, cameras))
+    return T, _placed(hints, cameras)
 
 
 def require_standing_joints(machine: Machine) -> None:

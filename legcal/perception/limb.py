@@ -103,17 +103,11 @@ def _reflections() -> Array:
     return np.asarray(fitted @ process @ fitted.T)
 
 
-def _principal(covariance: Array) -> tuple[Array, Array]:
-    """Return principal directions (5, 5), as rows, and their standard deviations (5,)."""
-    variance, directions = np.linalg.eigh(covariance)
-    return directions.T, np.sqrt(variance)
-
-
 _OF_MATTE = MATTE_DIRECTIONS.T @ (MATTE_SIGMA**2 * MATTE_DIRECTIONS.T).T
-_POLISHED_DIRECTIONS, _POLISHED_SIGMA = _principal(_OF_MATTE + _reflections())
+_POLISHED_VARIANCE, _POLISHED_DIRECTIONS = np.linalg.eigh(_OF_MATTE + _reflections())
 MATTE, POLISHED = 0, 1  # finishes, by which the following are ordered
-SURFACES = np.stack([MATTE_DIRECTIONS, _POLISHED_DIRECTIONS])
-SURFACE_SIGMA = np.stack([MATTE_SIGMA, _POLISHED_SIGMA])
+SURFACES = np.stack([MATTE_DIRECTIONS, _POLISHED_DIRECTIONS.T])
+SURFACE_SIGMA = np.stack([MATTE_SIGMA, np.sqrt(_POLISHED_VARIANCE)])
 
 _ROOT = float(np.sqrt(2.0))
 # Rows: r^0 to r^4 by rho^0, rho^(1/2), rho, rho^(3/2), rho^2.

@@ -51,6 +51,7 @@ MAX_BLOCKS = 80  # of a part
 EDGE_MARGIN = 6  # columns beyond the search window, to judge edges [px]
 MAX_LINES = 8  # near an edge
 SIZES = 4  # windows are worked on together whose half widths are equal in steps of so much [px]
+MAX_WINDOW = 0.05  # of the longer side of an image
 MOST_VOTES = 2_000_000  # that are added at once, of a few patches
 OUTER_GAP, OUTER_PART = 2, 0.5  # columns between parallel lines; and what the outer one takes
 LEAST_LEFT = 1e-3  # of the score of a line
@@ -417,10 +418,6 @@ class ImageSearch:
         return index if index < self.n_legs else self.arms[index - self.n_legs]
 
 
-Method = Callable[[ImageSearch], tuple[Outlines, float]]
-"""Finds the outlines of all parts in one image, and the blur of the image [px] or NaN."""
-
-
 class PartVerdict(NamedTuple):
     """Which outlines of a part are used."""
 
@@ -439,10 +436,11 @@ class JudgedPart(NamedTuple):
     band: Band | None = None  # their frame
 
 
-def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, float]:
+def measure(search: ImageSearch, *, in_brief: bool = False) -> tuple[Outlines, float]:
     """Find, measure and judge the outlines of all parts in one image; return its blur too [px].
 
-    Two outlines for every part of every leg that is looked for, found or not.
+    Two outlines for every part of every leg that is looked for, found or not. In brief, in half the
+    time, blocks are fitted alone: to a few hundredths of a pixel.
     """
     parts, lines = find_parts(search)
     blur = math.nan
@@ -463,11 +461,14 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
         ]
         parts, edges = _at_limbs(search, parts, edges)
         measured, blur = measure_edges(
-            search.grey, search.camera, edges, together, search.blur, near_fit=near
+            search.grey, search.camera, edges, search.blur, near_fit=near, in_brief=in_brief
         )
         for part, first, second in zip(parts, measured[::2], measured[1::2], strict=True):
             of_leg = near and part.leg.leg < search.n_legs
-            lines.append(_with_verdict(part, (first, second), near_fit=of_leg))
+            reach = part.window if part.guided else None
+            pair, band = (first, second), part.band
+            judged = verdict(part.edges, part.predicted, band.length, pair, reach, near_fit=of_leg)
+            lines.append(JudgedPart(part.leg.leg, part.segment.link, judged, pair, band))
     return outline_table(search, lines), blur
 
 
@@ -501,11 +502,6 @@ def _at_limbs(
         ]
         parts[i] = replace(parts[i], pair=replace(parts[i].edges, v=v))
     return parts, edges
-
-
-def measure_in_brief(search: ImageSearch) -> tuple[Outlines, float]:
-    """Do the same in half the time, to a few hundredths of a pixel: blocks are fitted alone."""
-    return measure(search, together=False)
 
 
 def used_as_before(outlines: Outlines, before: Outlines) -> Outlines:
@@ -691,18 +687,6 @@ def _beside(part: LegPart, edges: Array, window: float) -> BoolArray:
     return np.asarray(np.any(is_there & (np.abs(offset) < window), axis=1))
 
 
-def _with_verdict(
-    part: LegPart,
-    measured: tuple[MeasuredEdge | LostEdge, MeasuredEdge | LostEdge],
-    *,
-    near_fit: bool,
-) -> JudgedPart:
-    """Return the measured edges of a part with verdicts and how well they were seen."""
-    length, window = part.band.length, part.window if part.guided else None
-    judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
-    return JudgedPart(part.leg.leg, part.segment.link, judged, measured, part.band)
-
-
 def _quality(edge: MeasuredEdge, length: float) -> tuple[float, ...]:
     """Return contrast, length, residual, by_gamma and polish of Outlines; a band's length [px]."""
     line = edge.line
@@ -851,7 +835,7 @@ def measure_outlines(
     placement: Placement,
     rows: Sequence[int],
     *,
-    method: Method = measure,
+    in_brief: bool = False,
     run: Run = in_turn,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Outlines, Array]:
@@ -865,7 +849,7 @@ def measure_outlines(
         rows = [row for row in rows if not np.isnan(placement.window[row]).all()]
     search = replace(search, edge_pairs={}, still={})  # of no use to worker processes
     blur, tables = np.full(search.measurements.n_rows, np.nan), []
-    task = partial(_of_image, search, placement, method)
+    task = partial(_of_image, search, placement, in_brief)
     for row, (outlines, blur[row]) in zip(rows, run(task, rows), strict=True):
         tables.append(outlines)
         if progress is not None:
@@ -874,7 +858,7 @@ def measure_outlines(
 
 
 def _of_image(
-    search: Search, placement: Placement, method: Method, row: int
+    search: Search, placement: Placement, in_brief: bool, row: int
 ) -> tuple[Outlines, float]:
     """Find and measure the outlines of all wanted legs of an image; return its blur too [px]."""
     view = int(search.measurements.view[row])
@@ -900,7 +884,9 @@ def _of_image(
             depths = leg.A_camera[2], leg.B_camera[2]
             length = float(np.linalg.norm(leg.B_camera - leg.A_camera))
             nearest = max(min(depths), 0.2 * depths[0], 0.0025 * length)
-            window[leg.leg] += placement.pixel_error + joint_error * float(leg.band.scale / nearest)
+            error_px = placement.pixel_error + joint_error * float(leg.band.scale / nearest)
+            # A leg right before a camera that stands nowhere would be searched all over the image.
+            window[leg.leg] += min(error_px, MAX_WINDOW * max(camera.width, camera.height))
     known = placement.blur[view] if placement.blur else np.nan
     blur = search.blur.get(row, 0.0) if np.isnan(known) else known
     one = ImageSearch(
@@ -917,7 +903,7 @@ def _of_image(
         occluders=occluders,
         polished=placement.polished,
     )
-    found, blur = (no_outlines(), np.nan) if T is None else method(one)
+    found, blur = (no_outlines(), np.nan) if T is None else measure(one, in_brief=in_brief)
     seen = {leg.leg for leg in predicted}
     why = Rejection(Reason.NOT_PLACED if T is None else Reason.OUTSIDE)
     # The longest part stands for a leg that is not looked for.

@@ -33,7 +33,7 @@ from legcal.perception.diagnostics import (
 from legcal.perception.free_poses import ROUNDS, find_free_poses
 from legcal.perception.image_quality import Exposure, image_defects, measure_exposure
 from legcal.perception.limb import powers
-from legcal.perception.outline import Method, measure, measure_in_brief, measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.placement import (
     Joined,
     Load,
@@ -214,7 +214,7 @@ def place_and_measure(
     report: Report,
     joined: Joined = None,
     *,
-    method: Method = measure,
+    in_brief: bool = False,
 ) -> MeasuredImages:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
@@ -235,10 +235,10 @@ def place_and_measure(
     search = photographs.search(nominal, pairs, rough)
     counted = _counted(report, "Recognising legs", len(usable))
     placement = place_views(search, usable, hints, joined, run=photographs.run, progress=counted)
-    outlines, blur = _measured(photographs, search, placement, report, method=method)
+    outlines, blur = _measured(photographs, search, placement, report, in_brief=in_brief)
     if not free_poses:  # which would follow wrong radii, and these wrong poses
         photographs, search, outlines, notes = _with_other_radii(
-            photographs, search, placement, outlines, report, method=method
+            photographs, search, placement, outlines, report, in_brief=in_brief
         )
         placement = replace(placement, notes=(*placement.notes, *notes))
     groups = group_views(photographs.measurements, usable, hints, joined)
@@ -249,7 +249,7 @@ def place_and_measure(
         groups,
         placement,
         own,
-        method=method,
+        in_brief=in_brief,
         run=photographs.run,
         progress=_counted(report, "Looking for missing legs", len(usable)),
     )
@@ -277,7 +277,7 @@ def _with_other_radii(
     outlines: Outlines,
     report: Report,
     *,
-    method: Method,
+    in_brief: bool,
 ) -> tuple[Photographs, Search, Outlines, list[str]]:
     """Return what is measured with the radii that outlines show, if more of these are used then.
 
@@ -307,7 +307,7 @@ def _with_other_radii(
     )
     search_again = replace(search, cylinders=changed.cylinders)
     stage = f"{MEASURING} with other radii"
-    again, _ = _measured(changed, search_again, placement, report, method=method, stage=stage)
+    again, _ = _measured(changed, search_again, placement, report, in_brief=in_brief, stage=stage)
     if again.used.sum() <= outlines.used.sum():
         return photographs, search, outlines, []
     return changed, search_again, again, _radius_notes(machine.leg_names, factors, common)
@@ -346,7 +346,7 @@ def _with_free_poses(
     machine = photographs.machine
     if machine.is_determined or len(rows) == 0:
         return nominal, {}
-    poses = find_free_poses(
+    found, cameras = find_free_poses(
         photographs.search(nominal, pairs),
         machine,
         rows.tolist(),
@@ -355,9 +355,8 @@ def _with_free_poses(
         _counted(report, "Looking for platform poses", ROUNDS * len(rows)),
         photographs.clicked_poses,
     )
-    nominal = replace(nominal, T_base_camera=poses.T_base_camera)
-    first = {pose: choices[0] for pose, choices in poses.T_base_platform.items()}
-    return _at_poses(photographs, nominal, first), poses.T_base_platform
+    first = {pose: choices[0] for pose, choices in found.items()}
+    return _at_poses(photographs, replace(nominal, T_base_camera=cameras), first), found
 
 
 def _at_poses(
@@ -409,7 +408,7 @@ def _decided_by_outlines(
             there = {pose: every[n] for pose, every in choices.items() if len(every) > n}
             search = photographs.search(_at_poses(photographs, nominal, there))
             shown = placement.shifted(search, placement.shift)
-            outlines, _ = _measured(photographs, search, shown, report, method=measure_in_brief)
+            outlines, _ = _measured(photographs, search, shown, report, in_brief=True)
             pose = photographs.measurements.pose[outlines.row[outlines.used]]
             for own in there:
                 n_used = int(np.sum(pose == own))
@@ -431,12 +430,12 @@ def measure_photographs(
     placement: Placement,
     report: Report,
     *,
-    method: Method = measure,
+    in_brief: bool = False,
     stage: str = MEASURING,
 ) -> Outlines:
     """Return all outlines: those measured near a placement, and those kept."""
     search = photographs.search(placement)
-    return _measured(photographs, search, placement, report, method=method, stage=stage)[0]
+    return _measured(photographs, search, placement, report, in_brief=in_brief, stage=stage)[0]
 
 
 def with_measured_radii(
@@ -495,7 +494,7 @@ def _measured(
     placement: Placement,
     report: Report,
     *,
-    method: Method,
+    in_brief: bool,
     stage: str = MEASURING,
 ) -> tuple[Outlines, Array]:
     """Return all outlines, measured and kept, and the blur of each row [px]."""
@@ -504,7 +503,7 @@ def _measured(
         search,
         placement,
         rows,
-        method=method,
+        in_brief=in_brief,
         run=photographs.run,
         progress=_counted(report, stage, len(photographs.detect)),
     )

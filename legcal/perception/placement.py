@@ -8,7 +8,7 @@ again is measuring with a better placement.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -120,6 +120,7 @@ class Search:
         return [(*own, *around) for own, around in zip(self.cylinders, bodies, strict=True)]
 
 
+@lru_cache(maxsize=64)  # the same in all images of a view, and at all candidate places of a camera
 def sensor_extent(camera: Camera) -> Array:
     """Return the least and the greatest x and y (2, 2) of the sensor plane that an image shows."""
     x, y = camera.width - 1.0, camera.height - 1.0
@@ -156,7 +157,7 @@ def predict_legs_and_arms(
         for k, of_legs in enumerate(ends)
     )
     every = [*cylinders, *([arm.cylinder] for arm in arms.values())]
-    return predict_legs(camera, T_base_camera, A, B, every, row)
+    return predict_legs(camera, T_base_camera, A, B, every)
 
 
 def placed_arms(

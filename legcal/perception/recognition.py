@@ -22,10 +22,10 @@ from legcal.errors import Cause
 from legcal.geometry.types import Array, IntArray
 from legcal.perception.alignment import is_moved
 from legcal.perception.camera_search import (
+    NOT_MIRRORED_SUPPORT,
     SOME_PICTURES,
     PoseCandidates,
     is_mirrored,
-    may_be_mirrored,
     mirrored,
     place_at,
     place_by_edges,
@@ -162,7 +162,7 @@ def _is_mirrored(
     search: Search, group: Group, pictures: Mapping[int, Picture], placed: PoseCandidates
 ) -> bool:
     """Return whether images of a group show the legs only with left and right exchanged."""
-    if not may_be_mirrored(placed):
+    if placed.is_given or (placed.is_convincing and placed.share >= NOT_MIRRORED_SUPPORT):
         return False
     few = placed.hinted and placed.support.shape[1] == len(group.some)
     flipped = mirrored(group.pictures(pictures, group.some if few else group.rows))

@@ -74,16 +74,16 @@ def measure_edges(
     grey: Grey,
     camera: Camera,
     edges: Sequence[Edge],
-    together: bool = True,
     blur: float | None = None,
     *,
     near_fit: bool = False,
+    in_brief: bool = False,
 ) -> tuple[list[MeasuredEdge | LostEdge], float]:
     """Fit the limb model and straight lines to all edges of an image; return its blur as well [px].
 
-    Unless all blocks are fitted together in the end,
-    lines are good to a few hundredths of a pixel, in half the time. The blur may be known roughly.
-    Near a fit it is that of other images, and edges are known to a few tenths of a pixel.
+    In brief, blocks are not fitted together in the end: lines are good to a few hundredths of a
+    pixel, in half the time. The blur may be known roughly. Near a fit it is that of other images,
+    and edges are known to a few tenths of a pixel.
     """
     v, joint = [edge.v for edge in edges], None
     n_rounds = ROUNDS if blur is None else ROUNDS_NEAR
@@ -96,17 +96,17 @@ def measure_edges(
         for n in n_rounds:
             blocks.fit(blur, 1)
             blur = blocks.estimate_blur(n)
-        if not together and abs(np.log(blur / first)) < BLUR_CONVERGED:
+        if in_brief and abs(np.log(blur / first)) < BLUR_CONVERGED:
             blocks.fit(blur, LAST_ROUNDS)
             return _measured(edges, v, blocks, blur, None), blur
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(MAX_BLUR_TRIALS):
         tried = blur
-        blocks = Blocks.read(grey, camera, edges, v, tried, None if together else FIRST_BLOCKS)
+        blocks = Blocks.read(grey, camera, edges, v, tried, FIRST_BLOCKS if in_brief else None)
         if len(blocks.moved) == 0:
             return [LostEdge(tried)] * len(edges), tried
         blocks.fit(tried, LAST_ROUNDS)
-        if not together:
+        if in_brief:
             break
         if near_fit:
             blocks.unmove()

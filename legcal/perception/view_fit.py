@@ -40,7 +40,7 @@ from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import main_cylinders
-from legcal.perception.outline import Method, measure, measure_outlines
+from legcal.perception.outline import measure_outlines
 from legcal.perception.pair_matching import MIN_DEPTH, CameraPoses, depth_reversed
 from legcal.perception.placement import Group, Placement, Search
 from legcal.perception.tuning import EVIDENCE, OUTLIER_SIGMAS, OUTLINE_SIGMA_PX
@@ -109,13 +109,8 @@ class ViewFit:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the outlines determine the pose: else legs may be others."""
-        return bool(self.turn_sigma <= MAX_TURN_SIGMA)
-
-    @property
-    def turn_sigma(self) -> float:
-        """Standard deviation of the rotation about the axis that is known worst [rad]."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+        """Whether the outlines determine the pose about every axis: else legs may be others."""
+        return bool(np.linalg.eigvalsh(self.covariance[:3, :3])[-1] <= MAX_TURN_SIGMA**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,7 +464,7 @@ def refine_views(
     placement: Placement,
     outlines: Outlines,
     *,
-    method: Method = measure,
+    in_brief: bool = False,
     run: Run = in_turn,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Placement, Outlines, Fits]:
@@ -484,7 +479,7 @@ def refine_views(
     placement = _placed_by_fits(search, groups, placement, fits)
     near = replace(placement, window=_windows(search, groups, fits, outlines))
     rows = sorted(row for group in groups for row in group.rows)
-    again, _ = measure_outlines(search, near, rows, method=method, run=run, progress=progress)
+    again, _ = measure_outlines(search, near, rows, in_brief=in_brief, run=run, progress=progress)
     measured = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
     kept = outlines.choose(~_among(outlines, measured))
     outlines = join_outlines([kept, again.choose(_among(again, measured))])

@@ -154,7 +154,7 @@ class PlacedBoard:
         sheet = BoardPrint.of(self.board, face, middle[:2])
         material = Material(albedo=0.8, specular=0.0, shininess=10.0, limb=0.0, sheet=sheet)
         T = self.T_base_board * T_board_plate
-        solid = Solid("calibration board", None, Box(self.plate_size), T, material)
+        solid = Solid(None, Box(self.plate_size), T, material)
         return PlacedSolid(solid, T)
 
     def beside(self, posed: PosedMachine) -> PosedMachine:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +21,7 @@ from legcal.geometry.motions import look_at
 from legcal.geometry.types import Array
 from legcal.machine.leg import Link
 from legcal.machine.model import Machine
+from legcal.perception.placement import sensor_extent
 from legcal.planning.places import feet
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
@@ -179,7 +178,7 @@ def board_and_cameras(
         if len(good) == _N_BOARD_CANDIDATES:
             break
     if not good:
-        raise _nowhere(board, "every camera around the machine", "use a smaller board")
+        raise _nowhere(board, "every camera around the machine")
     _, placed, views = max(good, key=lambda scored: scored[0])
     return placed, views
 
@@ -203,7 +202,7 @@ def board_on_platform(
             for p, body in zip(placed, _some(posed_machines), strict=True)
         ):
             return T
-    raise _nowhere(board, "the cameras", "use a smaller board", "platform")
+    raise _nowhere(board, "the cameras", "platform")
 
 
 def _few(posed_machines: Sequence[PosedMachine]) -> list[int]:
@@ -238,7 +237,7 @@ def _before(
     """Return the pose of a camera in a direction, with all points in the image."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     rotation = look_at(target + toward, target, roll, up=up).rotation
-    low, high = field_of_view(camera)
+    low, high = sensor_extent(camera)
     low, high = (1.0 - 2.0 * _MARGIN) * low, (1.0 - 2.0 * _MARGIN) * high
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     p = rotation.inv().apply(points - target)
@@ -311,17 +310,6 @@ def _length(
     return total / (len(seen) * machine.n_legs)
 
 
-@lru_cache(maxsize=64)  # the same at every candidate place of a camera
-def field_of_view(camera: Camera) -> tuple[Array, Array]:
-    """Return the least and the largest (x, y) of the sensor plane on the image's border."""
-    x, y = camera.width - 1.0, camera.height - 1.0
-    t = np.linspace(0.0, 1.0, 9)[:, None]
-    corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y], [0.0, 0.0]])
-    border = np.concatenate([a + t * (b - a) for a, b in pairwise(corners)])
-    xy = camera.undistort(border)
-    return xy.min(axis=0), xy.max(axis=0)
-
-
 def _lying(
     board: Board, machine: Machine, posed_machines: Sequence[PosedMachine]
 ) -> Iterator[PlacedBoard]:
@@ -337,11 +325,11 @@ def _lying(
                 break
 
 
-def _nowhere(board: Board, who: str, remedy: str, link: Link = "base") -> NotVisible:
+def _nowhere(board: Board, who: str, link: Link = "base") -> NotVisible:
     """Return the error of a board without a suitable place."""
     width, height = np.ptp(board.extent, axis=0)[:2].tolist()
     return NotVisible(
         f"The board could not be placed: found no place near the {link} at which {who} would see a "
         f"{board.kind} of {1000 * width:.0f} x {1000 * height:.0f} mm well enough, needed one in "
-        f"all images; {remedy}."
+        "all images; use a smaller board."
     )

@@ -17,11 +17,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data.corners import Corners, found_corners, join_corners
-from legcal.data.outlines import Outlines, join_outlines, unmeasured
-from legcal.data.reasons import USED
+from legcal.data.outlines import Outlines, join_outlines, outlines_in_sight
 from legcal.errors import NotVisible, UsageError
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import matrix_applied
+from legcal.geometry.tables import Table
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Leg, cylinder_of_arm
 from legcal.machine.shapes import Occluder
@@ -96,7 +96,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True, eq=False)
-class Images:
+class Images(Table):
     """The images of a dataset, in the order of its rows."""
 
     # view, pose, repeat: (n_rows,) indices; ``repeat`` counts the images of one pose in one view
@@ -105,9 +105,6 @@ class Images:
     repeat: IntArray
     # visible legs and arms by row; equal for all images of one pose in one view
     shown: tuple[Seen, ...]
-
-    def __len__(self) -> int:
-        return len(self.view)
 
     def seen(self, row: int) -> list[int]:
         """Return the legs that are measurable in an image."""
@@ -119,12 +116,6 @@ class Images:
         rows = np.flatnonzero(self.view == view).tolist()
         counts = Counter(j for row in rows for j in self.seen(row))
         return sorted(j for j, n in counts.items() if n > least * len(rows))
-
-    def chosen(self, rows: Sequence[int]) -> Images:
-        """Return some of the images."""
-        index = np.asarray(rows, dtype=np.intp)
-        shown = tuple(self.shown[row] for row in rows)
-        return Images(self.view[index], self.pose[index], self.repeat[index], shown)
 
 
 def take_images(
@@ -240,33 +231,18 @@ def outlines_of(
     either case.
     """
     claimed = replace(noise, sigma_px=max(noise.sigma_px, EXACT_PX))
-    images = scene.images
-    rows, h, ends, covariances = [], list[Array](), list[Array](), []
-    for row, seen in enumerate(images.shown):
-        camera = scene.views[images.view[row]].camera
-        for line, pixels, length in zip(seen.h, seen.ends, seen.length_px.tolist(), strict=True):
-            covariance = claimed.covariance(length)
-            if rng is not None and noise.sigma_px > 0.0:
-                errors = rng.multivariate_normal(np.zeros(2), covariance, size=2)
-                line, pixels = shifted_outlines(camera, line, pixels, errors)
-            rows.append(row)
-            h.append(line)
-            ends.append(pixels)
-            covariances.append(covariance)
-    n, no_legs = 2 * len(rows), np.zeros(0, dtype=np.intp)
-    return Outlines(
-        row=np.repeat(np.array(rows, dtype=np.intp), 2),
-        leg=np.repeat(np.concatenate([no_legs, *(seen.leg for seen in images.shown)]), 2),
-        part=tuple(part for seen in images.shown for part in seen.part for _ in range(2)),
-        edge=np.tile(np.array([1, 2], dtype=np.intp), len(rows)),
-        h=np.array(h).reshape(n, 3),
-        ends=np.array(ends).reshape(n, 2, 2),
-        covariance=np.repeat(np.array(covariances).reshape(-1, 2, 2), 2, axis=0),
-        used=np.ones(n, dtype=np.bool_),
-        reason=(USED,) * n,
-        source=("detected",) * n,
-        **unmeasured(n),
-    )
+    images, seen = scene.images, Seen.joined(scene.images.shown)
+    row = np.repeat(np.arange(len(images)), [len(shown) for shown in images.shown])
+    covariance = [claimed.covariance(length) for length in seen.length_px.tolist()]
+    outlines = outlines_in_sight(seen, row, np.array(covariance).reshape(-1, 2, 2))
+    if rng is None or noise.sigma_px == 0.0:
+        return outlines
+    errors = [rng.multivariate_normal(np.zeros(2), C, size=2) for C in covariance]
+    offsets, h, ends = np.reshape(errors, (-1, 2)), outlines.h.copy(), outlines.ends.copy()
+    for v, view in enumerate(scene.views):
+        some = images.view[outlines.row] == v
+        h[some], ends[some] = shifted_outlines(view.camera, h[some], ends[some], offsets[some])
+    return replace(outlines, h=h, ends=ends)
 
 
 def edges_of_bodies(

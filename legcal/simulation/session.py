@@ -14,7 +14,6 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -44,7 +43,7 @@ from legcal.machine.model import Machine, platform_pose
 from legcal.machine.redundancy import contradictions
 from legcal.planning.places import LaidBoard, Setting
 from legcal.planning.request import difference
-from legcal.planning.session import PlanDocument
+from legcal.planning.session import PlanDocument, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board, placed_at
 from legcal.simulation.cameras import (
@@ -59,6 +58,7 @@ from legcal.simulation.cameras import (
 )
 from legcal.simulation.observe import Images, Scene, Viewpoint, take_images
 from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.rays import divided
 from legcal.simulation.rendering.scene import RenderedView, prepare_view
 from legcal.simulation.settings import Distribution, Level, Sampling, SimulationSettings
 from legcal.simulation.solids import PlacedSolid, PosedMachine, Solid, dressed, pose_machine
@@ -109,17 +109,22 @@ def simulate_session(
     simulator = _Simulator(truth, nominal, settings, rngs, progress)
     poses, plan = simulator.poses(), simulator.plan
     posed, boards, views, groups = simulator.set_up(poses)
-    images = simulator.shoot(posed, views, groups)
+    poses_of: Sequence[Sequence[int]] = [
+        [v % len(posed)] if groups else simulator.poses_of(v, len(posed)) for v in range(len(views))
+    ]
+    images = take_images(
+        truth.legs, posed, views, poses_of if plan is None else plan.poses_of, settings.images,
+        progress, all_views=plan is None or not plan.hand,
+    )  # fmt: skip
     rows = list(range(len(images)))
     if settings.level != Level.PHOTOGRAPHS:  # tables need a leg in every row
         rows = [row for row in rows if images.seen(row)]
-    left_out, images = len(images) - len(rows), images.chosen(rows)
+    left_out, images = len(images) - len(rows), images.choose(np.array(rows, dtype=np.intp))
     if groups:
         images, views, groups = _numbered(images, views, groups)
     A, B = (np.array([getattr(m, joint) for m in posed]) for joint in "AB")
     scene = Scene(A, B, views, images)
-    width = max(2, len(str(len(posed))))
-    labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(posed)))
+    labels = tuple(pose_labels(len(posed)))
     hints = settings.hints and not groups
     measurements = _recorded(truth, poses, labels, scene, settings, rngs, hints=hints)
     if plan is not None and hints:  # hints are the planned poses of the tripods
@@ -129,15 +134,6 @@ def simulate_session(
     return SimulatedSession(
         measurements, truth, poses, labels, posed, scene, left_out, boards, groups
     )
-
-
-class _Setup(NamedTuple):
-    """The true machine in its poses, among boards and cameras."""
-
-    posed_machines: tuple[PosedMachine, ...]  # in every pose, with the boards
-    boards: tuple[FixedBoard, ...]
-    views: tuple[Viewpoint, ...]
-    groups: tuple[str, ...]  # view of each hand-held camera pose; empty for fixed cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +207,15 @@ class _Simulator:
         settings.check_images(n_views, len(poses.poses) // n_sets)
         return poses
 
-    def set_up(self, poses: Configurations) -> _Setup:
-        """Return boards and cameras around the machine, according to plan and settings."""
+    def set_up(
+        self, poses: Configurations
+    ) -> tuple[
+        tuple[PosedMachine, ...], tuple[FixedBoard, ...], tuple[Viewpoint, ...], tuple[str, ...]
+    ]:
+        """Return the machine in its poses with boards, these, cameras, and the view of each.
+
+        According to plan and settings. Fixed cameras are views themselves: there are no others.
+        """
         # Meshes are beside the nominal URDF; the URDF of the true machine is a copy.
         urdf = replace(self.truth.urdf, path=self.nominal.urdf.path)
         has_images = self.settings.level == Level.PHOTOGRAPHS
@@ -271,7 +274,7 @@ class _Simulator:
                 for view in views
             }
             views = tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
-        return _Setup(posed, boards, views, groups)
+        return posed, boards, views, groups
 
     def _in_hand(
         self, posed: tuple[PosedMachine, ...]
@@ -294,24 +297,6 @@ class _Simulator:
                 groups.append(name)
         self.progress("Camera places", n_images, n_images)
         return tuple(views), tuple(groups)
-
-    def shoot(
-        self,
-        posed: Sequence[PosedMachine],
-        views: Sequence[Viewpoint],
-        groups: Sequence[str],
-    ) -> Images:
-        """Return the images that the views take of the machine in their poses."""
-        plan, n_poses = self.plan, len(posed)
-        poses_of: Sequence[Sequence[int]] = [
-            [v % n_poses] if groups else self.poses_of(v, n_poses) for v in range(len(views))
-        ]
-        if plan is not None:
-            poses_of = plan.poses_of
-        return take_images(
-            self.truth.legs, posed, views, poses_of, self.settings.images, self.progress,
-            all_views=plan is None or not plan.hand,
-        )  # fmt: skip
 
 
 def _numbered(
@@ -685,11 +670,7 @@ def preview(
     board: LaidBoard | None = None,
 ) -> bytes:
     """Return a JPEG of a machine in the first of some poses, without noise and clutter."""
-    scale = min(_WIDTH / camera.width, 1.0)
-    K = camera.K * [[scale], [scale], [1.0]]
-    small = replace(
-        camera, K=K, width=round(camera.width * scale), height=round(camera.height * scale)
-    )
+    small = divided(camera, min(_WIDTH / camera.width, 1.0))
     (posed,) = pose_machine(machine, dressed(machine, meshes_needed=False), poses.chosen([0]))
     if board is not None:
         posed = PlacedBoard(board.board, board.T_base_board).beside(posed)

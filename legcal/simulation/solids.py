@@ -159,7 +159,6 @@ PART = Material(albedo=0.30, specular=0.05, shininess=15.0, limb=0.20)
 class Solid:
     """A solid that moves with a link."""
 
-    name: str
     link: str | None  # of the URDF; None for objects in the base frame that are not in the URDF
     shape: Shape
     T_link_solid: RigidTransform  # its pose in the link, or in the base frame
@@ -188,7 +187,7 @@ def solids_of(machine: Machine, *, meshes_needed: bool = True) -> tuple[Solid, .
     problems: list[str] = []
     solids = []
     for element in robot.findall("link"):
-        link, number = element.get("name", ""), 0
+        link = element.get("name", "")
         for visual in element.findall("visual"):
             geometry = visual.find("geometry")
             if geometry is None or len(geometry) == 0:
@@ -206,7 +205,6 @@ def solids_of(machine: Machine, *, meshes_needed: bool = True) -> tuple[Solid, .
                     f"'{link}' could not be shown: {error}."
                 )
                 continue
-            number += 1
             leg = None
             if isinstance(shape, SolidCylinder):
                 leg = _leg_along(shape, product(poses[link], T), link, machine)
@@ -215,8 +213,7 @@ def solids_of(machine: Machine, *, meshes_needed: bool = True) -> tuple[Solid, .
             if named is not None:
                 colour = _rgb(named) or colours.get(named.get("name", ""))
             material = _material(shape, colour, None if leg is None else machine.legs[leg])
-            name = link if number == 1 else f"{link}/{number}"
-            solids.append(Solid(name, link, shape, T, material, leg))
+            solids.append(Solid(link, shape, T, material, leg))
     if problems:
         raise ModelError(problems)
     return tuple(solids)
@@ -331,22 +328,20 @@ def _end(
     The posts are ``further`` radii of the thickest leg longer than they need to be.
     """
     solids = []
-    for j, (joint, R, ball) in enumerate(zip(joints, radii, balls, strict=True)):
+    for joint, R, ball in zip(joints, radii, balls, strict=True):
         if ball:
             position = RigidTransform.from_translation(joint)
-            solids.append(
-                Solid(f"{link}_ball{j + 1}", link, Sphere(_BALL_SIZE * R), position, _BALL)
-            )
+            solids.append(Solid(link, Sphere(_BALL_SIZE * R), position, _BALL))
     if away is None:
         return solids
     turn = Rotation.align_vectors([away], [[0.0, 0.0, 1.0]])[0]
     thickest = float(radii.max())
     outside = float((joints @ away).max()) + (_POST_LENGTH + further) * thickest
-    for j, (joint, R) in enumerate(zip(joints, radii, strict=True)):
+    for joint, R in zip(joints, radii, strict=True):
         length = outside - float(joint @ away)
         middle = RigidTransform.from_components(joint + 0.5 * length * away, turn)
         post = SolidCylinder(_POST_SIZE * float(R), length)
-        solids.append(Solid(f"{link}_post{j + 1}", link, post, middle, _POST))
+        solids.append(Solid(link, post, middle, _POST))
     middle = joints.mean(axis=0)
     across = joints - middle
     across = across - (across @ away)[:, None] * away
@@ -354,7 +349,7 @@ def _end(
     size = float(np.linalg.norm(across, axis=1).max()) + _PLATE_RIM * thickest
     position = middle + (outside + 0.5 * thickness - float(middle @ away)) * away
     pose = RigidTransform.from_components(position, turn)
-    solids.append(Solid(f"{link}_plate", link, SolidCylinder(size, thickness), pose, _PLATE))
+    solids.append(Solid(link, SolidCylinder(size, thickness), pose, _PLATE))
     return solids
 
 
@@ -407,11 +402,12 @@ class PosedMachine:
 
     def encloses(self, centre: Array) -> bool:
         """Return whether a point (3,) is in a solid, or between the joints of the machine."""
-        if any(
-            _is_in(shape.solid.shape, shape.T_base_solid.inv().apply(centre))
-            for shape in self.solids
-        ):
-            return True
+        for placed_solid in self.solids:
+            shape, point = placed_solid.solid.shape, placed_solid.T_base_solid.inv().apply(centre)
+            (middle, reach), mesh = holding_sphere(shape), triangles(shape)
+            is_near = np.linalg.norm(point - middle) < reach
+            if is_near and mesh.is_watertight and mesh.contains(point[None])[0]:
+                return True
         joints = np.concatenate([self.A, self.B])
         size = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
         if len(joints) < 5 or size[2] < _FLAT_JOINTS * size[0]:
@@ -465,14 +461,9 @@ def triangles(shape: Shape) -> Any:
     return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
 
 
-def _is_in(shape: Shape, point: Array) -> bool:
-    """Return whether a point (3,) in the frame of a shape is inside it."""
-    if isinstance(shape, SolidCylinder):
-        beside = np.hypot(point[0], point[1]) < shape.radius
-        return bool(beside and abs(point[2]) < 0.5 * shape.length)
-    if isinstance(shape, Sphere):
-        return bool(np.linalg.norm(point) < shape.radius)
-    if isinstance(shape, Box):
-        return bool(np.all(np.abs(point) < 0.5 * np.asarray(shape.size)))
-    mesh = triangles(shape)
-    return bool(mesh.is_watertight and mesh.contains(point[None])[0])
+@lru_cache(maxsize=256)
+def holding_sphere(shape: Shape) -> tuple[Array, float]:
+    """Return middle (3,) and radius of a sphere around a shape, in the shape's frame [m]."""
+    vertices = np.asarray(triangles(shape).vertices)
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    return middle, float(np.linalg.norm(vertices - middle, axis=1).max())

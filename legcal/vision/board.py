@@ -135,18 +135,13 @@ class FixedBoard:
     T_link_board: RigidTransform | None = None  # None if not known
     first: int = 0  # the number of its first corner
 
-    @property
-    def name(self) -> str:
-        """Its name in parameters and messages."""
-        return board_name(self.link)
-
     def has(self, corner: IntArray) -> BoolArray:
         """Return a mask (n,) of the corner indices that belong to this board."""
         return (corner >= self.first) & (corner < self.first + self.board.n_corners)
 
 
 def board_name(link: Link) -> str:
-    """Return the name of the board on a link."""
+    """Return the name of the board on a link, in parameters and messages."""
     return "board" if link == "base" else f"{link}_board"
 
 

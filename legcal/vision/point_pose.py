@@ -55,12 +55,13 @@ def camera_poses_by_points(
     front of the camera.
     """
     middle, xy = points.mean(axis=0), camera.undistort(px)
+    shown = points - middle
     starts = [
         pose
         for some in _subsets(len(points))
-        for pose in _closed_form(points[some] - middle, xy[some])
+        if not on_a_line(shown[some])
+        for pose in closed_form_poses(shown[some], xy[some], cv2.SOLVEPNP_SQPNP)
     ]
-    shown = points - middle
     cost = np.array([_cost(camera, pose, shown, px, sigma_px) for pose in starts])
     refined: list[PointPose] = []
     tried: list[RigidTransform] = []
@@ -98,12 +99,6 @@ def _subsets(n: int) -> Iterator[IntArray]:
     rng = np.random.default_rng(SEED)
     for _ in range(MAX_SUBSETS):
         yield rng.choice(n, MIN_POINTS, replace=False)
-
-
-def _closed_form(points: Array, xy: Array) -> Iterator[RigidTransform]:
-    """Yield T_camera_points by SQPnP of points (n, 3) seen at (n, 2) of the sensor plane."""
-    if not on_a_line(points):
-        yield from closed_form_poses(points, xy, cv2.SOLVEPNP_SQPNP)
 
 
 def closed_form_poses(points: Array, xy: Array, method: int) -> Iterator[RigidTransform]:

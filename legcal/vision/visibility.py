@@ -135,19 +135,6 @@ class Band:
         value = np.sum(h[..., :2] * on_axis, axis=-1) + h[..., 2]
         return np.asarray(-self.scale * value / (h[..., :2] @ self.normal))
 
-    def line(self, v0: Array | float, v1: Array | float) -> Array:
-        """Return the unit (a, b, c) of the line through (0, v0) and (length, v1), eq (2).
-
-        The sign follows eq (3): positive on the side of greater v.
-        """
-        ends = np.stack([np.asarray(v0, dtype=np.float64), np.asarray(v1, dtype=np.float64)], -1)
-        (x0, y0), (x1, y1) = np.moveaxis(
-            self.points(np.array([0.0, self.length]), ends), (-2, -1), (0, 1)
-        )
-        h = np.stack([y0 - y1, x1 - x0, x0 * y1 - x1 * y0], axis=-1)  # the vector product of rays
-        h /= np.linalg.norm(h, axis=-1, keepdims=True)
-        return np.asarray(h * np.sign(h[..., :2] @ self.normal)[..., None])
-
 
 def bands_of_legs(
     camera: Camera,
@@ -228,7 +215,6 @@ def longest_runs(flags: BoolArray) -> tuple[IntArray, IntArray]:
 class PredictedLeg:
     """The predicted appearance of one leg in one image."""
 
-    row: int  # of the image
     leg: int  # index of the leg
     A_camera: Array  # (3,) its base joint in the camera frame [m]
     B_camera: Array  # (3,) its platform joint [m]
@@ -264,7 +250,6 @@ def predict_legs(
     A_base: Array,  # (n_legs, 3)
     B_base: Array,  # (n_legs, 3)
     cylinders: Sequence[Sequence[Cylinder]],
-    row: int,
 ) -> list[PredictedLeg]:
     """Predict every leg that an image should show."""
     T = T_base_camera.as_matrix()
@@ -295,7 +280,6 @@ def predict_legs(
     of_leg = np.split(outlines, np.cumsum([len(segments[leg]) for leg in visible_bands])[:-1])
     return [
         PredictedLeg(
-            row,
             leg,
             A_camera[leg],
             B_camera[leg],

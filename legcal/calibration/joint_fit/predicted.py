@@ -46,8 +46,7 @@ from legcal.calibration.tuning import TWIST_SIGMA_DEG
 from legcal.data.corners import Corners, found_corners
 from legcal.data.dataset import OBSERVATIONS_NAME
 from legcal.data.measurements import Measurements, View
-from legcal.data.outlines import FIRST_EDGE, OUTLINE_COLUMNS, Outlines, unmeasured
-from legcal.data.reasons import USED
+from legcal.data.outlines import FIRST_EDGE, OUTLINE_COLUMNS, Outlines, outlines_in_sight
 from legcal.errors import DatasetError, UsageError
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.uncertainty import marginal_rows
@@ -59,7 +58,6 @@ from legcal.machine.rods import ends_in_base, reading_of_rod
 from legcal.perception.body_edges import predicted_edges
 from legcal.vision.board import Board, FixedBoard
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON
 from legcal.vision.visibility import Seen
 
 # What is known of all that has no other prior: [rad] and [px], mean leg lengths
@@ -70,20 +68,7 @@ CORNER_PX = 0.1  # standard deviation of a corner of a board [px]
 
 def predicted_outlines(seen: Seen, row: IntArray) -> Outlines:
     """Return the outlines of visible segments, each end known to a pixel; *row* of each image."""
-    n = len(seen.leg)
-    return Outlines(
-        row=np.repeat(row[seen.image], 2),
-        leg=np.repeat(seen.leg, 2),
-        part=tuple(part for part in seen.part for _ in EPSILON),
-        edge=np.tile(np.array([1, 2], dtype=np.intp), n),
-        h=seen.h.reshape(-1, 3),
-        ends=seen.ends.reshape(-1, 2, 2),
-        covariance=np.tile(np.eye(2), (2 * n, 1, 1)),
-        used=np.ones(2 * n, dtype=np.bool_),
-        reason=(USED,) * (2 * n),
-        source=("detected",) * (2 * n),
-        **unmeasured(2 * n),
-    )
+    return outlines_in_sight(seen, row[seen.image], np.tile(np.eye(2), (len(seen), 1, 1)))
 
 
 def predicted_corners(fixed: FixedBoard, row: IntArray, px: Array) -> Corners:

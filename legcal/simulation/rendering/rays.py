@@ -13,7 +13,16 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.meshes import ray_caster
-from legcal.simulation.solids import Box, Material, Mesh, PlacedSolid, Shape, SolidCylinder, Sphere
+from legcal.simulation.solids import (
+    Box,
+    Material,
+    Mesh,
+    PlacedSolid,
+    Shape,
+    SolidCylinder,
+    Sphere,
+    holding_sphere,
+)
 from legcal.vision.camera import Camera
 
 Single = NDArray[np.float32]
@@ -98,11 +107,11 @@ def pixel_rays(camera: Camera, fineness: int = 1) -> PixelRays:
     return PixelRays(camera if fineness == 1 else divided(camera, fineness))
 
 
-def divided(camera: Camera, fineness: int) -> Camera:
-    """Return a camera with each pixel divided into ``fineness`` x ``fineness`` pixels."""
+def divided(camera: Camera, fineness: float) -> Camera:
+    """Return a camera with ``fineness`` x ``fineness`` pixels in place of each pixel."""
     K = camera.K * [[fineness], [fineness], [1.0]]
     K[:2, 2] += 0.5 * (fineness - 1)
-    width, height = fineness * camera.width, fineness * camera.height
+    width, height = round(fineness * camera.width), round(fineness * camera.height)
     return replace(camera, K=K, width=width, height=height)
 
 
@@ -142,19 +151,6 @@ def in_view(solids: Sequence[PlacedSolid], T_camera_base: RigidTransform) -> lis
         middle, reach = holding_sphere(shape)
         in_camera.append(SolidInView(shape, placed.solid.material, R, w, R @ middle + w, reach))
     return in_camera
-
-
-def holding_sphere(shape: Shape) -> tuple[Array, float]:
-    """Return middle (3,) and radius of a sphere around a shape, in the shape's frame [m]."""
-    if isinstance(shape, Mesh):
-        low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
-        middle = 0.5 * (low + high)
-        return middle, float(np.linalg.norm(shape.vertices - middle, axis=1).max())
-    if isinstance(shape, SolidCylinder):
-        return np.zeros(3), float(np.hypot(shape.radius, 0.5 * shape.length))
-    if isinstance(shape, Sphere):
-        return np.zeros(3), shape.radius
-    return np.zeros(3), 0.5 * float(np.linalg.norm(shape.size))
 
 
 def first_triangle(solid: SolidInView, mesh: Mesh, x: Single, y: Single) -> tuple[Single, IntArray]:
@@ -305,7 +301,10 @@ def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
     hull = _cut(hull, rays.low - spare, rays.high + spare)
     if not len(hull):
         return np.zeros(0, dtype=np.intp)
-    return _filled(_hull(rays.camera.distort(_dense(hull))), rays.width, rays.height)
+    # More points along its sides: the lens bends them.
+    along, side = np.arange(_PIECES)[:, None] / _PIECES, np.roll(hull, -1, axis=0) - hull
+    dense = (hull[:, None] + along * side[:, None]).reshape(-1, 2)
+    return _filled(_hull(rays.camera.distort(dense)), rays.width, rays.height)
 
 
 def surrounding_points(solid: SolidInView) -> Array:
@@ -351,13 +350,6 @@ def _cut(polygon: Array, low: Array, high: Array) -> Array:
                 return np.zeros((0, 2))
             polygon = np.array(kept)
     return polygon
-
-
-def _dense(polygon: Array) -> Array:
-    """Return more points along the sides of a polygon: the lens bends them."""
-    t = np.arange(_PIECES)[:, None] / _PIECES
-    side = np.roll(polygon, -1, axis=0) - polygon
-    return np.asarray((polygon[:, None] + t * side[:, None]).reshape(-1, 2))
 
 
 def _filled(hull: Array, width: int, height: int) -> IntArray:

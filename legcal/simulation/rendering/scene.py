@@ -20,7 +20,6 @@ from legcal.simulation.rendering.rays import (
     Single,
     SolidInView,
     footprint,
-    holding_sphere,
     in_view,
     intersect,
     is_hidden,
@@ -38,6 +37,8 @@ from legcal.simulation.solids import (
     Solid,
     SolidCylinder,
     Sphere,
+    holding_sphere,
+    triangles,
 )
 from legcal.vision.camera import Camera
 
@@ -200,16 +201,6 @@ class Lighting:
     look: Appearance  # ambient light, factors on the properties of materials, colour
 
 
-@dataclass(frozen=True, eq=False)
-class Shaded:
-    """Light from points of a surface, apart by where it comes from."""
-
-    P: Single  # (3, n) the points in the camera frame [m]
-    fixed: Single  # (n_channels, n) light that shadows do not affect
-    of_lamp: list[Single]  # (n_channels, n) the light of each lamp, without shadows
-    faces_lamp: list[BoolArray]  # (n,) whether the surface faces the lamp
-
-
 def shade(
     solid: SolidInView,
     x: Single,
@@ -218,8 +209,8 @@ def shade(
     face: Faces,
     light: Lighting,
     ink: Single | None = None,
-) -> Shaded:
-    """Return the light that points of a solid send to the camera."""
+) -> tuple[Single, Single, list[Single], list[BoolArray]]:
+    """Return the light that points of a solid send to the camera, as VisibleSolid has it."""
     material = solid.material
     P = np.stack([x * z, y * z, z])
     n = normals(solid, P, face)
@@ -261,7 +252,7 @@ def shade(
             glint *= np.minimum(np.maximum(cosine, 0.0) * 8.0, 1.0)  # none beyond the terminator
         of_lamp.append(_channels(albedo * lit, glint, material.tint, light))
         faces_lamp.append(cosine > 0.0)
-    return Shaded(P, fixed, of_lamp, faces_lamp)
+    return P, fixed, of_lamp, faces_lamp
 
 
 def _channels(
@@ -306,26 +297,29 @@ class CoarseSurface:
 
 @dataclass(frozen=True, eq=False)
 class VisibleSolid:
-    """The visible part of one solid."""
+    """The visible part of one solid, and the light from its points by where it comes from."""
 
     solid: int  # the solid, as an index
     pixels: IntArray  # (n_pixels,) its pixels, ascending
-    shaded: Shaded  # the light from its points
     # (n_pixels,) the first point of each pixel where a pixel has several
-    first: IntArray | None = None
+    first: IntArray | None
+    P: Single  # (3, n) the points in the camera frame [m]
+    fixed: Single  # (n_channels, n) light that shadows do not affect
+    of_lamp: list[Single]  # (n_channels, n) the light of each lamp, without shadows
+    faces_lamp: list[BoolArray]  # (n,) whether the surface faces the lamp
 
     def faces(self, lamp: int) -> BoolArray:
         """Return a mask (n_pixels,) of the pixels where the surface faces a lamp."""
-        faces = self.shaded.faces_lamp[lamp]
+        faces = self.faces_lamp[lamp]
         return faces if self.first is None else np.logical_or.reduceat(faces, self.first)
 
     def radiance(self, shares: Sequence[Single | None], n_terms: int) -> Single:
         """Return the light summed over points, (n_terms, n_channels, n_pixels)."""
         lit = [
             light if share is None else light * self._spread(share)
-            for light, share in zip(self.shaded.of_lamp, shares, strict=True)
+            for light, share in zip(self.of_lamp, shares, strict=True)
         ]
-        fixed = self.shaded.fixed
+        fixed = self.fixed
         terms = np.stack([fixed, *lit]) if n_terms > 1 else np.asarray(sum(lit, fixed))[None]
         if self.first is None:
             return terms
@@ -335,7 +329,7 @@ class VisibleSolid:
         """Return the shares of pixels, repeated for all of their points."""
         if self.first is None:
             return share
-        return np.repeat(share, np.diff(self.first, append=self.shaded.P.shape[1]))
+        return np.repeat(share, np.diff(self.first, append=self.P.shape[1]))
 
 
 def shares_of_lamps(
@@ -353,7 +347,10 @@ def shares_of_lamps(
                 shares.append(None)
             continue
         lit = [np.flatnonzero(part.faces(k)) for part in parts]
-        points = [_traced(part, some) for part, some in zip(parts, lit, strict=True)]
+        points = [
+            part.P[:, some if part.first is None else part.first[some]]
+            for part, some in zip(parts, lit, strict=True)
+        ]
         small = [len(some) <= _LARGE for some in lit]
         together = [P for P, is_small in zip(points, small, strict=True) if is_small]
         owners = [np.full(P.shape[1], p.solid) for p, P in zip(parts, points, strict=True)]
@@ -376,11 +373,6 @@ def shares_of_lamps(
                 share[some] = surface.seen(lamp, occluders, part.solid).take(pixels)
             shares.append(share)
     return shares_by_part
-
-
-def _traced(part: VisibleSolid, some: IntArray) -> Single:
-    """Return a point of each of some pixels, (3, n)."""
-    return part.shaded.P[:, some if part.first is None else part.first[some]]
 
 
 _TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=0.08,
@@ -418,24 +410,15 @@ def _table(
     size = 4.0 * radius, 3.2 * radius, 0.06 * radius
     foot = centre + (lowest - float(centre @ _UP) - 0.5 * size[2]) * _UP
     T = RigidTransform.from_components(foot, Rotation.from_euler("z", 0.3))
-    return (_placed("table", Box(size), T, _TABLE),)
+    return (_placed(Box(size), T, _TABLE),)
 
 
 def _lowest(placed: PlacedSolid, up: Array) -> float:
     """Return the height of the lowest point of a solid."""
-    shape, T = placed.solid.shape, placed.T_base_solid
-    if isinstance(shape, SolidCylinder):
-        c = abs(float(T.rotation.as_matrix()[:, 2] @ up))
-        down = 0.5 * shape.length * c + shape.radius * max(1.0 - c * c, 0.0) ** 0.5
-        return float(T.translation @ up) - float(down)
-    middle, reach = holding_sphere(shape)
-    if isinstance(shape, Box):
-        reach = 0.5 * float(np.abs(T.rotation.as_matrix().T @ up) @ np.array(shape.size))
-    return float(T.apply(middle) @ up) - reach
+    return float((placed.T_base_solid.apply(triangles(placed.solid.shape).vertices) @ up).min())
 
 
 def _piece(
-    number: int,
     centre: Array,
     radius: float,
     camera: Camera,
@@ -470,17 +453,11 @@ def _piece(
         texture=float(rng.uniform(0.0, 0.2)),
         tint=_tint(rng),
     )
-    return _placed(
-        f"clutter{number + 1}", shape, RigidTransform.from_components(position, turn), material
-    )
+    return _placed(shape, RigidTransform.from_components(position, turn), material)
 
 
 def _cable(
-    number: int,
-    centre: Array,
-    radius: float,
-    T_base_camera: RigidTransform,
-    rng: np.random.Generator,
+    centre: Array, radius: float, T_base_camera: RigidTransform, rng: np.random.Generator
 ) -> PlacedSolid:
     """Return a thin dark cylinder that crosses the picture between camera and machine."""
     eye = T_base_camera.translation
@@ -494,14 +471,12 @@ def _cable(
     )
     position = eye + t * way + width * aside
     shape = SolidCylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
-    return _placed(
-        f"cable{number + 1}", shape, RigidTransform.from_components(position, turn), _CABLE
-    )
+    return _placed(shape, RigidTransform.from_components(position, turn), _CABLE)
 
 
-def _placed(name: str, shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
+def _placed(shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
     """Return a placed solid outside the machine."""
-    return PlacedSolid(Solid(name, None, shape, T, material), T)
+    return PlacedSolid(Solid(None, shape, T, material), T)
 
 
 def _tint(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -565,7 +540,7 @@ class Painter:
                 x, y = self.rays.x.take(inside), self.rays.y.take(inside)
                 ink = printed_inside(solid, self.rays, inside, face[inside], self.samples)
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light, ink)
-                parts.append(VisibleSolid(i, inside, shaded))
+                parts.append(VisibleSolid(i, inside, None, *shaded))
         lamp_shares = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares in zip(parts, lamp_shares, strict=True):
             canvas.terms[:, :, part.pixels] = part.radiance(shares, len(canvas.terms))
@@ -632,8 +607,11 @@ class Painter:
 
     def _is_thin(self, solid: SolidInView) -> bool:
         """Return whether rays through the centres of pixels may miss a solid."""
+        if isinstance(solid.shape, Mesh):
+            return False
         farthest = float(solid.centre[2]) + solid.reach
-        return _thickness(solid) * float(self.rays.camera.K[0, 0]) < _THIN * farthest
+        thickness = float(triangles(solid.shape).extents.min())
+        return thickness * float(self.rays.camera.K[0, 0]) < _THIN * farthest
 
     def _paint_edge(
         self,
@@ -678,7 +656,7 @@ class Painter:
                 x, y, face = X.take(hit_rays), Y.take(hit_rays), faces.take(hit_rays)
                 ink = printed(solids[i], x, y, face)
                 shaded = shade(solids[i], x, y, Z.take(hit_rays), face, self.light, ink)
-                parts.append(VisibleSolid(i, hit_rays[first] // S, shaded, first))
+                parts.append(VisibleSolid(i, hit_rays[first] // S, first, *shaded))
                 weights.append(weight)
         lamp_shares = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares, weight in zip(parts, lamp_shares, weights, strict=True):
@@ -699,18 +677,6 @@ def _some_of_each(
     kept = (np.arange(len(rays)) - np.repeat(first, count)) % _SHADED == 0
     n_kept = -(-count // _SHADED)
     return rays[kept], np.cumsum(n_kept) - n_kept, (count / n_kept).astype(np.float32)
-
-
-def _thickness(solid: SolidInView) -> float:
-    """Return the least size of a solid [m]."""
-    shape = solid.shape
-    if isinstance(shape, Box):
-        return min(shape.size)
-    if isinstance(shape, SolidCylinder):
-        return min(2.0 * shape.radius, shape.length)
-    if isinstance(shape, Sphere):
-        return 2.0 * shape.radius
-    return np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -771,9 +737,9 @@ def prepare_view(
     centre, radius = _around(placed)
     floor = _table(placed, centre, radius, T_base_camera.translation) if appearance.table else ()
     clutter = [
-        _piece(i, centre, radius, camera, T_base_camera, rng) for i in range(appearance.clutter)
+        _piece(centre, radius, camera, T_base_camera, rng) for _ in range(appearance.clutter)
     ]
-    cables = [_cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)]
+    cables = [_cable(centre, radius, T_base_camera, rng) for _ in range(appearance.cables)]
     light = _lighting(centre, radius, T_camera_base, appearance)
     painter = Painter(rays, light, samples)
     canvas = _empty(rays, light, rng)
