@@ -191,7 +191,7 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     left_out = left_out_blocks(linearize(problem, state), block)
     squares = np.array([one.squares for one in left_out])
     dof = np.array([one.dof for one in left_out], dtype=np.intp)
-    held = problem.changed(held_directions=np.eye(problem.n_kinematic))
+    held = replace(problem, held_directions=np.eye(problem.n_kinematic))
     begin = replace(state, legs=problem.parameters.at_fixed(problem.legs.nominal))
     gain, gain_sigma = None, 0.0
     try:
