@@ -571,7 +571,9 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
         ]
         svg = scatter(f"Residuals: {title}", groups, label, _OFFSET, words=words)
         charts.append(Drawing(svg.markup(), title=title))
-    quantiles = Points(_normal(residuals.whitened)[keep].ravel(), whitened.ravel(), number)
+    ranks = np.argsort(np.argsort(residuals.whitened, axis=None, kind="stable"))
+    normal = ndtri((ranks + 0.5) / len(ranks)).reshape(-1, 2)  # quantiles of a normal distribution
+    quantiles = Points(normal[keep].ravel(), whitened.ravel(), number)
     svg = scatter("Residuals: QQ plot", [quantiles], "normal quantile", "residual / sigma",
                   diagonal=True)  # fmt: skip
     charts.append(Drawing(svg.markup(), title="QQ plot"))
@@ -584,11 +586,3 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
         )
     }  # fmt: skip
     return Charts(charts, labels, {i: links[i] for i in labels if i in links})
-
-
-def _normal(whitened: Array) -> Array:
-    """Return the quantiles of a normal distribution at the ranks of residuals."""
-    flat = whitened.ravel()
-    rank = np.empty(len(flat))
-    rank[np.argsort(flat, kind="stable")] = np.arange(len(flat))
-    return np.asarray(ndtri((rank + 0.5) / len(flat)).reshape(whitened.shape))
