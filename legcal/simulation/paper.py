@@ -30,7 +30,7 @@ from legcal.files.schema import Document, Number
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import BoolArray
 from legcal.machine.closing import solve_poses
-from legcal.machine.kinematics import platforms_in_base
+from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
@@ -187,10 +187,9 @@ class PaperStudy:
         for name in self.estimators:
             try:
                 legs = run_steps(machine, axes, session.measurements, criteria=name).legs
+                errors_by_estimator[name] = _errors(truth, legs, checked)
             except LegcalError as failure:
                 errors_by_estimator[name] = {"failure": failure_of(failure)}
-            else:
-                errors_by_estimator[name] = _errors(truth, legs, checked)
         return errors_by_estimator
 
 
@@ -212,14 +211,11 @@ def checked_poses(
 
 
 def _errors(truth: Machine, legs: Sequence[Leg], checked: RigidTransform) -> Record:
-    """Return the errors of eq (20) and of every parameter, or the failure to compute them."""
+    """Return the errors of eq (20) and of every parameter."""
     estimated, true = (
         to_vector(some_legs, truth.frame_legs) for some_legs in (legs, geometries(truth))
     )
-    try:
-        errors = platform_errors(truth, legs, checked)
-    except LegcalError as error:
-        return {"failure": failure_of(error)}
+    errors = platform_errors(truth, legs, checked)
     return asdict(errors) | {"parameters": np.abs(estimated - true).tolist()}
 
 
@@ -243,12 +239,10 @@ def platform_errors(truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform
             f"The errors of the platform could not be computed: found {np.sum(~reached)} of "
             f"{len(reached)} poses whose readings the model does not reach, needed all."
         )
+    dX, angle = pose_differences(list(poses), list(T_Rb_Re))
     turn = T_Rb_Re.rotation.inv() * poses.rotation
-    displacement = np.linalg.norm(poses.translation - T_Rb_Re.translation, axis=-1)
-    euler = np.linalg.norm(turn.as_euler("xyz"), axis=-1)
-    return PlatformErrors(
-        float(displacement.mean()), float(euler.mean()), float(turn.magnitude().mean())
-    )
+    dE = np.linalg.norm(turn.as_euler("xyz"), axis=-1)
+    return PlatformErrors(*(float(errors.mean()) for errors in (dX, dE, angle)))
 
 
 def poses_by_readings(
