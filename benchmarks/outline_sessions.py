@@ -42,7 +42,6 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization, geometries, moved_legs, parametrize
 from legcal.machine.rods import (
     actuator_index,
-    ends_at_poses,
     reading_legs,
     readings_of_rods,
 )
@@ -190,7 +189,6 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     at = RigidTransform.concatenate([platform_in_base(machine, T) for T in drawn.poses])
     rotation: Rotation = at.rotation
     R, t = closed_poses(legs, machine.frame_legs, rotation.as_matrix(), at.translation)
-    _, B = ends_at_poses(legs, R, t)
     in_base = [np.array([getattr(m, side) for m in machines]) for side in "AB"]
     scene = Scene(in_base[0], in_base[1], views, images)
     outlines = outlines_of(scene, OutlineNoise(sigma_px, None))
@@ -205,14 +203,8 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
         seen.append(sorted(longest[:most].tolist()))
     shown = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
     told = np.flatnonzero([j in seen[images.view[r]] for r, j in shown])
-    q = np.zeros((len(t), len(legs)))
-    for j, leg in enumerate(legs):
-        if leg.kind is LegKind.PASSIVE:
-            q[:, j] = np.nan
-        elif leg.actuator is not None:
-            q[:, j] = readings_of_rods(legs, R, t)[:, actuator_index(legs)[j]]
-        elif leg.kind is LegKind.ACTUATED:
-            q[:, j] = machine.sign[j] * (np.linalg.norm(B[:, j] - leg.A, axis=-1) - leg.q0)
+    q = exact_readings(legs, R, t)
+    q[:, [leg.kind is LegKind.CONSTANT and leg.actuator is None for leg in legs]] = 0.0
     radii = {
         (j, part): radius
         for j, leg in enumerate(machine.legs)
@@ -241,6 +233,18 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
         pose=images.pose,
         outlines=outlines.choose(told),
     )
+
+
+def exact_readings(legs: Sequence[Leg], R: Array, t: Array) -> Array:
+    """Return readings at poses, (n_poses, n_legs) [m or rad]; NaN without an encoder."""
+    q, on = np.full((len(t), len(legs)), np.nan), actuator_index(legs)
+    of_actuators = readings_of_rods(legs, R, t)
+    for j, leg in enumerate(legs):
+        if leg.actuator is not None:
+            q[:, j] = of_actuators[:, on[j]]
+        elif leg.kind is LegKind.ACTUATED:
+            q[:, j] = leg.sign * (np.linalg.norm(R @ leg.B + t - leg.A, axis=1) - leg.q0)
+    return q
 
 
 def closed_poses(
@@ -381,8 +385,15 @@ def _parameter_errors(
 def _rough(T: RigidTransform, errors: StartErrors, rng: np.random.Generator) -> RigidTransform:
     """Return the pose of a camera as somebody noted it."""
     shift, turn = (1.0, 1.0) if errors.full else rng.random(2)
-    turned = Rotation.from_rotvec(errors.camera_turn * turn * _direction(rng, 3))
-    moved = errors.camera_shift * shift * _direction(rng, 3)
+    return shaken(T, shift * errors.camera_shift, turn * errors.camera_turn, rng)
+
+
+def shaken(
+    T: RigidTransform, distance: float, angle: float, rng: np.random.Generator
+) -> RigidTransform:
+    """Return a pose that is wrong by a distance [m] and an angle [rad], in any direction."""
+    turned = Rotation.from_rotvec(angle * _direction(rng, 3))
+    moved = distance * _direction(rng, 3)
     return RigidTransform.from_components(T.translation + moved, turned * T.rotation)
 
 

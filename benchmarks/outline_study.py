@@ -32,7 +32,7 @@ from rich.text import Text
 from legcal.cli.options import print_failure
 from legcal.errors import LegcalError, UsageError
 from legcal.report.render import Report, report, table
-from legcal.simulation.paper import Record, failure_of, run_study
+from legcal.simulation.paper import Record, Summary, failure_of, run_study
 from legcal.workers import processors
 
 Found = dict[str, Any]
@@ -100,11 +100,16 @@ class OutlineStudy(ABC):
                 record[machine] = {"failure": failure_of(error)}
         return record
 
-    def summary(self, records: Iterable[Record], heading: dict[str, Any]) -> OutlineSummary:
+    def summary(self, records: Sequence[Record], heading: dict[str, Any]) -> Summary:
         """Return what all runs showed."""
-        together = list(records)
-        found = [self.judged(m, [record[m] for record in together]) for m in self.machines]
-        return OutlineSummary(self, found, heading)
+        found = [self.judged(m, [record[m] for record in records]) for m in self.machines]
+        document = {
+            "machines": found,
+            "met": all(machine["met"] for machine in found),
+            "readings": list(self.readings),
+            **heading,
+        }
+        return document, self.files(found)
 
     @property
     def readings(self) -> tuple[str, ...]:
@@ -149,28 +154,6 @@ class OutlineStudy(ABC):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class OutlineSummary:
-    """What all runs of a study found together."""
-
-    study: OutlineStudy
-    machines: list[Found]
-    heading: dict[str, Any]
-
-    def document(self) -> dict[str, Any]:
-        """Return the document of ``--json``."""
-        return {
-            "machines": self.machines,
-            "met": all(found["met"] for found in self.machines),
-            "readings": list(self.study.readings),
-            **self.heading,
-        }
-
-    def files(self) -> dict[str, bytes]:
-        """Return the files that belong to it."""
-        return self.study.files(self.machines)
-
-
 def failures_of(records: Iterable[Record]) -> dict[str, int]:
     """Return how many records are failures, by kind of error."""
     kinds = [record["failure"]["kind"] for record in records if "failure" in record]
@@ -198,7 +181,7 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
     asked = parser.parse_args()
     try:
         study = kind(tuple(asked.machine))
-        result = run_study(
+        document = run_study(
             study,
             asked.runs,
             seed=asked.seed,
@@ -212,7 +195,7 @@ def run(kind: type[OutlineStudy], description: str | None) -> int:
         print_failure(type(error).__name__, str(error), as_json=asked.json)
         return error.exit_code
     if asked.json:
-        print(json.dumps(result.document(), allow_nan=False))
+        print(json.dumps(document, allow_nan=False))
     else:
-        Console(highlight=False).print(study.table(result.document()["machines"]))
+        Console(highlight=False).print(study.table(document["machines"]))
     return 0

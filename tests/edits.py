@@ -4,8 +4,9 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
 import cv2
 import numpy as np
@@ -13,54 +14,51 @@ import yaml
 from csv_rows import read_rows, write_rows
 
 Edit = Callable[[Path], object]
+Rows = list[dict[str, str]]
+P = ParamSpec("P")
 GONE = object()  # of a key: take it out
 
 
-def text(name: str, content: str | bytes) -> Edit:
+def edit(change: Callable[Concatenate[Path, P], object]) -> Callable[P, Edit]:
+    """Return what makes an edit of the arguments of a change but its folder."""
+
+    @wraps(change)
+    def made(*arguments: P.args, **named: P.kwargs) -> Edit:
+        return lambda folder: change(folder, *arguments, **named)
+
+    return made
+
+
+@edit
+def text(folder: Path, name: str, content: str | bytes) -> None:
     """Write a file."""
-    data = content if isinstance(content, bytes) else content.encode()
-
-    def edit(folder: Path) -> None:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-
-    return edit
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
-def swap(name: str, old: str, new: str, count: int = 1) -> Edit:
+@edit
+def swap(folder: Path, name: str, old: str, new: str, count: int = 1) -> None:
     """Replace text in a file."""
-
-    def edit(folder: Path) -> None:
-        content = (folder / name).read_text()
-        assert old in content, f"{name} has no {old!r}"
-        (folder / name).write_text(content.replace(old, new, count))
-
-    return edit
+    content = (folder / name).read_text()
+    assert old in content, f"{name} has no {old!r}"
+    (folder / name).write_text(content.replace(old, new, count))
 
 
-def remove(name: str) -> Edit:
+@edit
+def remove(folder: Path, name: str) -> None:
     """Delete a file or folder."""
-
-    def edit(folder: Path) -> None:
-        path = folder / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-    return edit
+    path = folder / name
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def document(name: str, change: Callable[[Any], object]) -> Edit:
+@edit
+def document(folder: Path, name: str, change: Callable[[Any], object]) -> None:
     """Change the content of a YAML or JSON file in place."""
-
-    def edit(folder: Path) -> None:
-        path = folder / name
-        is_json = path.suffix == ".json"
-        content = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
-        change(content)
-        path.write_text(
-            json.dumps(content) if is_json else yaml.safe_dump(content, sort_keys=False)
-        )
-
-    return edit
+    path = folder / name
+    is_json = path.suffix == ".json"
+    content = json.loads(path.read_text()) if is_json else yaml.safe_load(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content) if is_json else yaml.safe_dump(content, sort_keys=False))
 
 
 def keyed(name: str, /, **values: Any) -> Edit:
@@ -80,96 +78,70 @@ def keyed(name: str, /, **values: Any) -> Edit:
     return document(name, change)
 
 
-def cell(name: str, row: int | None, /, **cells: str) -> Edit:
-    """Change cells of a row of a table, counted from 1; of all rows without one."""
-
-    def edit(folder: Path) -> None:
-        header, rows = _table(folder / name)
-        for number, line in enumerate(rows, start=1):
-            if row in {None, number}:
-                for column, value in cells.items():
-                    line[header.index(column)] = value
-        _write_table(folder / name, [header, *rows])
-
-    return edit
-
-
-def header(name: str, old: str, new: str | None) -> Edit:
+@edit
+def header(folder: Path, name: str, old: str, new: str | None) -> None:
     """Rename a column of a table, or take it out."""
-
-    def edit(folder: Path) -> None:
-        names, rows = _table(folder / name)
-        k = names.index(old)
-        lines = [names, *rows]
-        if new is None:
-            lines = [[*line[:k], *line[k + 1 :]] for line in lines]
-        else:
-            names[k] = new
-        _write_table(folder / name, lines)
-
-    return edit
-
-
-def doubled(name: str) -> Edit:
-    """Write the first row of a table once more."""
-
-    def edit(folder: Path) -> None:
-        names, rows = _table(folder / name)
-        _write_table(folder / name, [names, *rows, rows[0]])
-
-    return edit
-
-
-def kept(name: str, n: int) -> Edit:
-    """Keep the first rows of a table."""
-
-    def edit(folder: Path) -> None:
-        names, rows = _table(folder / name)
-        _write_table(folder / name, [names, *rows[:n]])
-
-    return edit
-
-
-def _table(path: Path) -> tuple[list[str], list[list[str]]]:
-    with path.open(newline="") as file:
+    with (folder / name).open(newline="") as file:
         names, *rows = csv.reader(file)
-    return names, rows
+    place = names.index(old)
+    for line in (names, *rows):
+        if new is None:
+            del line[place]
+    if new is not None:
+        names[place] = new
+    with (folder / name).open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([names, *rows])
 
 
-def _write_table(path: Path, lines: list[list[str]]) -> None:
-    with path.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(lines)
-
-
-def picture(name: str, width: int, height: int) -> Edit:
-    """Write a grey picture."""
-
-    def edit(folder: Path) -> None:
-        cv2.imwrite(str(folder / name), np.full((height, width), 90, dtype=np.uint8))
-
-    return edit
-
-
-def cut(name: str, by: int) -> Edit:
-    """Cut off the end of a file."""
-
-    def edit(folder: Path) -> None:
-        path = folder / name
-        path.write_bytes(path.read_bytes()[:-by])
-
-    return edit
+@edit
+def table(folder: Path, name: str, change: Callable[[Rows], Rows]) -> None:
+    """Change the rows of a table."""
+    write_rows(folder / name, change(read_rows(folder / name)))
 
 
 def each_row(name: str, change: Callable[[dict[str, str]], object]) -> Edit:
     """Change every row of a table in place."""
 
-    def edit(folder: Path) -> None:
-        rows = read_rows(folder / name)
+    def changed(rows: Rows) -> Rows:
         for row in rows:
             change(row)
-        write_rows(folder / name, rows)
+        return rows
 
-    return edit
+    return table(name, changed)
+
+
+def cell(name: str, row: int | None, /, **cells: str) -> Edit:
+    """Change cells of a row of a table, counted from 1; of all rows without one."""
+    return table(
+        name,
+        lambda rows: [
+            line | cells if row in {None, number} else line
+            for number, line in enumerate(rows, start=1)
+        ],
+    )
+
+
+def doubled(name: str) -> Edit:
+    """Write the first row of a table once more."""
+    return table(name, lambda rows: [*rows, rows[0]])
+
+
+def kept(name: str, n: int) -> Edit:
+    """Keep the first rows of a table."""
+    return table(name, lambda rows: rows[:n])
+
+
+@edit
+def picture(folder: Path, name: str, width: int, height: int) -> None:
+    """Write a grey picture."""
+    cv2.imwrite(str(folder / name), np.full((height, width), 90, dtype=np.uint8))
+
+
+@edit
+def cut(folder: Path, name: str, by: int) -> None:
+    """Cut off the end of a file."""
+    path = folder / name
+    path.write_bytes(path.read_bytes()[:-by])
 
 
 def added(name: str, column: str, amount: float) -> Edit:

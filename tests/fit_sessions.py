@@ -12,7 +12,14 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from outline_sessions import NONCOPLANAR, closed_poses, moved_poses, true_machine
+from outline_sessions import (
+    NONCOPLANAR,
+    closed_poses,
+    exact_readings,
+    moved_poses,
+    shaken,
+    true_machine,
+)
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.factors import BoardCorners
@@ -33,14 +40,12 @@ from legcal.data.reading_units import sigmas_of_legs
 from legcal.geometry.motions import components, look_at, motions_of
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
-from legcal.machine.leg import Leg, LegKind
+from legcal.machine.leg import Leg
 from legcal.machine.parameters import geometries, moved_legs
 from legcal.machine.rods import (
-    actuator_index,
     arms_at,
     ends_at_poses,
     measured_readings,
-    readings_of_rods,
 )
 from legcal.paper.unknowns import NominalMachine
 from legcal.simulation import observe
@@ -192,7 +197,7 @@ def machine_session(
     R, t = closed_poses(legs, machine.frame_legs, *moved_poses(R, t, step))
     first = np.arange(len(t)) // repeats * repeats
     R, t = R[first], t[first]
-    q, view = _readings(fitted, R, t), np.repeat(np.arange(n_views), n_poses)
+    q, view = exact_readings(legs, R, t), np.repeat(np.arange(n_views), n_poses)
     T_camera_Rb = _cameras(home, legs, n_views, distance)
     measurements = Measurements(
         tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
@@ -204,7 +209,7 @@ def machine_session(
     )
     truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
     away = _wrong(fitted, legs, 0.003, float(np.deg2rad(1.0)), rng)
-    rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
+    rough = tuple(shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
     wrong, at_home = replace(fitted, nominal=away), (home,) * len(t)
     return MachineSession(
         wrong,
@@ -213,19 +218,6 @@ def machine_session(
         truth,
         start_from(away, measurements, wrong, rough, at_home, "nominal"),
     )
-
-
-def _readings(fitted: FittedLegs, R: Array, t: Array) -> Array:
-    legs = fitted.nominal
-    q, on = np.full((len(t), len(legs)), np.nan), actuator_index(legs)
-    of_actuators = readings_of_rods(legs, R, t)
-    for j, leg in enumerate(legs):
-        if leg.actuator is not None:
-            q[:, j] = of_actuators[:, on[j]]
-        elif leg.kind is LegKind.ACTUATED:
-            length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
-            q[:, j] = fitted.sign[j] * (length - leg.q0)
-    return q
 
 
 def _cameras(
@@ -313,8 +305,8 @@ def disturbed_start(
     rng, truth = np.random.default_rng(seed), session.truth
     return Start(
         _wrong(session.legs, truth.legs, joints, angle, rng),
-        tuple(_shaken(T, camera, angle, rng) for T in truth.T_camera_Rb),
-        tuple(_shaken(T, camera, angle, rng) for T in truth.T_Rb_Re),
+        tuple(shaken(T, camera, angle, rng) for T in truth.T_camera_Rb),
+        tuple(shaken(T, camera, angle, rng) for T in truth.T_Rb_Re),
         "nominal",
     )
 
@@ -344,17 +336,6 @@ def irregular_hexapod(
     shown = o.choose(is_tube & is_near[session.measurements.view[o.row], o.leg])
     white = np.tile(sigma_px**2 * np.eye(2), (len(shown), 1, 1))
     return replace(session, outlines=replace(shown, covariance=white))
-
-
-def _shaken(
-    T: RigidTransform, distance: float, angle: float, rng: np.random.Generator
-) -> RigidTransform:
-    """Return a camera that is wrong by a distance and an angle in any direction."""
-    turn, shift = rng.standard_normal((2, 3))
-    rotation = Rotation.from_rotvec(angle * turn / np.linalg.norm(turn))
-    return RigidTransform.from_components(
-        T.translation + distance * shift / np.linalg.norm(shift), rotation * T.rotation
-    )
 
 
 # A calibration board on the base of a machine

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from simulated import settings, small_camera, standing
 
 from legcal import calibrate, detect, load_dataset, simulate
-from legcal.calibration.mistake_search import NONE_EXPLAINS
+from legcal.calibration.diagnosis import NONE_EXPLAINS
 from legcal.data.measurements import Measurements, View
 from legcal.data.photograph_notes import notes_on_moves
 from legcal.errors import NotVisible

@@ -57,12 +57,12 @@ def test_every_back_end_keeps_the_contract(several: Workers) -> None:
 def test_an_executor_that_is_handed_in_gives_the_same_bits(tmp_path: Path) -> None:
     study, rows = Draws(seconds=0.002), range(6)
     with OtherProcess(2) as executor:
-        found = run_study(study, 40, seed=3, workers=executor).document()
+        found = run_study(study, 40, seed=3, workers=executor)
         with worker_pool(executor) as run:
             work = partial(row_zero_after_row_five, tmp_path / "done")
             (tmp_path / "done").touch()
             assert list(run(work, rows)) == list(rows)
-    assert found == run_study(study, 40, seed=3).document()
+    assert found == run_study(study, 40, seed=3)
 
 
 def test_what_is_no_executor_is_refused() -> None:
@@ -158,7 +158,7 @@ def test_a_study_outlives_a_worker_and_says_that_the_scheduler_stopped(tmp_path:
 
         reports = ended_at(40, local.workers[0])
         found = run_study(study, 100, workers=local.address, progress=reports)
-        assert found.document() == run_study(Draws(), 100).document()
+        assert found == run_study(Draws(), 100)
         reports, out = ended_at(20, local.scheduler), tmp_path / "out"
         with pytest.raises(OutOfResources, match="does not answer any more") as told:
             run_study(study, 400, workers=local.address, output=out, progress=reports)

@@ -102,14 +102,14 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
 
     monkeypatch.setattr("legcal.simulation.paper.run_steps", steps)
     found = run_study(PaperStudy(n_poses=4), 2)
-    rows = {(row["estimator"], row["coplanar"]): row for row in found.document()["rows"]}
+    rows = {(row["estimator"], row["coplanar"]): row for row in found["rows"]}
     assert rows["literal", True]["failures"] == {"DidNotConverge": 2}
     assert rows["literal", False]["failures"] == {}
     assert rows["default", True]["dX_mm"] is None
     assert rows["default", True]["parameters_mm"] == []
-    assert found.document()["failures"] == {}
+    assert found["failures"] == {}
     printed = io.StringIO()
-    Console(file=printed, width=80).print(study_table(found.document()))
+    Console(file=printed, width=80).print(study_table(found))
     said = "steps as printed, coplanar joints: 2 of 2 runs failed (DidNotConverge)"
     assert said in printed.getvalue()
 
@@ -119,15 +119,13 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
 
 def test_runs_do_not_depend_on_their_number_and_are_counted(tmp_path: Path) -> None:
     progress = list[tuple[str, int, int]]()
-    few = run_study(
-        Draws(), 10, output=tmp_path, progress=lambda *now: progress.append(now)
-    ).document()
+    few = run_study(Draws(), 10, output=tmp_path, progress=lambda *now: progress.append(now))
     assert progress == [("Study draws", done, 10) for done in range(11)]
     assert json.loads((tmp_path / DOCUMENT_NAME).read_bytes()) == few
     assert (tmp_path / "total.txt").read_text() == str(few["total"])
-    more = run_study(Draws(), 25, output=tmp_path).document()
+    more = run_study(Draws(), 25, output=tmp_path)
     assert json.loads((tmp_path / DOCUMENT_NAME).read_bytes()) == more
-    some = run_study(Draws(fails_above=0.0), 25).document()
+    some = run_study(Draws(fails_above=0.0), 25)
     assert some["n"] + some["failures"]["DidNotConverge"] == 25 == some["runs"]
     assert some["total"] < 0.0
     assert some["settings"] == {"scale": 1.0, "fails": {"above": 0.0}}
@@ -149,7 +147,7 @@ def test_processes_give_the_same_and_one_that_is_ended_from_outside_is_told(
     tmp_path: Path,
 ) -> None:
     study = Draws(fails_above=1.0)
-    assert run_study(study, 30, workers=2).document() == run_study(study, 30).document()
+    assert run_study(study, 30, workers=2) == run_study(study, 30)
     with pytest.raises(OutOfResources, match="one of the processes was ended from outside"):
         run_study(Deadly(), 20, workers=2, output=tmp_path)
     assert list(tmp_path.iterdir()) == []

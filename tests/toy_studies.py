@@ -3,29 +3,14 @@
 import os
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from legcal.errors import DidNotConverge
-from legcal.simulation.paper import Record
-
-
-@dataclass(frozen=True)
-class Total:
-    """The sum of what the runs drew."""
-
-    total: float
-    n: int
-    heading: dict[str, Any]
-
-    def document(self) -> dict[str, Any]:
-        return {"total": self.total, "n": self.n, **self.heading}
-
-    def files(self) -> dict[str, bytes]:
-        return {"total.txt": str(self.total).encode()}
+from legcal.simulation.paper import Record, Summary
 
 
 @dataclass(frozen=True)
@@ -50,11 +35,10 @@ class Draws:
             raise DidNotConverge(f"The draw is {x}.")
         return {"x": x}
 
-    def summary(self, records: Iterable[Record], heading: dict[str, Any]) -> Total:
-        total, n = 0.0, 0
-        for record in records:
-            total, n = total + record["x"], n + 1
-        return Total(total, n, heading)
+    def summary(self, records: Sequence[Record], heading: dict[str, Any]) -> Summary:
+        total = sum(record["x"] for record in records)
+        document = {"total": total, "n": len(records), **heading}
+        return document, {"total.txt": str(total).encode()}
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
@@ -221,15 +221,20 @@ class ParameterTable:
         return Table(columns, rows, title)
 
     def __repr__(self) -> str:
-        cells = [self.columns, *self.cells()]
-        width = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
-        return "\n".join(
-            "  ".join(
-                text.rjust(w) if name in NUMBERS else text.ljust(w)
-                for name, text, w in zip(self.columns, row, width, strict=True)
-            ).rstrip()
-            for row in cells
-        )
+        return aligned(self.columns, self.cells(), NUMBERS)
+
+
+def aligned(columns: Sequence[str], rows: Sequence[Sequence[str]], numbers: Container[str]) -> str:
+    """Return a table as text, columns of numbers flush right."""
+    cells = [columns, *rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "\n".join(
+        "  ".join(
+            text.rjust(width) if name in numbers else text.ljust(width)
+            for name, text, width in zip(columns, row, widths, strict=True)
+        ).rstrip()
+        for row in cells
+    )
 
 
 def _numbers(q: Quantity) -> tuple[Any, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -153,16 +153,16 @@ def paper(
     from legcal.pages.document import Drawing
     from legcal.report.session import study_table
     from legcal.simulation.observe import TableNoise
-    from legcal.simulation.paper import PaperStudy, Summary, run_study
+    from legcal.simulation.paper import PaperStudy, run_study
     from legcal.workers import processors
 
-    def make_page(study_result: Summary, folder: Path) -> None:
+    def make_page(document: dict[str, Any], folder: Path) -> None:
         figure = Markup((folder / "fig4.svg").read_text(encoding="utf-8"))
-        title, text = "The paper's simulation", study_table(study_result.document())
+        title, text = "The paper's simulation", study_table(document)
         write_page(folder / REPORT, title, text, blocks=[Drawing(figure)])
 
     noise, page = TableNoise.in_radians() if radians else TableNoise(), PageOfResult(make_page)
-    result = run_study(
+    document = run_study(
         PaperStudy(noise),
         runs,
         seed=seed,
@@ -172,7 +172,6 @@ def paper(
         beside=page,
     )
     page.say()
-    document = result.document()
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nDocument and figures: {output}")

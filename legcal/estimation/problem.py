@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
@@ -229,16 +229,10 @@ class Factor(Generic[S]):
     element: IntArray | None = None  # (n,) eliminated element of each measurement, if any
     whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero: rejected
     robust: bool = False  # under the robust loss, or plain squares
-    _empty_rows: list[Residuals] = field(default_factory=list, repr=False)  # cached if n = 0
 
     def linearize(self, state: S) -> Residuals:
         """Return whitened residuals and derivatives at a state."""
-        if self._empty_rows:
-            return self._empty_rows[0]
-        rows = self.rows(state).whitened(np.asarray(self.whitening))
-        if self.n == 0:
-            self._empty_rows.append(rows)
-        return rows
+        return self.rows(state).whitened(np.asarray(self.whitening))
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,62 +352,6 @@ class Constraint(Protocol[S]):
 
 
 @dataclass(frozen=True, eq=False)
-class _Layout:
-    """Columns of the unknowns in x, for given variables and touches."""
-
-    variables: tuple[Variables, ...]
-    eliminated: Variables | None
-    touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...]
-    columns: Mapping[str, IntArray]  # (n, d) columns in x of each kept block; n_kept if fixed
-    n_kept: int
-    sparsity: tuple[Sparsity, ...]  # of each factor
-
-    def is_of(
-        self,
-        variables: tuple[Variables, ...],
-        eliminated: Variables | None,
-        touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...],
-    ) -> bool:
-        """Whether the layout was built from these objects."""
-        return (
-            self.eliminated is eliminated
-            and len(self.variables) == len(variables)
-            and len(self.touches) == len(touches)
-            and all(a is b for a, b in zip(self.variables, variables, strict=True))
-            and all(
-                a is b and element is other_element
-                for (a, element), (b, other_element) in zip(self.touches, touches, strict=True)
-            )
-        )
-
-
-def _same_unknowns(layout: _Layout, problem: EstimationProblem[Any]) -> bool:
-    """Whether a problem has the unknowns of a layout, in the same columns."""
-    return (
-        layout.eliminated is problem.eliminated
-        and len(layout.variables) == len(problem.variables)
-        and all(
-            a is b or (a.name == b.name and np.array_equal(a.unknown, b.unknown))
-            for a, b in zip(layout.variables, problem.variables, strict=True)
-        )
-    )
-
-
-def _same_touches(
-    factor: Factor[Any], touches: tuple[Touch, ...], element: IntArray | None
-) -> bool:
-    """Whether the measurements of a factor touch the same elements as before."""
-    return (
-        factor.element is element
-        and len(factor.touches) == len(touches)
-        and all(
-            a[0] == b[0] and a[1] is b[1] and a[2] == b[2]
-            for a, b in zip(factor.touches, touches, strict=True)
-        )
-    )
-
-
-@dataclass(frozen=True, eq=False)
 class EstimationProblem(Generic[S]):
     """Variables, factors and constraints; see :mod:`legcal.estimation`."""
 
@@ -426,64 +364,43 @@ class EstimationProblem(Generic[S]):
     )  # (w, m <= n_kept) fixed gauge
     name: str = "fit"  # for messages, with the remedy if it fails
     remedy: str = "check the starting values and the measurements"
-    # Layout of the original problem; its unchanged parts are reused.
-    earlier: _Layout | None = field(default=None, repr=False)
 
     @cached_property
-    def layout(self) -> _Layout:
-        """Columns of the unknowns, and columns of each factor."""
-        old = self.earlier
-        touches = tuple((factor.touches, factor.element) for factor in self.factors)
-        if old is not None and old.is_of(self.variables, self.eliminated, touches):
-            return old
-        keeps_unknowns = old is not None and _same_unknowns(old, self)
-        if old is not None and keeps_unknowns:
-            columns, n_kept = old.columns, old.n_kept
-        else:
-            counts = [block.n_unknowns for block in self.variables]
-            first = np.cumsum([0, *counts]).tolist()
-            n_kept = first[-1]
-            columns = {
-                block.name: np.where(block.unknown < 0, n_kept, start + block.unknown)
-                for block, start in zip(self.variables, first, strict=False)
-            }
-        earlier = [] if old is None else list(zip(old.touches, old.sparsity, strict=True))
-        sparsity = []
-        for factor in self.factors:
-            reusable = next((p for (t, e), p in earlier if _same_touches(factor, t, e)), None)
-            if reusable is not None and keeps_unknowns:
-                sparsity.append(reusable)
-                continue
-            touched_elements = [element for _, element, _ in factor.touches]
-            groups = None if reusable is None else reusable.groups
-            if groups is None:
-                groups = _Groups.of(touched_elements, factor.element, factor.n)
-            touched_columns = [
-                columns[name][e[groups.first]][..., d] for name, e, d in factor.touches
-            ]
-            flat = [
-                part.reshape(len(part), int(np.prod(part.shape[1:]))) for part in touched_columns
-            ]
-            none = np.zeros((len(groups.first), 0), dtype=np.intp)
-            unknowns = np.concatenate([none, *flat], axis=1)
-            sizes = self.n_elements, self.d_element
-            sparsity.append(_sparsity(groups, unknowns, factor.element, n_kept, sizes))
-        return _Layout(self.variables, self.eliminated, touches, columns, n_kept, tuple(sparsity))
+    def n_kept(self) -> int:
+        """Number of kept unknowns."""
+        return sum(block.n_unknowns for block in self.variables)
 
-    @property
+    @cached_property
+    def first(self) -> Mapping[str, int]:
+        """Column in x of the first unknown of each kept block."""
+        counts = (block.n_unknowns for block in self.variables)
+        names = (block.name for block in self.variables)
+        return dict(zip(names, accumulate(counts, initial=0), strict=False))
+
+    @cached_property
     def columns(self) -> Mapping[str, IntArray]:
         """Columns in x of each kept block, (n, d); ``n_kept`` for fixed coordinates."""
-        return self.layout.columns
+        return {
+            block.name: np.where(
+                block.unknown < 0, self.n_kept, self.first[block.name] + block.unknown
+            )
+            for block in self.variables
+        }
 
     @cached_property
     def sparsity(self) -> Mapping[str, Sparsity]:
         """Columns of the Jacobian of each factor, by its name."""
-        return dict(zip((f.name for f in self.factors), self.layout.sparsity, strict=True))
+        return {factor.name: self._sparsity_of(factor) for factor in self.factors}
 
-    @property
-    def n_kept(self) -> int:
-        """Number of kept unknowns."""
-        return self.layout.n_kept
+    def _sparsity_of(self, factor: Factor[S]) -> Sparsity:
+        groups = _Groups.of([e for _, e, _ in factor.touches], factor.element, factor.n)
+        unknowns = [np.zeros((len(groups.first), 0), dtype=np.intp)]
+        for name, element, numbers in factor.touches:
+            part = self.columns[name][element[groups.first]][..., numbers]
+            unknowns.append(part.reshape(len(part), int(np.prod(part.shape[1:]))))
+        sizes = self.n_elements, self.d_element
+        columns = np.concatenate(unknowns, axis=1)
+        return _sparsity(groups, columns, factor.element, self.n_kept, sizes)
 
     @property
     def n_elements(self) -> int:
@@ -518,21 +435,15 @@ class EstimationProblem(Generic[S]):
     @cached_property
     def priors(self) -> GaussianPrior:
         """All priors, by column in x."""
-        priors, first = NO_PRIOR, 0
+        priors = NO_PRIOR
         for block in self.variables:
             prior = block.prior
-            priors = priors + replace(prior, unknown=first + prior.unknown)
-            first += block.n_unknowns
+            priors += replace(prior, unknown=self.first[block.name] + prior.unknown)
         return priors
 
     def where(self, name: str) -> IntArray:
         """Return the columns in x of a block's unknowns."""
-        first = 0
-        for block in self.variables:
-            if block.name == name:
-                return np.arange(first, first + block.n_unknowns, dtype=np.intp)
-            first += block.n_unknowns
-        raise KeyError(name)
+        return self.first[name] + np.arange(self.block(name).n_unknowns, dtype=np.intp)
 
     def block(self, name: str) -> Variables:
         """Return a kept block by its name."""
@@ -542,14 +453,11 @@ class EstimationProblem(Generic[S]):
         """Return a factor by its name."""
         return next(factor for factor in self.factors if factor.name == name)
 
-    def changed(self, **parts: Any) -> Self:
-        """Return the problem with other fields, reusing unchanged parts of its layout."""
-        return replace(self, earlier=vars(self).get("layout", self.earlier), **parts)
-
     def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:
         """Replace blocks and factors by others of the same names."""
         b, f = {block.name: block for block in blocks}, {factor.name: factor for factor in factors}
-        return self.changed(
+        return replace(
+            self,
             variables=tuple(b.get(block.name, block) for block in self.variables),
             factors=tuple(f.get(factor.name, factor) for factor in self.factors),
         )
@@ -663,18 +571,17 @@ class Linearization(Generic[P, S]):
 
 def linearize(problem: P, state: S) -> Linearization[P, S]:
     """Linearise a problem at a state."""
-    priors, first = [], 0
+    priors = []
     for block in problem.variables:
-        prior, size = block.prior, block.n_unknowns
+        prior, value = block.prior, getattr(state, block.name)
         if len(prior.mean):
-            value = getattr(state, block.name)
             r = prior.whitened(block.read(value)[prior.unknown] - prior.mean)
             slope = 1.0 / prior.sigma
             if block.jacobian is not None:
                 slope = prior.whitened(block.jacobian(value)[prior.unknown])
             elif prior.whitening is not None:
-                slope = prior.whitened(np.eye(size)[prior.unknown])
+                slope = prior.whitened(np.eye(block.n_unknowns)[prior.unknown])
+            first = problem.first[block.name]
             priors.append(PriorRows(r, slope, first + prior.unknown, first))
-        first += size
     rows = {factor.name: factor.linearize(state) for factor in problem.factors}
     return Linearization(problem, state, rows, tuple(priors))

@@ -290,12 +290,7 @@ class NormalEquations(Generic[P, S]):
 
     @cached_property
     def _reduced(self) -> Array:
-        try:
-            root = np.asarray(np.linalg.cholesky(self.V_inverse), dtype=np.float64)
-            half = _times_blocks(self.W, root)
-            R = self.U - _sum_of_products(half, half)
-        except np.linalg.LinAlgError:  # some elements are not determined
-            R = self.U - _sum_of_products(_times_blocks(self.W, self.V_inverse), self.W)
+        R = _schur_complement(self.U, self.W, self.V_inverse)
         return np.asarray(0.5 * (R + R.T))
 
     def contributions(self) -> Array:
@@ -342,12 +337,7 @@ class NormalEquations(Generic[P, S]):
         V = _damped(self.V, damping)
         V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
         U = _damped(self.U, damping)
-        try:
-            root = np.asarray(np.linalg.cholesky(V_inverse), dtype=np.float64)
-            half = _times_blocks(self.W, root)
-            R = U - _sum_of_products(half, half)
-        except np.linalg.LinAlgError:  # by rounding
-            R = U - _sum_of_products(_times_blocks(self.W, V_inverse), self.W)
+        R = _schur_complement(U, self.W, V_inverse)
         element_part = (V_inverse @ self.g_elements[..., None]).ravel()
         right = -self.g_kept + _as_matrix(self.W) @ element_part
         free = self.free_steps
@@ -550,6 +540,15 @@ def _as_matrix(W: Array) -> Array:
 def _sum_of_products(left: Array, right: Array) -> Array:
     """Sum of left right^T over elements, both (n_kept, n_elements, f)."""
     return np.asarray(_as_matrix(left) @ _as_matrix(right).T)
+
+
+def _schur_complement(U: Array, W: Array, V_inverse: Array) -> Array:
+    """Return U - W V^-1 W^T; V^-1 is singular if elements are not determined, or by rounding."""
+    try:
+        half = _times_blocks(W, np.asarray(np.linalg.cholesky(V_inverse), dtype=np.float64))
+    except np.linalg.LinAlgError:
+        return U - _sum_of_products(_times_blocks(W, V_inverse), W)
+    return U - _sum_of_products(half, half)
 
 
 def _times_blocks(W: Array, blocks: Array) -> Array:

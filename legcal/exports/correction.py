@@ -63,7 +63,13 @@ def correction_files(subject: Subject, path: Path, nodes: int | None = None) -> 
         raise ValueError("a model without a result has no correction")
     columns = independent_coordinates(calibrated)
     m = len(columns)
-    n = _number_of_nodes(nodes, m)
+    n = DEFAULT_NODES[m] if nodes is None else nodes
+    if n < 2 or n**m > MAX_ROWS:
+        most = int(MAX_ROWS ** (1.0 / m) + 1e-9)
+        raise UsageError(
+            f"--nodes could not be used: found {n} along each of {m} coordinates, needed 2 to "
+            f"{most}; give another number."
+        )
     ticks, commands, corrected = _grid(calibrated, nominal, columns, n)
     left, raw = _residuals(calibrated, nominal, columns, ticks, corrected.reshape(*(n,) * m, m))
     figures: dict[str, Any] = {
@@ -102,17 +108,6 @@ def correction_files(subject: Subject, path: Path, nodes: int | None = None) -> 
     lines += [",".join(f"{x:.9f}" for x in row) for row in rows.tolist()]
     content = ("\n".join(lines) + "\n").encode()
     return Rendered({"": content}, tuple(sentences), figures)
-
-
-def _number_of_nodes(given: int | None, m: int) -> int:
-    n = DEFAULT_NODES[m] if given is None else given
-    if n < 2 or n**m > MAX_ROWS:
-        most = int(MAX_ROWS ** (1.0 / m) + 1e-9)
-        raise UsageError(
-            f"--nodes could not be used: found {n} along each of {m} coordinates, needed 2 to "
-            f"{most}; give another number."
-        )
-    return n
 
 
 def _grid(

@@ -6,8 +6,6 @@ R_e, defined by the joints of the ``base_frame`` legs.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration.documents import JointInLink
-from legcal.calibration.summary import FRAMES, Quantity, joints_of, parameters_of
+from legcal.calibration.summary import FRAMES, Quantity, aligned, joints_of, parameters_of
 from legcal.exports.subject import Rendered, Subject, one_file
 from legcal.files.quantity import SHOWN_IN
+from legcal.files.table import format_table
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
@@ -32,30 +31,16 @@ _DIGITS = 6  # decimals in the table
 
 def csv_files(subject: Subject, path: Path) -> Rendered:
     """Return a CSV with a row for each number, read back exactly."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in rows_of(subject):
-        writer.writerow(["" if getattr(row, c) is None else getattr(row, c) for c in COLUMNS])
-    return one_file(text.getvalue())
+    return one_file(
+        format_table(COLUMNS, ([getattr(q, c) for c in COLUMNS] for q in rows_of(subject)))
+    )
 
 
 def table_files(subject: Subject, path: Path) -> Rendered:
     """Return a text table with aligned columns."""
-    rows = [
-        ["" if getattr(row, c) is None else _shown(getattr(row, c)) for c in COLUMNS]
-        for row in rows_of(subject)
-    ]
-    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
-    lines = [
-        "  ".join(
-            cell.rjust(width) if 3 <= k <= 6 else cell.ljust(width)
-            for k, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        ).rstrip()
-        for cells in [list(COLUMNS), *rows]
-    ]
+    rows = [[_shown(getattr(row, c)) for c in COLUMNS] for row in rows_of(subject)]
     title = f"{subject.name}, written by legcal {__version__}"
-    return one_file("\n".join([title, "", *lines]) + "\n")
+    return one_file(f"{title}\n\n{aligned(COLUMNS, rows, COLUMNS[3:7])}\n")
 
 
 def json_files(subject: Subject, path: Path) -> Rendered:
@@ -249,5 +234,7 @@ def _millimetres(matrix: Array) -> list[list[float]]:
     return rows
 
 
-def _shown(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{round(value, _DIGITS) + 0.0:.{_DIGITS}f}"
+def _shown(value: str | float | None) -> str:
+    if isinstance(value, str | None):
+        return value or ""
+    return f"{round(value, _DIGITS) + 0.0:.{_DIGITS}f}"

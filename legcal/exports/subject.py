@@ -15,7 +15,7 @@ from legcal.machine.leg import LegColumns
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.model_writer import model_name
-from legcal.machine.parameters import geometries, legs_in_links, parametrization_of
+from legcal.machine.parameters import geometries, legs_in_links, parametrization_of, with_numbers
 
 if TYPE_CHECKING:
     from legcal.calibration.result_folder import EarlierResult
@@ -85,17 +85,13 @@ def _nominal(result: EarlierResult) -> Machine:
 
     machine = result.machine
     parametrization = parametrization_of(machine, twists=True)
-    nominal = {row.name: row.nominal for row in result.document.parameters}
-    legs = with_nominal_axes(machine.leg_names, geometries(machine), result.document, nominal)
-    moved = []
-    for leg, place in zip(legs, parametrization.place, strict=True):
-        numbers = np.concatenate([leg.A, leg.B, [leg.q0]])
-        for column, at in enumerate(place[: LegColumns.LENGTH + 1].tolist()):
-            if at >= 0:
-                numbers[column] = nominal.get(parametrization.names[at], numbers[column])
-        A, B = numbers[LegColumns.A], numbers[LegColumns.B]
-        moved.append(replace(leg, A=A, B=B, q0=float(numbers[LegColumns.LENGTH])))
-    return replace(machine, legs=legs_in_links(machine, moved))
+    values = {row.name: row.nominal for row in result.document.parameters}
+    legs = with_nominal_axes(machine.leg_names, geometries(machine), result.document, values)
+    nominal = [values.get(name, np.nan) for name in parametrization.names]
+    numbers = np.append(nominal, np.nan)[parametrization.place]
+    stated = np.isfinite(numbers)
+    stated[:, LegColumns.LENGTH + 1 :] = False  # axes, twists and actuators are nominal already
+    return replace(machine, legs=legs_in_links(machine, with_numbers(legs, legs, numbers, stated)))
 
 
 # Names of a machine as identifiers and literals of other languages

@@ -60,11 +60,6 @@ class JointsInBase:
     in_cameras: JointsInCamera  # the input of this step
     diagnostics: tuple[str, ...]  # omissions and nominal values, with their reasons
 
-    @property
-    def A_Rb(self) -> Array:
-        """Base joint centres, (n_legs, 3) [m]."""
-        return self.machine.A
-
 
 def locate_joints_in_base(
     machine: NominalMachine, joints: JointsInCamera, measurements: Measurements, *, weighted: bool

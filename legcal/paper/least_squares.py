@@ -132,12 +132,6 @@ class LeastSquares:
         place = np.concatenate(rows), np.concatenate(columns)
         return csc_array((np.concatenate(entries), place), shape=(first, len(self.start)))
 
-    def derivative_at_start(self, *, weighted: bool) -> csc_array[np.float64]:
-        """Return the derivative (m, n) of the residuals at the start; in sigmas with weights."""
-        x = self.start
-        weights = [term.weights(x, robust=False) for term in self.terms] if weighted else None
-        return self.jacobian(x, weights)
-
 
 @dataclass(frozen=True, eq=False)
 class IpoptSolution:

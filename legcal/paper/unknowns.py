@@ -260,7 +260,9 @@ def hold_at_nominal(
     wanted = np.arange(min(len(problem.start), len(unknowns))) if wanted is None else wanted
     n = len(wanted)
     nominal = problem.start[:n] if nominal is None else nominal
-    information = _without_poses(problem.derivative_at_start(weighted=weighted), n)
+    x = problem.start
+    weights = [term.weights(x, robust=False) for term in problem.terms] if weighted else None
+    information = _without_poses(problem.jacobian(x, weights), n)
     lengths = machine.offsets[np.isfinite(machine.offsets)]
     if not len(lengths):  # a machine that is moved by hand
         lengths = machine.lengths

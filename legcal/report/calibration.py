@@ -31,8 +31,8 @@ from legcal.calibration.summary import (
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import few
 from legcal.machine.leg import ParameterId
-from legcal.pages.document import Table, Verdict
-from legcal.report.render import Report, report, table
+from legcal.pages.document import Light, Table, Verdict
+from legcal.report.render import Report, report, table, verdict_line
 
 if TYPE_CHECKING:
     from legcal.calibration.evaluation import Evaluation
@@ -43,6 +43,11 @@ _SCREEN, _WIDTH = 24, 80  # lines and columns of a small terminal
 _LARGEST = 3  # largest changes of parameters shown
 _WORTH_A_BOARD = 0.9  # predicted error with exact intrinsics, relative to the present one
 _EXPLANATIONS = 3  # alternative explanations shown
+_WORDS: dict[Light, str] = {
+    "good": "Use it",
+    "doubtful": "Do not trust it yet",
+    "bad": "Do not load it into the controller",
+}
 
 
 def summary(
@@ -53,10 +58,7 @@ def summary(
     *verbose* adds all parameters in mm, degrees and pixels, and the quality of the fit.
     """
     result = calibration.result
-    colour = "green" if calibration.verdict.trustworthy else "yellow"
-    if calibration.verdict.is_to_be_refused:
-        colour = "red"
-    verdict = Text(calibration.verdict.sentence, style=f"bold {colour}")
+    verdict = verdict_line(verdict_of(calibration))
     written = f"Written to {output}."
     following = list[str]()  # of doubts it stands in the verdict and beside each of them
     if calibration.verdict.trustworthy:
@@ -94,6 +96,16 @@ def _first(lines: Sequence[str], room: int) -> list[str]:
 def _height(line: str) -> int:
     """Return the height of a text on a screen."""
     return max(1, len(textwrap.wrap(line, _WIDTH)))
+
+
+def verdict_of(calibration: Calibration) -> Verdict:
+    """Return the verdict: green, amber where something speaks against it, or red."""
+    verdict = calibration.verdict
+    light: Light = "good"
+    if not verdict.trustworthy:
+        light = "bad" if verdict.is_to_be_refused else "doubtful"
+    reasons = brief_sentences(calibration.result)
+    return Verdict(light, _WORDS[light], verdict.sentence, reasons)
 
 
 def document(calibration: Calibration, output: Path, command: str) -> dict[str, Any]:
@@ -241,8 +253,7 @@ def check_summary(check: Check) -> Report:
         f"statistic {movement.statistic:.1f}.",
         *(f"Note: {note}" for note in check.notes),
     ]
-    style = "bold red" if movement.moved else "bold green"
-    return report(Text(check.sentence, style=style), lines)
+    return report(verdict_line(check_verdict(check)), lines)
 
 
 def _amount(change: ExplanationBlock) -> str:

@@ -14,7 +14,6 @@ from legcal.calibration.joint_fit.platform import PlatformMap, platform_map
 from legcal.calibration.result import Calibration
 from legcal.calibration.result_folder import REPORT_NAME
 from legcal.calibration.summary import (
-    brief_sentences,
     fit_lines,
     joints_of,
     parameter_charts,
@@ -41,20 +40,18 @@ from legcal.pages.document import (
     Facts,
     Gallery,
     Items,
-    Light,
     Page,
     Row,
     Scene,
     Section,
     Text,
-    Verdict,
     data_url,
     page_html,
     time_of_page,
 )
 from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
 from legcal.perception.overlays import curve
-from legcal.report.calibration import next_steps, platform_table
+from legcal.report.calibration import next_steps, platform_table, verdict_of
 from legcal.report.render import record_section, table
 from legcal.report.scene import MachineScene
 from legcal.vision.cylinder import outlines_of_axis
@@ -62,11 +59,6 @@ from legcal.vision.image_file import small_jpeg
 
 MAX_POSES = 60  # largest number of poses of the slider
 MAX_CAMERAS = 60
-_WORDS: dict[Light, str] = {
-    "good": "Use it",
-    "doubtful": "Do not trust it yet",
-    "bad": "Do not load it into the controller",
-}
 
 
 def write_report(
@@ -153,19 +145,6 @@ def calibration_page(
             record_section(command, when, facts),
         ],
     )
-
-
-# Verdict and next steps
-
-
-def verdict_of(calibration: Calibration) -> Verdict:
-    """Return the verdict: green, amber where something speaks against it, or red."""
-    verdict = calibration.verdict
-    light: Light = "good"
-    if not verdict.trustworthy:
-        light = "bad" if verdict.is_to_be_refused else "doubtful"
-    reasons = brief_sentences(calibration.result)
-    return Verdict(light, _WORDS[light], verdict.sentence, reasons)
 
 
 # Platform error
@@ -572,7 +551,9 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
         ]
         svg = scatter(f"Residuals: {title}", groups, label, _OFFSET, words=words)
         charts.append(Drawing(svg.markup(), title=title))
-    quantiles = Points(_normal(residuals.whitened)[keep].ravel(), whitened.ravel(), number)
+    ranks = np.argsort(np.argsort(residuals.whitened, axis=None, kind="stable"))
+    normal = ndtri((ranks + 0.5) / len(ranks)).reshape(-1, 2)  # quantiles of a normal distribution
+    quantiles = Points(normal[keep].ravel(), whitened.ravel(), number)
     svg = scatter("Residuals: QQ plot", [quantiles], "normal quantile", "residual / sigma",
                   diagonal=True)  # fmt: skip
     charts.append(Drawing(svg.markup(), title="QQ plot"))
@@ -585,11 +566,3 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
         )
     }  # fmt: skip
     return Charts(charts, labels, {i: links[i] for i in labels if i in links})
-
-
-def _normal(whitened: Array) -> Array:
-    """Return the quantiles of a normal distribution at the ranks of residuals."""
-    flat = whitened.ravel()
-    rank = np.empty(len(flat))
-    rank[np.argsort(flat, kind="stable")] = np.arange(len(flat))
-    return np.asarray(ndtri((rank + 0.5) / len(flat)).reshape(whitened.shape))

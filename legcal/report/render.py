@@ -16,6 +16,7 @@ from legcal.pages.document import (
     Block,
     Cell,
     Facts,
+    Light,
     Number,
     Page,
     Section,
@@ -27,6 +28,7 @@ from legcal.pages.document import Text as Paragraphs
 from legcal.version import __version__
 
 Part = str | Text | Table
+_COLOURS: dict[Light, str] = {"good": "green", "doubtful": "yellow", "bad": "red"}
 _COMMAND = "  legcal "
 _NAME = 8  # characters of names in a first column that do not break
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")  # start of a cell that sorts by its value
@@ -86,6 +88,11 @@ def table(
 def heading(name: str, rest: str) -> Text:
     """Return the heading of a report, the name in bold."""
     return Text.assemble((printable(name), "bold"), printable(rest))
+
+
+def verdict_line(verdict: Verdict) -> Text:
+    """Return the sentence of a verdict in its colour."""
+    return Text(verdict.sentence, style=f"bold {_COLOURS[verdict.light]}")
 
 
 def safe_text(text: str | Text) -> Text:

@@ -13,7 +13,7 @@ import json
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from itertools import product
@@ -30,13 +30,13 @@ from legcal.files.schema import Document, Number
 from legcal.geometry.motions import look_at
 from legcal.geometry.types import BoolArray
 from legcal.machine.closing import solve_poses
-from legcal.machine.kinematics import platforms_in_base
+from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrize, to_vector
 from legcal.machine.rods import ends_at_poses
-from legcal.pages.svg import Bars, log_bars, stacked
+from legcal.pages.svg import Bars, Canvas, log_bars, stacked
 from legcal.paper.criteria import Criteria
 from legcal.paper.four_steps import run_steps
 from legcal.paper.unknowns import NominalMachine
@@ -152,10 +152,11 @@ class PaperStudy:
             for name, child in zip(MACHINES, seeds, strict=True)
         }
 
-    def summary(self, records: Iterable[Record], heading: Heading) -> PaperDocument:
-        """Return the means over all runs."""
+    def summary(self, records: Sequence[Record], heading: Heading) -> Summary:
+        """Return the means over all runs, and figure 4."""
         in_radians = self.noise == TableNoise.in_radians()
-        return PaperDocument.of(records, heading, in_radians=in_radians)
+        means = PaperDocument.of(records, heading, in_radians=in_radians)
+        return means.document(), {"fig4.svg": means.figure().markup().encode()}
 
     def session(
         self, truth: Machine, views: Sequence[Viewpoint], rngs: Streams
@@ -186,10 +187,9 @@ class PaperStudy:
         for name in self.estimators:
             try:
                 legs = run_steps(machine, axes, session.measurements, criteria=name).legs
+                errors_by_estimator[name] = _errors(truth, legs, checked)
             except LegcalError as failure:
                 errors_by_estimator[name] = {"failure": failure_of(failure)}
-            else:
-                errors_by_estimator[name] = _errors(truth, legs, checked)
         return errors_by_estimator
 
 
@@ -211,14 +211,11 @@ def checked_poses(
 
 
 def _errors(truth: Machine, legs: Sequence[Leg], checked: RigidTransform) -> Record:
-    """Return the errors of eq (20) and of every parameter, or the failure to compute them."""
+    """Return the errors of eq (20) and of every parameter."""
     estimated, true = (
         to_vector(some_legs, truth.frame_legs) for some_legs in (legs, geometries(truth))
     )
-    try:
-        errors = platform_errors(truth, legs, checked)
-    except LegcalError as error:
-        return {"failure": failure_of(error)}
+    errors = platform_errors(truth, legs, checked)
     return asdict(errors) | {"parameters": np.abs(estimated - true).tolist()}
 
 
@@ -242,12 +239,10 @@ def platform_errors(truth: Machine, legs: Sequence[Leg], T_Rb_Re: RigidTransform
             f"The errors of the platform could not be computed: found {np.sum(~reached)} of "
             f"{len(reached)} poses whose readings the model does not reach, needed all."
         )
+    dX, angle = pose_differences(list(poses), list(T_Rb_Re))
     turn = T_Rb_Re.rotation.inv() * poses.rotation
-    displacement = np.linalg.norm(poses.translation - T_Rb_Re.translation, axis=-1)
-    euler = np.linalg.norm(turn.as_euler("xyz"), axis=-1)
-    return PlatformErrors(
-        float(displacement.mean()), float(euler.mean()), float(turn.magnitude().mean())
-    )
+    dE = np.linalg.norm(turn.as_euler("xyz"), axis=-1)
+    return PlatformErrors(*(float(errors.mean()) for errors in (dX, dE, angle)))
 
 
 def poses_by_readings(
@@ -368,7 +363,7 @@ class PaperDocument(Document):
     failures: dict[str, int]  # runs that failed as a whole, by kind of error
 
     @classmethod
-    def of(cls, records: Iterable[Record], heading: Heading, *, in_radians: bool) -> PaperDocument:
+    def of(cls, records: Sequence[Record], heading: Heading, *, in_radians: bool) -> PaperDocument:
         """Return the means over the records of runs."""
         by_key: dict[tuple[str, str], list[Record]] = {}
         for record in records:
@@ -391,7 +386,7 @@ class PaperDocument(Document):
             **heading,
         )
 
-    def files(self) -> dict[str, bytes]:
+    def figure(self) -> Canvas:
         """Return figure 4: a row for each estimator, a column for each machine."""
         by_key = {(row.coplanar, row.estimator): row for row in (*self.initial, *self.rows)}
         labels = []
@@ -414,7 +409,7 @@ class PaperDocument(Document):
             charts.append(log_bars(title, "mm", labels, *errors))
         n_runs = self.rows[0].runs + self.rows[0].failed
         title = f"Fig. 4 of the paper: mean errors of parameters over {n_runs} calibrations"
-        return {"fig4.svg": stacked(title, charts, len(MACHINES)).markup().encode()}
+        return stacked(title, charts, len(MACHINES))
 
 
 # The Monte Carlo runner
@@ -429,16 +424,8 @@ Record = dict[str, Any]
 """The result of one run as a JSON document: numbers, texts, lists, null; never NaN."""
 Heading = dict[str, Any]
 """What the documents of all studies begin with: study, settings, seed, runs, failures."""
-
-
-class Summary(Protocol):
-    """The combined result of the runs of a study that did not fail, with its heading."""
-
-    def document(self) -> dict[str, Any]:
-        """Return it as a JSON document."""
-
-    def files(self) -> dict[str, bytes]:
-        """Return the files that belong to it, such as figures, by name."""
+Summary = tuple[dict[str, Any], dict[str, bytes]]
+"""The document of a study, and the files that belong to it, such as figures, by name."""
 
 
 class Study(Protocol):
@@ -459,8 +446,8 @@ class Study(Protocol):
     def one_run(self, seed: np.random.SeedSequence) -> Record:
         """Return the record of one run; a LegcalError is recorded as a failed run."""
 
-    def summary(self, records: Iterable[Record], heading: Heading) -> Summary:
-        """Summarise the records of all runs that did not fail, read once and in order."""
+    def summary(self, records: Sequence[Record], heading: Heading) -> Summary:
+        """Summarise the records of all runs that did not fail, with a heading."""
 
 
 def run_study(
@@ -471,8 +458,8 @@ def run_study(
     workers: Workers = 1,
     output: Path | None = None,
     progress: Progress = False,
-    beside: Callable[[Any, Path], None] | None = None,
-) -> Summary:
+    beside: Callable[[dict[str, Any], Path], None] | None = None,
+) -> dict[str, Any]:
     """Run a study.
 
     Parameters
@@ -491,12 +478,13 @@ def run_study(
     progress : bool or callable
         True shows a bar on stderr; a function is called as ``progress(stage, done, total)``.
     beside : callable, optional
-        Called as ``beside(result, folder)`` with the figures in the folder; files that it writes
+        Called as ``beside(document, folder)`` with the figures in the folder; files that it writes
         there appear in the output with them.
 
     Returns
     -------
-    Summary
+    dict
+        The document.
 
     Raises
     ------
@@ -533,16 +521,16 @@ def run_study(
         "runs": n_runs,
         "failures": dict(Counter(type(failure).__name__ for failure in failures)),
     }
-    records = (outcome for outcome in in_order if not isinstance(outcome, LegcalError))
-    result = study.summary(records, heading)
+    records = [outcome for outcome in in_order if not isinstance(outcome, LegcalError)]
+    document, files = study.summary(records, heading)
     if output is not None:
-        document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
+        files[DOCUMENT_NAME] = json.dumps(document, indent=1, allow_nan=False).encode() + b"\n"
         with result_folder(output, _STUDY) as folder:
-            for name, content in {**result.files(), DOCUMENT_NAME: document}.items():
+            for name, content in files.items():
                 (folder / name).write_bytes(content)
             if beside is not None:
-                beside(result, folder)
-    return result
+                beside(document, folder)
+    return document
 
 
 def _outcome(study: Study, seed: int, number: int) -> tuple[int, Record | LegcalError]:

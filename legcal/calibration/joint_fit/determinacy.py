@@ -158,7 +158,7 @@ def held_at_nominal(
     target = values - held.unit[:n] * (component @ held.basis[:, :n])
     numbers = np.flatnonzero(free).tolist()
     moved = with_values(state.legs, legs, dict(zip(numbers, target.tolist(), strict=True)))
-    return problem.changed(held_directions=orthonormal), replace(
+    return replace(problem, held_directions=orthonormal), replace(
         state, legs=problem.parameters.tied(moved)
     )
 

@@ -189,7 +189,7 @@ def cross_validate(problem: FitProblem, state: State) -> CrossValidation | None:
     problem = with_weights(problem, state)
     block = _blocks(state)
     left_out = left_out_blocks(linearize(problem, state), block)
-    held = problem.changed(held_directions=np.eye(problem.n_kinematic))
+    held = replace(problem, held_directions=np.eye(problem.n_kinematic))
     begin = replace(state, legs=problem.parameters.at_fixed(problem.legs.nominal))
     gain, gain_sigma = None, 0.0
     try:

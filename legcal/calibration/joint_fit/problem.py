@@ -241,14 +241,15 @@ class FitProblem(EstimationProblem[State]):
         """Replace the common-mode edge biases."""
         outlines = replace(self.outlines, bias_index=biases.index, bias_shift=biases.shift)
         factor = replace(outlines.factor(self.keys), whitening=self.factor("outlines").whitening)
-        other = self.changed(observed=self.observed._replace(outlines=outlines))
+        other = replace(self, observed=self.observed._replace(outlines=outlines))
         return other.with_parts((_bias_block(biases),), (factor,))
 
     def with_corners(
         self, corners: ObservedCorners, rejected: Sequence[tuple[int, int, int]]
     ) -> FitProblem:
         """Replace the corners of a calibration board, and record rejected ones."""
-        other = self.changed(
+        other = replace(
+            self,
             observed=self.observed.with_corners(corners),
             rejected_corners=(*self.rejected_corners, *rejected),
         )
@@ -271,7 +272,8 @@ class FitProblem(EstimationProblem[State]):
         more = np.full((len(outlines.parts) - len(radii.unknown), 1), -1)
         radii = replace(radii, unknown=np.concatenate([radii.unknown, more]))
         blocks = {"radii": radii, "biases": _bias_block(biases)}
-        return self.changed(
+        return replace(
+            self,
             observed=observed,
             variables=tuple(blocks.get(block.name, block) for block in self.variables),
             eliminated=_poses(measurements.n_poses, self.legs.n_actuators),
