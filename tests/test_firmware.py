@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import run
 from edits import keyed
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -257,6 +258,8 @@ def test_poses_of_a_printer_stay_over_its_bed(tmp_path: Path) -> None:
     machine = machine_of(KLIPPER, tmp_path)
     copied = load_mechanism(write_model(machine, tmp_path / "copy")[0])
     assert (copied.reach, copied.floor) == (machine.reach, machine.floor) == (0.12, 0.0)
+    said = " ".join(run("inspect", copied.yaml_path).out.split())
+    assert "within 120.00 mm of the z axis of the base and at or above z = 0.00 mm" in said
     extreme = feasible_poses(copied, 12, np.random.default_rng(1), extreme=True)
     for poses in (extreme.poses, random_poses(copied, 50, 2)[1]):
         at = np.array([pose.translation for pose in poses])
