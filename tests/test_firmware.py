@@ -300,6 +300,22 @@ def test_a_calibrated_printer_prints_with_what_was_exported(tmp_path: Path) -> N
     assert abs(exported.figures["remaining_mm"]["rms"] - after) < 0.01
 
 
+def test_lines_of_a_calibration_in_doubt_say_its_verdict_first(tmp_path: Path) -> None:
+    """Outlines of one view tell little of a printer; sure results have no such line."""
+    folder = tmp_path / "session"
+    made = SimulationSettings(Level.OUTLINES, ParameterErrors(), poses=5, views=1, seed=4)
+    simulate(machine_of(KLIPPER, tmp_path), folder, made)
+    keyed("dataset.yaml", machine_kind="printed")(folder)
+    found = calibrate(folder, output=tmp_path / "out", only="all")
+    assert not found.verdict.trustworthy
+    exported = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg")
+    assert exported.notes[0] == found.verdict.sentence
+    assert exported.paths[0].read_text().splitlines()[1] == f"# {found.verdict.sentence}"
+    keyed("result.json", trustworthy=True, doubts=[])(tmp_path / "out")
+    again = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg", force=True)
+    assert again.notes == exported.notes[1:]
+
+
 # --- hexapods -----------------------------------------------------------------------------------
 
 INI = """
