@@ -64,6 +64,12 @@ def _late_from_fourth(d: Dataset) -> Dataset:
     return _late(d, 3)
 
 
+def _doubled_row(d: Dataset) -> Dataset:
+    """Return a session whose eighth row stands twice in the table, through both views."""
+    q = d.measurements.q
+    return _with_readings(d, np.vstack([q[:8], q[7:-1]]))
+
+
 def _in_order_of_text(d: Dataset) -> Dataset:
     """Return a session whose readings are those of images 1, 10, 2, ... in each view."""
     q = d.measurements.q.copy()
@@ -153,7 +159,10 @@ def _diagnosed(d: Dataset) -> Diagnosis:
 
 
 BESIDE = {"images mirrored", "images upside down", "readings shifted", "direction of encoders"}
-USUAL = (_exchanged, _thick, _in_order_of_text, _exchanged_from_eighth, _reversed_from_eighth)
+USUAL = (
+    *(_exchanged, _thick, _doubled_row, _in_order_of_text),
+    *(_exchanged_from_eighth, _reversed_from_eighth),
+)
 
 
 @pytest.mark.parametrize(
@@ -175,6 +184,8 @@ USUAL = (_exchanged, _thick, _in_order_of_text, _exchanged_from_eighth, _reverse
             ("delta", _in_radians, "unit", "the readings appear to be radians", ""),
             ("3-upu", _late_from_fourth, "readings shifted",
              "from p14 on, the readings of view c2 appear to be one row late", ""),
+            ("3-upu", _doubled_row, "readings shifted",
+             "from p09 on, the readings appear to be one row late", ""),
             ("3-upu", _in_order_of_text, "order of text",
              "the readings appear to be sorted in another order", ""),
             ("3-upu", _exchanged_from_eighth, "columns exchanged",

@@ -31,6 +31,7 @@ from legcal.calibration.diagnosis.mistakes import (
     limited_to,
     mistakes,
     moved_cameras,
+    shifted_from,
     turned_images,
 )
 from legcal.calibration.ordered_dataset import OrderedDataset
@@ -110,6 +111,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     tried = [
         *common,
         *judge.in_some_images(common),
+        *judge.in_the_rest(),
         *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
     ]
     finalists, gain = judge.finalists(tried)
@@ -249,6 +251,18 @@ class _Judge:
             if MIN_IMAGES <= len(rows) <= len(all_changed) - MIN_IMAGES:
                 found.append(limited_to(self.data, self.given, some[k], rows))
         return found
+
+    def in_the_rest(self) -> list[Mistake]:
+        """Return readings shifted from where images cease to agree: a row too many, or missing.
+
+        In several views, of which the last may agree nowhere.
+        """
+        in_file = np.argsort(self.data.order.rows, kind="stable")
+        agrees = np.isin(in_file, self.own.row[self.own.agrees])
+        first = 1 + int(np.argmax(np.cumsum(np.where(agrees, 1, -1))))
+        if len(self.groups) == 1 or len(in_file) - first < MIN_IMAGES or not agrees[:first].any():
+            return []
+        return shifted_from(self.data, self.given, first)
 
     def turned_images(self) -> list[Mistake]:
         """Return single images that agree with the camera of their view only if turned over."""
