@@ -65,7 +65,7 @@ def test_another_export_of_a_mesh_is_read_again(tmp_path: Path) -> None:
     _check(load_mechanism(path))
     file = tmp_path / "assets" / "rod.stl"
     thicker = trimesh.load_mesh(file)
-    thicker.apply_scale([1.0, 1.5, 1.5])
+    thicker.apply_transform(np.diag([1.0, 1.5, 1.5, 1.0]))
     thicker.export(file)
     _check(load_mechanism(path), radius=1.5 * RADIUS)
 

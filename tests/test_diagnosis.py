@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edits import cell
+import yaml
+from edits import cell, keyed
 from simulated import settings, simulated
 from thinned import thinned
 
@@ -238,6 +239,18 @@ def test_what_was_tried_in_vain_stands_beside_a_refusal(
     with pytest.raises((NotVisible, DidNotConverge)) as refused:
         calibrate(_with_readings(d, rng.permuted(d.measurements.q, axis=0)))
     assert diagnosis.NONE_EXPLAINS in refused.value.notes
+
+
+def test_a_board_of_another_size_is_named_without_further_guesses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _try_only(("diameter for radius",), monkeypatch)
+    folder = simulated(tmp_path / "set", "servo-hexapod", poses=5, board="chessboard").folder
+    square = yaml.safe_load((folder / "dataset.yaml").read_text())["board"]["square"]
+    keyed("dataset.yaml", board__square=1.04 * square)(folder)
+    with pytest.raises(DidNotConverge, match="dimensions of the calibration board") as refused:
+        calibrate(folder)
+    assert diagnosis.NONE_EXPLAINS not in refused.value.notes
 
 
 @pytest.mark.parametrize(

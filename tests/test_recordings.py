@@ -173,7 +173,7 @@ def test_poses_that_were_held_become_rows(
     if kind == "folder":
         again = import_recordings(
             source, MODEL, tmp_path / "again",
-            cameras=small_camera(tmp_path, *SIZE), readings=words[1],
+            cameras=small_camera(tmp_path, *SIZE), readings=str(words[1]),
         )  # fmt: skip
         np.testing.assert_array_equal(again.measurements.q, found)
 
