@@ -445,6 +445,7 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
     }
     assumed = [] if stated is not None else [f"joints {r:g} {unit} from its middle"]
     assumed += [f"the rods of a tower {2.0 * pair:g} {unit} apart"]
+    where = " (stepper of GET_POSITION)" if firmware.title == "Klipper" else ""
     return table, (
         *read.notes,
         f"{firmware.title} knows no effector: assumed are {' and '.join(assumed)} "
@@ -452,8 +453,7 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
         f"{thick:g} {unit} of the rods (--leg-radius). Where rods are looked for in photographs "
         "depends on these, the numbers of the firmware do not.",
         f"A reading is {'the angle of an arm' if ideal.turns else 'the height of a carriage'} as "
-        f"{firmware.title} counts it{' (stepper of GET_POSITION)' * (firmware.title == 'Klipper')}, "
-        "the endstop the upper end of the travel.",
+        f"{firmware.title} counts it{where}, the endstop the upper end of the travel.",
     )
 
 
