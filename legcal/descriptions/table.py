@@ -1154,8 +1154,8 @@ def _from_points(lines: Lines, path: Path) -> Lines:
         stated = describe(" ".join(words)) if "".join(words) else "no name"
         if joint is None:
             needed = (
-                "a row for each joint, with side and number in its name such as B1 and P1, or base1 "
-                "and platform1, as legcal new --template writes it"
+                "a row for each joint, with side and number in its name such as B1 and P1, or "
+                "base1 and platform1, as legcal new --template writes it"
             )
             refuse(row, line, stated, needed, *(header[i] for i in of_name[:2]))
             continue
