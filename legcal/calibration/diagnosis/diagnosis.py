@@ -121,7 +121,8 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
         likeliest = judge.of_two(tried, gain)
     data.progress(STAGE, 1, 1)
     if not likeliest:
-        return renamed
+        most_agree = judge.own.images >= _MOST * len(judge.own.row)
+        return renamed or (None if most_agree else ())
     suited = [judge.hints_suited(one) for _, one in likeliest]
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
     first = [what for what, _ in likeliest]
