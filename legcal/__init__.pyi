@@ -28,6 +28,7 @@ from .machine.loader import load_mechanism as load_mechanism
 from .machine.model import Machine as Machine
 from .machine.picture import plot_machine as plot_machine
 from .planning.request import plan as plan
+from .recordings.importing import import_recordings as import_recordings
 from .report.calibration_page import write_report as write_report
 from .simulation.dataset import simulate as simulate
 from .simulation.observe import TableNoise as TableNoise

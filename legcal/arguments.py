@@ -62,12 +62,19 @@ def with_arguments_in_words(function: Callable[..., Any], public: str) -> Callab
 
 def check_arguments(name: str, annotations: Mapping[str, Any], given: Mapping[str, object]) -> None:
     """Raise UsageError with all arguments that do not fit their annotations."""
-    wrong = [
-        f"{name} could not be run: found {value!r:.60} ({type(value).__name__}) as {argument}, "
-        f"needed {' or '.join(dict.fromkeys(_in_words(annotations[argument])))}; correct it."
-        for argument, value in given.items()
-        if argument in annotations and not _fits(value, annotations[argument])
-    ]
+    wrong = list[str]()
+    for argument, value in given.items():
+        if argument not in annotations or _fits(value, annotations[argument]):
+            continue
+        needed, remedy = dict.fromkeys(_in_words(annotations[argument])), "correct it"
+        if "Machine" in needed and hasattr(type(value), "machine"):  # a calibration
+            remedy = "give its .machine, or the folder of its output"
+        elif "Machine" in needed and isinstance(value, str | os.PathLike):
+            remedy = "load it with legcal.load_mechanism"
+        wrong.append(
+            f"{name} could not be run: found {value!r:.60} ({type(value).__name__}) as {argument}, "
+            f"needed {' or '.join(needed)}; {remedy}."
+        )
     if wrong:
         raise UsageError(wrong)
 

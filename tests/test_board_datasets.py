@@ -1,20 +1,27 @@
 """Datasets with a board: views of a camera in the hand, and the table ``corners.csv``."""
 
+import re
 import tempfile
+from collections.abc import Container
 from pathlib import Path
 
 import numpy as np
 import pytest
 from boards import CHARUCO, LENS
+from csv_rows import read_rows, write_rows
 from dataset_folder import Folder, folder
-from hypothesis import given, settings
+from hypothesis import given
+from hypothesis import settings as drawn
 from hypothesis import strategies as st
+from simulated import settings
 
+from legcal import Calibration, calibrate, simulate
 from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
 from legcal.data.dataset import load_dataset
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import USED, Reason, Rejection
+from legcal.errors import DatasetError
 from legcal.vision.board import FixedBoard
 
 __all__ = ["folder"]
@@ -45,6 +52,36 @@ def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: 
     assert T_base_board.translation == pytest.approx([0.1, 0.0, 0.0])
     assert dataset.corners is not None
     assert np.bincount(dataset.corners.row).tolist() == [6, 6]
+
+
+def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
+    tmp_path: Path,
+) -> None:
+    """The parameters are those without this image; of many images that is refused."""
+    folder = tmp_path / "d"
+    chosen = settings(poses=8, board="chessboard", hand_held=True)
+    simulate("hexapod", folder, chosen)
+    first = read_rows(folder / "corners.csv")
+    scattered = np.random.default_rng(1).normal(0.0, 3.0, (len(first), 2))
+
+    def calibrated(views: Container[str]) -> Calibration:
+        rows = [
+            row | {"u": float(row["u"]) + off[0], "v": float(row["v"]) + off[1]}
+            if row["view"] in views
+            else row
+            for row, off in zip(first, scattered.tolist(), strict=True)
+        ]
+        write_rows(folder / "corners.csv", rows)
+        return calibrate(folder)
+
+    found = calibrated(["c1-3"])
+    (note,) = [note for note in found.notes if "left out" in note]
+    assert note.startswith("view c1-3: ")
+    assert re.search(r"found [234]\.?\d* px from the best pose of the chessboard", note)
+    without = calibrate(folder, leave_out="c1-3").solution.estimates
+    assert found.solution.estimates.values == pytest.approx(without.values, abs=1e-9)
+    with pytest.raises(DatasetError, match="view c1-3: its camera could not be placed"):
+        calibrated([f"c1-{k}" for k in range(1, 9)] + ["c2-1"])
 
 
 # The table of corners.
@@ -83,7 +120,7 @@ def _same(one: Corners, other: Corners) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
 
 
-@settings(deadline=None, max_examples=40)
+@drawn(deadline=None, max_examples=40)
 @given(tables())
 def test_corners_are_read_as_they_were_written_and_put_in_order(corners: Corners) -> None:
     with tempfile.TemporaryDirectory() as name:

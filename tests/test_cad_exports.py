@@ -60,6 +60,16 @@ def test_a_robot_of_a_cad_export_loads_as_it_is(write: object, tmp_path: Path) -
     assert written.leg_names == machine.leg_names
 
 
+def test_another_export_of_a_mesh_is_read_again(tmp_path: Path) -> None:
+    path = write_head_urdf(tmp_path)
+    _check(load_mechanism(path))
+    file = tmp_path / "assets" / "rod.stl"
+    thicker = trimesh.load_mesh(file)
+    thicker.apply_transform(np.diag([1.0, 1.5, 1.5, 1.0]))
+    thicker.export(file)
+    _check(load_mechanism(path), radius=1.5 * RADIUS)
+
+
 def test_an_ankle_of_two_cranks_and_a_universal_joint_loads_and_is_written(tmp_path: Path) -> None:
     machine = load_mechanism(write_ankle(tmp_path / "from"))
     assert [leg.type for leg in machine.legs] == ["RSS", "RSS", "U"]

@@ -343,18 +343,22 @@ def test_cameras_are_written_for_other_programs(
 
 
 @pytest.mark.parametrize(
-    ("program", "model"),
+    ("of", "program", "model"),
     [
-        ("ros", "rational_polynomial"),
-        ("opencv", "rational_polynomial"),
-        ("kalibr", "equidistant"),
-        ("mrcal", "rational_polynomial"),
+        (LENSES[-1], "ros", "rational_polynomial"),
+        (LENSES[-1], "opencv", "rational_polynomial"),
+        (LENSES[-1], "kalibr", "equidistant"),
+        (LENSES[-1], "mrcal", "rational_polynomial"),
+        (LENSES[1], "kalibr", "plumb_bob"),  # with k3
     ],
 )
-def test_a_splined_lens_is_written_as_the_nearest_of_the_program(
-    tmp_path: Path, program: CameraProgram, model: str
+def test_a_lens_that_the_program_lacks_is_written_as_its_nearest(
+    tmp_path: Path,
+    of: tuple[DistortionModel, list[float]],
+    program: CameraProgram,
+    model: str,
 ) -> None:
-    lens = Camera(STRAIGHT, *SIZE, np.array(SPLINE), "splined_radial")
+    lens = Camera(STRAIGHT, *SIZE, np.array(of[1]), of[0])
     block = {"version": 1, "sigma": {"fx": 2.0}, "names": ["fx"], "covariance": [[4.0]]}
     source = write(tmp_path, camera_info(lens, "any", {"legcal_camera": block}))
     _, said, left_out = convert_camera(source, program, tmp_path / "other.txt")

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edits import cell
+import yaml
+from edits import cell, keyed
 from simulated import settings, simulated
 from thinned import thinned
 
@@ -24,6 +25,7 @@ from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisi
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.progress import no_progress
+from legcal.simulation.settings import Level, SimulationSettings
 from legcal.workers import in_turn
 
 
@@ -62,6 +64,12 @@ def _late(d: Dataset, first: int = 0) -> Dataset:
 
 def _late_from_fourth(d: Dataset) -> Dataset:
     return _late(d, 3)
+
+
+def _doubled_row(d: Dataset) -> Dataset:
+    """Return a session whose eighth row stands twice in the table, through both views."""
+    q = d.measurements.q
+    return _with_readings(d, np.vstack([q[:8], q[7:-1]]))
 
 
 def _in_order_of_text(d: Dataset) -> Dataset:
@@ -153,7 +161,10 @@ def _diagnosed(d: Dataset) -> Diagnosis:
 
 
 BESIDE = {"images mirrored", "images upside down", "readings shifted", "direction of encoders"}
-USUAL = (_exchanged, _thick, _in_order_of_text, _exchanged_from_eighth, _reversed_from_eighth)
+USUAL = (
+    *(_exchanged, _thick, _doubled_row, _in_order_of_text),
+    *(_exchanged_from_eighth, _reversed_from_eighth),
+)
 
 
 @pytest.mark.parametrize(
@@ -175,6 +186,8 @@ USUAL = (_exchanged, _thick, _in_order_of_text, _exchanged_from_eighth, _reverse
             ("delta", _in_radians, "unit", "the readings appear to be radians", ""),
             ("3-upu", _late_from_fourth, "readings shifted",
              "from p14 on, the readings of view c2 appear to be one row late", ""),
+            ("3-upu", _doubled_row, "readings shifted",
+             "from p09 on, the readings appear to be one row late", ""),
             ("3-upu", _in_order_of_text, "order of text",
              "the readings appear to be sorted in another order", ""),
             ("3-upu", _exchanged_from_eighth, "columns exchanged",
@@ -227,6 +240,29 @@ def test_what_was_tried_in_vain_stands_beside_a_refusal(
     with pytest.raises((NotVisible, DidNotConverge)) as refused:
         calibrate(_with_readings(d, rng.permuted(d.measurements.q, axis=0)))
     assert NONE_EXPLAINS in refused.value.notes
+
+
+def test_where_most_images_agree_nothing_is_to_be_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """36 of 45: joints of the model are some millimetres off."""
+    _try_only(("diameter for radius",), monkeypatch)
+    folder = tmp_path / "set"
+    chosen = SimulationSettings(Level.OUTLINES, board="chessboard", hand_held=True)
+    simulate("hexapod", folder, chosen)
+    assert diagnose(order_dataset(load_dataset(folder), in_turn, no_progress)) is None
+
+
+def test_a_board_of_another_size_is_named_without_further_guesses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _try_only(("diameter for radius",), monkeypatch)
+    folder = simulated(tmp_path / "set", "servo-hexapod", poses=5, board="chessboard").folder
+    square = yaml.safe_load((folder / "dataset.yaml").read_text())["board"]["square"]
+    keyed("dataset.yaml", board__square=1.04 * square)(folder)
+    with pytest.raises(DidNotConverge, match="dimensions of the calibration board") as refused:
+        calibrate(folder)
+    assert diagnosis.NONE_EXPLAINS not in refused.value.notes
 
 
 @pytest.mark.parametrize(

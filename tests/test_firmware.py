@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import run
 from edits import keyed
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -257,6 +258,8 @@ def test_poses_of_a_printer_stay_over_its_bed(tmp_path: Path) -> None:
     machine = machine_of(KLIPPER, tmp_path)
     copied = load_mechanism(write_model(machine, tmp_path / "copy")[0])
     assert (copied.reach, copied.floor) == (machine.reach, machine.floor) == (0.12, 0.0)
+    said = " ".join(run("inspect", copied.yaml_path).out.split())
+    assert "within 120.00 mm of the z axis of the base and at or above z = 0.00 mm" in said
     extreme = feasible_poses(copied, 12, np.random.default_rng(1), extreme=True)
     for poses in (extreme.poses, random_poses(copied, 50, 2)[1]):
         at = np.array([pose.translation for pose in poses])
@@ -295,6 +298,22 @@ def test_a_calibrated_printer_prints_with_what_was_exported(tmp_path: Path) -> N
     assert after < before / 5.0
     assert exported.figures["nominal_mm"]["rms"] == pytest.approx(before, rel=0.3)
     assert abs(exported.figures["remaining_mm"]["rms"] - after) < 0.01
+
+
+def test_lines_of_a_calibration_in_doubt_say_its_verdict_first(tmp_path: Path) -> None:
+    """Outlines of one view tell little of a printer; sure results have no such line."""
+    folder = tmp_path / "session"
+    made = SimulationSettings(Level.OUTLINES, ParameterErrors(), poses=5, views=1, seed=4)
+    simulate(machine_of(KLIPPER, tmp_path), folder, made)
+    keyed("dataset.yaml", machine_kind="printed")(folder)
+    found = calibrate(folder, output=tmp_path / "out", only="all")
+    assert not found.verdict.trustworthy
+    exported = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg")
+    assert exported.notes[0] == found.verdict.sentence
+    assert exported.paths[0].read_text().splitlines()[1] == f"# {found.verdict.sentence}"
+    keyed("result.json", trustworthy=True, doubts=[])(tmp_path / "out")
+    again = export(tmp_path / "out", "klipper", tmp_path / "printer.cfg", force=True)
+    assert again.notes == exported.notes[1:]
 
 
 # --- hexapods -----------------------------------------------------------------------------------

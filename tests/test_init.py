@@ -115,6 +115,7 @@ def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(tmp_path: P
 
 FLAT = ("IMG_2.JPG", "IMG_10.JPG", "IMG_11.JPG")
 TWO = ("a/IMG_2.jpg", "a/IMG_10.jpg", "a/IMG_11.jpg", "b/IMG_3.jpg", "b/IMG_4.jpg", "b/IMG_12.jpg")
+BACK = ("a/IMG_10.jpg", "a/IMG_11.jpg", "b/IMG_8.jpg", "b/IMG_9.jpg")
 SAME = ("a/1.png", "a/2.png", "a/3.png", "b/1.png", "b/2.png", "b/3.png")
 TIMES = ("2026:11:23 10:00:05", "2026:11:23 10:01:05", "2026:11:23 10:02:06")
 Columns = dict[str, Sequence[str]]
@@ -127,6 +128,8 @@ MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
      [("IMG_10.JPG", 0), ("IMG_11.JPG", 1), ("IMG_2.JPG", 2)]),
     (TWO, {}, 3, [*zip(TWO[:3], range(3), strict=True), *zip(TWO[3:], range(3), strict=True)]),
     (TWO, {}, 6, list(zip(TWO, range(6), strict=True))),
+    # one camera counted the photographs of all folders
+    (BACK, {}, 4, list(zip([*BACK[2:], *BACK[:2]], range(4), strict=True))),
     (TWO, {"view": ("b", "b", "b", "a", "a", "a")}, 6,
      [*zip(TWO[3:], range(3), strict=True), *zip(TWO[:3], range(3, 6), strict=True)]),
     (SAME, {"file": ("3.jpg", "1.jpg", "2.jpg")}, 3,
@@ -238,6 +241,10 @@ def test_units_and_columns_are_found(
 REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]] = [
     # photographs, table, words of the command, what must be named
     (FLAT, {"n": 2}, (), ("3 photographs for 2 rows", "column image")),
+    (TWO, {"n": 7}, (), ("all folders together", "6 photographs for 7 rows")),
+    (TWO, {"n": 4}, (), ("folder a", "3 photographs for 4 rows")),
+    (FLAT[:2], {"columns": {"image": ("IMG_2", "IMG_10", "IMG_12")}}, (),
+     ("'IMG_12'", "add the file, or remove the row")),
     (FLAT, {"columns": {"image": ("IMG_2", "IMG_10", "IMG_12")}}, (),
      ("row 3 (line 4)", "'IMG_12'", "'IMG_11.JPG'")),
     (FLAT, {"columns": {"image": ("a", "b", "c")}}, (), ("'a'", "'IMG_2.JPG'", "in order")),

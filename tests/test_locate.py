@@ -443,3 +443,19 @@ def test_errors_are_as_large_as_the_covariance_says(case: str) -> None:
     # 40 x 12: one sigma is 0.065; with some 30 degrees of freedom a kind 1.07 is expected
     assert 0.85 < np.mean(squares) < (1.3 if case == "unknown" else 1.15)
     np.testing.assert_allclose(np.mean(sigmas, axis=0), STATED[0], rtol=0.06)
+
+
+@pytest.mark.parametrize("k", [24, 30])
+def test_poses_far_more_precise_than_the_model_are_fitted(k: int) -> None:
+    """Positions are exact: their scatter is estimated as next to nothing."""
+    truth, exact, chance = frames_of(BASE, TOOL), pairs_at(BASE, TOOL), np.random.default_rng(8)
+    common = 2e-4 * chance.normal(size=(8, 6, k))
+    step = (tool_motions(common, truth, exact) @ chance.normal(size=(k, 1)))[..., 0]
+    turn = rotation_matrices(SIGMA_ANGLE * chance.normal(size=(8, 3))) @ rotation_matrices(
+        step[:, 3:]
+    )
+    pairs = replace(exact, p=exact.p + step[:, :3], M=turn @ exact.M)
+    found = fit(pairs, truth, PoseNoise(*UNKNOWN), common)
+    error = frame_errors(found.frames, BASE, TOOL) / pairs.scale
+    assert error @ found.information @ error < 33.0  # chi2 of 12 at 0.1 %
+    assert np.abs(error).max() > 1e-6

@@ -184,7 +184,8 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
     calls: list[tuple[Any, str]] = [
         (lambda: public.evaluate(3, machine), "found 3 (int) as model, needed a text or a path"),
         (lambda: public.evaluate(machine, folder, dataset=0), "found 0 (int) as dataset"),
-        (lambda: public.plot_machine("hexapod"), "(str) as machine, needed Machine;"),
+        (lambda: public.plot_machine("hexapod"), "(str) as machine, needed Machine; load it"),
+        (lambda: public.plot_machine(example_run.calibration), "needed Machine; give its .machine"),
         (lambda: public.calibrate(example, holdout="a"), "as holdout, needed a number or None;"),
         (lambda: public.new(family="delta", rod_length="0.2"), "as rod_length, needed a number"),
         (lambda: public.Follower("hexapod"), "found a str, needed a Machine"),
@@ -206,6 +207,14 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
     pose = np.asarray(machine.home.as_matrix(), dtype=np.float32).tolist()  # of no annotated type
     assert np.isfinite(legcal.inverse_kinematics(machine, pose)).all()
     assert pickle.loads(pickle.dumps(legcal.calibrate)) is legcal.calibrate
+
+
+def test_a_calibration_has_the_machine_that_its_folder_holds(example_run: Run) -> None:
+    here, there = example_run.calibration.machine, legcal.load_result(example_run.output).machine
+    for one, other in zip(here.legs, there.legs, strict=True):
+        np.testing.assert_array_equal([*one.A, *one.B, one.q0], [*other.A, *other.B, other.q0])
+    moved = legcal.evaluate(here, example_run.calibration.dataset.machine)
+    assert moved.displacement.mean() > 1e-4
 
 
 def test_models_are_written_and_exported_without_the_command_line(

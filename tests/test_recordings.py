@@ -12,7 +12,7 @@ import pytest
 from command_line import Outcome, run
 from simulated import small_camera
 
-from legcal import load_dataset, load_mechanism
+from legcal import import_recordings, load_dataset, load_mechanism
 from legcal.geometry.types import Array
 from legcal.recordings.frames import VIDEOS, read_series, stamp_in
 
@@ -172,6 +172,12 @@ def test_poses_that_were_held_become_rows(
              dataset.measurements.image]  # fmt: skip
     dark = [int(np.argmin(np.convolve(row, np.ones(5), "same")[4:-4])) + 4 for row in shown]
     assert np.abs(np.array(dark) - (8.0 + 7.0 * np.arange(10))).max() <= 2.0
+    if kind == "folder":
+        again = import_recordings(
+            source, MODEL, tmp_path / "again",
+            cameras=small_camera(tmp_path, *SIZE), readings=str(words[1]),
+        )  # fmt: skip
+        np.testing.assert_array_equal(again.measurements.q, found)
 
 
 def test_clocks_are_compared_by_motion_and_json_tells_what_was_left_out(

@@ -19,10 +19,10 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.data.corners import Corners, join_corners
 from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
-from legcal.data.measurements import Measurements
+from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import LegAxes
 from legcal.data.reasons import Reason
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import Cause, DatasetError, NotVisible, by_cause
 from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
@@ -287,7 +287,19 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
     on_base = corners.used & fixed.has(corners.corner)
     shown_views = set(measurements.view[corners.row[on_base]].tolist())
     used = np.unique(measurements.view).tolist()
-    without = [measurements.view_names[v] for v in used if v not in shown_views]
+    lost = solution.outlines.row[solution.outlines.rejected_for(Reason.NOT_PLACED)]
+    why: dict[str, Cause] = {}  # single images of a camera in the hand were left out, by view
+    for row, reason in zip(corners.row.tolist(), corners.reason, strict=True):
+        view = measurements.views[measurements.view[row]]
+        if reason and row in lost and view.hand_held:
+            why.setdefault(view.name, reason.cause)
+    for cause, views in by_cause(why):
+        notes.append(
+            f"{few_views(views)}{', each' * (len(views) > 1)}: left out, since neither board nor "
+            f"legs place the camera; of the board: {cause}; correct its corners or take it again."
+        )
+    unseen = [measurements.view_names[v] for v in used if v not in shown_views]
+    without = [name for name in unseen if name not in why]
     if without:
         others = "the legs and the board on the platform" if len(dataset.boards) > 1 else "the legs"
         notes.append(

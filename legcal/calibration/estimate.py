@@ -27,7 +27,7 @@ import numpy as np
 
 from legcal.calibration.board import BoardViews
 from legcal.calibration.diagnosis import Diagnosis
-from legcal.calibration.four_steps import Steps, four_steps, starts
+from legcal.calibration.four_steps import Steps, four_steps, starts, without_lost_images
 from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.rounds import with_edge_biases
@@ -157,6 +157,7 @@ def fit_outlines(
         )
     if steps is None:
         steps = four_steps(fitted, fitted_outlines, board, options)
+    fitted_outlines, board = without_lost_images(fitted, fitted_outlines, placement, steps, board)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices
     if any(fitted.measurements.image) and "detected" in fitted_outlines.source:

@@ -14,6 +14,7 @@ from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.data.image_tables import Order, inverse
 from legcal.data.measurements import few_views
 from legcal.data.outlines import Outlines, along_legs, axes_from_outlines
+from legcal.data.reasons import Reason
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.machine.leg import Leg
 from legcal.machine.parameters import geometries, parametrization_of, reframed
@@ -93,6 +94,33 @@ def four_steps(
         return Steps(None, None, str(failure))
     finally:
         data.progress("Four steps", 1, 1)
+
+
+def without_lost_images(
+    data: OrderedDataset,
+    outlines: Outlines,
+    placement: Placement,
+    steps: Steps,
+    board: BoardViews | None,
+) -> tuple[Outlines, BoardViews | None]:
+    """Reject outlines and corners of single images, from a camera in the hand, that nothing places.
+
+    Other views are needed: :func:`starts` says what would place them.
+    """
+    staged = steps.T_Rb_camera or placement.T_base_camera
+    lost = np.array(
+        [
+            view.hand_held and T is None and of_steps is None
+            for view, T, of_steps in zip(
+                data.measurements.views, placement.T_base_camera, staged, strict=True
+            )
+        ],
+        dtype=np.bool_,
+    )[data.measurements.view]
+    if board is not None and lost.any():
+        of_lost = np.isin(board.corners.row, data.rows[lost])
+        board = replace(board, corners=board.corners.reject(of_lost, Reason.NOT_PLACED))
+    return outlines.reject(lost[outlines.row], Reason.NOT_PLACED), board
 
 
 def starts(

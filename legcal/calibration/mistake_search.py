@@ -29,6 +29,7 @@ from legcal.calibration.mistakes import (
     limited_to,
     mistakes,
     moved_cameras,
+    shifted_from,
     turned_images,
 )
 from legcal.calibration.ordered_dataset import OrderedDataset
@@ -107,6 +108,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     tried = [
         *common,
         *judge.in_some_images(common),
+        *judge.in_the_rest(),
         *(judge.turned_images() or judge.moved_cameras()),  # upside down is as a camera that rolled
     ]
     finalists, gain = judge.finalists(tried)
@@ -116,7 +118,8 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
         likeliest = judge.of_two(tried, gain)
     data.progress(STAGE, 1, 1)
     if not likeliest:
-        return renamed
+        most_agree = judge.own.images >= _MOST * len(judge.own.row)
+        return renamed or (None if most_agree else ())
     suited = [judge.hints_suited(one) for _, one in likeliest]
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
     first = [what for what, _ in likeliest]
@@ -240,6 +243,18 @@ class _Judge:
             if MIN_IMAGES <= len(rows) <= len(all_changed) - MIN_IMAGES:
                 found.append(limited_to(self.data, self.given, some[k], rows))
         return found
+
+    def in_the_rest(self) -> list[Mistake]:
+        """Return readings shifted from where images cease to agree: a row too many, or missing.
+
+        In several views, of which the last may agree nowhere.
+        """
+        in_file = np.argsort(self.data.order.rows, kind="stable")
+        agrees = np.isin(in_file, self.own.row[self.own.agrees])
+        first = 1 + int(np.argmax(np.cumsum(np.where(agrees, 1, -1))))
+        if len(self.groups) == 1 or len(in_file) - first < MIN_IMAGES or not agrees[:first].any():
+            return []
+        return shifted_from(self.data, self.given, first)
 
     def turned_images(self) -> list[Mistake]:
         """Return single images that agree with the camera of their view only if turned over."""

@@ -315,7 +315,7 @@ def limited_to(data: OrderedDataset, given: Assumed, mistake: Mistake, rows: Int
         what=f"{where}, {mistake.what}",
         mended=f"{mistake.mended} there",
         remedy="correct the readings there, and look for what changed (a plug, a setting, a row or "
-        "image that is missing)",
+        "image that is missing or doubled)",
         true=replace(given, q=q),
         same_as=(),
         test="",
@@ -336,32 +336,37 @@ def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     of_view = rows_of_views(data)
     nonempty = [rows for rows in of_view if len(rows)]
 
-    def moved(shifted: Sequence[IntArray], k: int, view: str = "") -> Iterator[Mistake]:
-        if any(len(rows) <= 2 for rows in shifted):
-            return
-        q = given.q.copy()
-        for rows in shifted:
-            q[rows] = given.q[np.roll(rows, -k)]
-        view_in_words = f" of view {view}" if view else ""
-        yield Mistake(
-            "readings shifted",
-            f"the readings{view_in_words} appear to be one row {_LATE[k]} (each image is paired "
-            "with the readings of a neighbour)",
-            "with the readings moved by 1 row",
-            "check which image belongs to which row",
-            replace(given, q=q),
-            amount_of=f"rows{view_in_words}",
-        )
-
-    for k in _LATE:
-        yield from moved(nonempty, k)
-    for v, rows in enumerate(of_view):
-        if len(nonempty) > 1:
-            for k in _LATE:
-                yield from moved([rows], k, data.measurements.views[v].name)
+    parts = [(nonempty, "")]
+    if len(nonempty) > 1:
+        names = [f" of view {view.name}" for view in data.measurements.views]
+        parts += [([rows], name) for rows, name in zip(of_view, names, strict=True)]
+    for shifted, name in parts:
+        if all(len(rows) > 2 for rows in shifted):
+            yield from (_shifted(given, shifted, k, name) for k in _LATE)
     whole = np.argsort(data.order.rows, kind="stable")
     for tables in (nonempty, [whole])[: len(nonempty)]:
         yield from _text_order(tables, given)
+
+
+def _shifted(given: Assumed, tables: Sequence[IntArray], k: int, of_view: str = "") -> Mistake:
+    q = given.q.copy()
+    for rows in tables:
+        q[rows] = given.q[np.roll(rows, -k)]
+    return Mistake(
+        "readings shifted",
+        f"the readings{of_view} appear to be one row {_LATE[k]} (each image is paired with the "
+        "readings of a neighbour)",
+        "with the readings moved by 1 row",
+        "check which image belongs to which row",
+        replace(given, q=q),
+        amount_of=f"rows{of_view}",
+    )
+
+
+def shifted_from(data: OrderedDataset, given: Assumed, first: int) -> list[Mistake]:
+    """Return readings shifted by a row from one row of the file to the end, through all views."""
+    whole = np.argsort(data.order.rows, kind="stable")
+    return [limited_to(data, given, _shifted(given, [whole], k), whole[first:]) for k in _LATE]
 
 
 def _text_order(tables: Sequence[IntArray], given: Assumed) -> Iterator[Mistake]:

@@ -68,6 +68,7 @@ from legcal.data.image_choice import chosen_images, dataset_at, own_zeros, split
 from legcal.data.measurements import few_views, image_notes, still_encoders
 from legcal.data.reading_units import legs_with_readings
 from legcal.errors import (
+    Code,
     DatasetError,
     DidNotConverge,
     LegcalError,
@@ -363,7 +364,8 @@ def estimate_parameters(data: OrderedDataset, file_rows: IntArray, options: Opti
         is_told = isinstance(error, DatasetError) and data.machine.is_redundant  # by the readings
         tried, notes = None if is_told else diagnosed(data), data.dataset.notes
         diagnosis = tried or ()
-        if tried == () and isinstance(error, NotVisible | DidNotConverge):
+        is_explained = any(fact.code is Code.BAD_VALUE for fact in error.facts)  # a stated value
+        if tried == () and isinstance(error, NotVisible | DidNotConverge) and not is_explained:
             notes = (NONE_EXPLAINS, *notes)
         if not (diagnosis or notes):
             raise

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,10 +58,12 @@ from legcal.data.measurements import places
 from legcal.files.motions import Pose
 from legcal.geometry.lines import normal_basis, turned_axis
 from legcal.geometry.types import Array, IntArray
+from legcal.machine.files import RESULT_YAML
 from legcal.machine.inspection import ActuatorBlock
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import LINKS, Leg, LegColumns, LegKind, Link
 from legcal.machine.model import Machine
+from legcal.machine.model_writer import write_calibrated
 from legcal.machine.parameters import (
     SHOWN,
     describe_direction,
@@ -158,6 +162,19 @@ class Calibration(Summarised):
     def doubts(self) -> tuple[Doubt, ...]:
         """What speaks against the result, the worst first; empty where it is trusted."""
         return self.verdict.doubts
+
+    @property
+    def legs(self) -> Sequence[Leg]:
+        """The legs of the calibrated model, in R_b and R_e."""
+        return self.solution.legs if self.group is None else self.group.written
+
+    @cached_property
+    def machine(self) -> Machine:
+        """The calibrated model, as its folder has it: evaluate, export and kinematics take it."""
+        with TemporaryDirectory() as folder:
+            nominal = self.dataset.machine
+            written = write_calibrated(nominal, self.legs, Path(folder) / RESULT_YAML)
+        return written.with_leg_order(nominal.leg_names)
 
     @cached_property
     def result(self) -> Result:

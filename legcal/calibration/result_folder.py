@@ -42,15 +42,13 @@ from legcal.files.folder import RESULT, in_the_way, path_problem, result_folder
 from legcal.files.schema import read_json
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
-from legcal.machine.home import home_of_legs
 from legcal.machine.leg import AXES, Leg, ParameterId, with_radii
 from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
-from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.machine.model_writer import urdf_of, write_calibrated
 from legcal.machine.parameters import (
     calibrated_axis,
     geometries,
-    in_joint_frames,
     nominal_axes,
     parametrization_of,
     turns_between,
@@ -68,8 +66,6 @@ if TYPE_CHECKING:
 Beside = Callable[[Calibration, Path], None]
 RESULT_NAME, STAGED_NAME = "result.json", "staged.yaml"
 REPORT_NAME = "report.html"  # removed with an earlier result
-RELOAD_TOLERANCE = 2.5e-11  # mean leg lengths, [rad] between reloaded and written parameters
-MAX_HOME_RESIDUAL = 0.2  # residual of calibrated legs at the nominal home [leg lengths]
 ROUNDING = 2.5e-9  # rounding of numbers in files [mean leg lengths, rad]
 SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of covariances
 
@@ -94,16 +90,14 @@ def write_result(
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
-    stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(_urdf_of(Path(STAGED_NAME)))]
+    stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(urdf_of(Path(STAGED_NAME)))]
     stale += [REPORT_NAME] * PAGE.is_at(destination / REPORT_NAME)
     old = [*map(Path, stale), *earlier_overlays(destination)]
     with result_folder(destination, stale=old) as folder:
-        group = calibration.group
-        legs = solution.legs if group is None else group.written
-        _write_model(machine, legs, folder / RESULT_YAML)
+        write_calibrated(machine, calibration.legs, folder / RESULT_YAML)
         if steps.legs is not None:
             try:
-                _write_model(machine, steps.legs, folder / STAGED_NAME)
+                write_calibrated(machine, steps.legs, folder / STAGED_NAME)
             except (DidNotConverge, ModelError, OutOfClass):
                 # The nominal model, which the error names, is not the cause: the calibrated model
                 # was made from it in the same way.
@@ -112,7 +106,7 @@ def write_result(
                     "that loads and closes. The calibrated model does not depend on it."
                 )
                 calibration = replace(calibration, notes=(*calibration.notes, note))
-                for path in (folder / STAGED_NAME, _urdf_of(folder / STAGED_NAME)):
+                for path in (folder / STAGED_NAME, urdf_of(folder / STAGED_NAME)):
                     path.unlink(missing_ok=True)
         if calibration.overlays:
             from legcal.calibration.detection import draw_images
@@ -140,38 +134,6 @@ def write_result(
         if beside is not None:
             beside(calibration, folder)
     return calibration
-
-
-def _urdf_of(yaml: Path) -> Path:
-    """Return the URDF beside the YAML of a written model."""
-    return yaml.with_suffix(".urdf")
-
-
-def _write_model(machine: Machine, legs: Sequence[Leg], yaml: Path) -> None:
-    """Write a machine with calibrated legs; check that it loads with these legs and closes."""
-    start = f"{yaml}: the model could not be written: found"
-    write_urdf(machine, legs, _urdf_of(yaml))
-    home = home_of_legs(machine, legs, MAX_HOME_RESIDUAL)
-    if home is None:
-        raise DidNotConverge(
-            f"{start} no closed pose of its legs near legcal.home, needed one; check legcal.home "
-            f"of {machine.yaml_path}, and the nominal model."
-        )
-    moved = None if home is machine.home else home
-    write_calibrated_yaml(machine, yaml, _urdf_of(yaml).name, moved, legs)
-    written = reload_and_check(yaml)
-    parametrization = parametrization_of(written, twists=True)
-    wanted = in_joint_frames(legs, machine.frame_legs)
-    difference = vector_of(parametrization, geometries(written), wanted) - vector_of(
-        parametrization, wanted, wanted
-    )
-    unit = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
-    error = float(np.abs(difference / unit).max())
-    if not error <= RELOAD_TOLERANCE:
-        raise DidNotConverge(
-            f"{start} that its parameters, loaded again, differ by {error:.1e} leg lengths or rad "
-            f"from the computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
-        )
 
 
 @dataclass(frozen=True, eq=False)

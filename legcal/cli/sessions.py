@@ -436,7 +436,7 @@ def import_(
 ) -> None:
     """Make a dataset from recordings of a machine that rests at each pose."""
     from legcal.progress import shown_progress
-    from legcal.recordings.importing import import_recordings, plan_import
+    from legcal.recordings.importing import plan_import, write_import
     from legcal.report.session import import_table, written_lines
 
     with shown_progress(not quiet) as progress:
@@ -453,7 +453,7 @@ def import_(
     if not as_json:
         print_table(import_table(plan))
     with shown_progress(not quiet) as progress:
-        written = import_recordings(plan, force=force, progress=progress)
+        written = write_import(plan, force=force, progress=progress)
     show(
         as_json,
         lambda: plan.document(written),

@@ -285,9 +285,9 @@ def read_override(
     return Override(name, action, where, stated, in_file)
 
 
-def listed(texts: Iterable[str]) -> list[str]:
-    """Return texts as a list; a single text counts as one element."""
-    return [texts] if isinstance(texts, str) else [str(text) for text in texts]
+def listed(texts: str | Path | Iterable[str | Path]) -> list[str]:
+    """Return texts as a list; a single text or path counts as one element."""
+    return list(map(str, [texts] if isinstance(texts, str | Path) else texts))
 
 
 def dataset_texts(

@@ -30,6 +30,7 @@ from legcal.data.reading_units import are_commands, sigmas_of, usual_sigma
 from legcal.data.readings_sheet import ReadingsSheet, SheetReadings
 from legcal.errors import DatasetError, OutOfResources, UsageError
 from legcal.files.folder import OutputKind, check_destination, check_path, new_files, result_folder
+from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import (
     MAX_IMAGE,
     NAME_NEEDED,
@@ -399,8 +400,13 @@ def _sigmas(
     if stated is None:
         shown = f"{1e6 * smallest:.3g} um" if smallest < 1e-3 else f"{1e3 * smallest:.3g} mm"
         if not slides:
-            of_motor = zip(motors, sigmas.items(), strict=True)
-            shown = few([f"{name} {x:.2g} {leg.reading_unit}" for leg, (name, x) in of_motor])
+            units_of = [SHOWN_IN[leg.reading_unit] for leg in motors]
+            texts = [
+                f"{scale * sigma:.2g} {unit}"
+                for (scale, unit), sigma in zip(units_of, sigmas.values(), strict=True)
+            ]
+            each = [f"{name} {text}" for name, text in zip(sigmas, texts, strict=True)]
+            shown = texts[0] if len(set(texts)) == 1 else few(each)
         why = "the last digit of the table, at least that of a good encoder"
         if any(map(are_commands, motors, readings.units)):
             why = "half a degree of what a hobby servo makes of its command"

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path, PurePosixPath
 
 from legcal.data.image_choice import DAY, seconds_in, seconds_of_column
@@ -304,7 +304,8 @@ def _refuse_names(
     taken = {photograph.name for same_key in best.values() for photograph in same_key}
     spare, needed = [p.name for p in photographs if p.name not in taken], len(photographs)
     for k in (k for k in named if k not in best):
-        found, near = f"no {describe(images[k])}", closest(images[k], spare)
+        found = f"no {describe(images[k])}"
+        near = closest(images[k], spare) if spare else "add the file, or remove the row"
         table.refuse(
             k, found, f"one of the {needed} photographs", "image",
             remedy=near, what="photograph", code=Code.MISSING_FILE,
@@ -350,8 +351,12 @@ def _in_order(table: Table, photographs: Sequence[Photograph]) -> Matched:
         ]
         method = "in the order of rows and of names, view by view"
     elif len(photographs) == len(rows):
-        groups = [("all folders", rows, list(photographs))]
-        method = "in the order of rows and of names"
+        counted, method = _counted(photographs), "in the order of rows and of names"
+        if counted != list(photographs):
+            method = "in the order of rows and of the numbers in names, through all folders"
+        groups = [("all folders", rows, counted)]
+    elif _lacking(len(photographs), rows) < min(_lacking(len(p), rows) for p in folders.values()):
+        groups, method = [("all folders together", rows, list(photographs))], ""
     else:
         groups = [(f"folder {folder}", rows, inside) for folder, inside in folders.items()]
         method = "in the order of rows and of names: every view shows the poses of all rows"
@@ -377,6 +382,25 @@ def _in_order(table: Table, photographs: Sequence[Photograph]) -> Matched:
             )
         pairs += zip(members, inside, strict=True)
     return pairs, method, notes
+
+
+def _lacking(n_photographs: int, rows: Sequence[int]) -> int:
+    return abs(n_photographs - len(rows))
+
+
+def _counted(photographs: Sequence[Photograph]) -> list[Photograph]:
+    """Return photographs in the order of their numbers where one camera counted all of them.
+
+    Folders then follow each other. Otherwise they stay in the order of folders and names.
+    """
+    names = [PurePosixPath(photograph.name).name for photograph in photographs]
+    of_one_camera = len({_NUMBERS.sub("0", name) for name in names}) == 1
+    if not of_one_camera or len(set(names)) < len(names):
+        return list(photographs)
+    counted = sorted(photographs, key=lambda one: in_order(PurePosixPath(one.name).name))
+    n_folders = len({photograph.folder for photograph in photographs})
+    blocks = [folder for folder, _ in groupby(counted, key=lambda one: one.folder)]
+    return counted if len(blocks) == n_folders else list(photographs)
 
 
 def photograph_time(photograph: Photograph) -> float | None:

@@ -62,7 +62,11 @@ class Reason(StrEnum):
         "shows too few legs to place the platform",
         "shows too few legs to place the platform, {}",
     )
-    NO_BOARD_POSE = "no_board_pose", "no pose of the board explains it"
+    NO_BOARD_POSE = (
+        "no_board_pose",
+        "no pose of the board explains it",
+        "no pose of the board explains it, found {}",
+    )
     CORNER_OFF = (
         "corner_off",
         "far from where the other corners put it",

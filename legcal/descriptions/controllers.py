@@ -121,6 +121,12 @@ def _with_named_files(path: Path, text: str, outer: tuple[Path, ...] = ()) -> st
                     f"{path}: [include {pattern}] could not be followed: found a file that "
                     "includes itself, needed one that does not; remove the line."
                 )
+            if not file.is_file():
+                raise ModelError(
+                    f"{path}: [include {pattern}] could not be followed: found no such file as the "
+                    f"included file {file}, needed it there; copy it from the printer, or remove "
+                    "the line if it says nothing of the machine's dimensions."
+                )
             of_file = content_of(file, "included file", ModelError).decode(errors="replace")
             texts.append(_with_named_files(file, of_file, outer))
         return "\n".join(texts)
@@ -439,6 +445,7 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
     }
     assumed = [] if stated is not None else [f"joints {r:g} {unit} from its middle"]
     assumed += [f"the rods of a tower {2.0 * pair:g} {unit} apart"]
+    where = " (stepper of GET_POSITION)" if firmware.title == "Klipper" else ""
     return table, (
         *read.notes,
         f"{firmware.title} knows no effector: assumed are {' and '.join(assumed)} "
@@ -446,7 +453,7 @@ def _table_of_delta(path: Path, read: Configuration, unit: str, effector: float 
         f"{thick:g} {unit} of the rods (--leg-radius). Where rods are looked for in photographs "
         "depends on these, the numbers of the firmware do not.",
         f"A reading is {'the angle of an arm' if ideal.turns else 'the height of a carriage'} as "
-        f"{firmware.title} counts it, the endstop the upper end of the travel.",
+        f"{firmware.title} counts it{where}, the endstop the upper end of the travel.",
     )
 
 

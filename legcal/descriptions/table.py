@@ -1153,7 +1153,10 @@ def _from_points(lines: Lines, path: Path) -> Lines:
         joint = _joint(" ".join(words))
         stated = describe(" ".join(words)) if "".join(words) else "no name"
         if joint is None:
-            needed = "a name of side and number such as B1 and P1, or base1 and platform1"
+            needed = (
+                "a row for each joint, with side and number in its name such as B1 and P1, or "
+                "base1 and platform1, as legcal new --template writes it"
+            )
             refuse(row, line, stated, needed, *(header[i] for i in of_name[:2]))
             continue
         for axis, i in axes.items():

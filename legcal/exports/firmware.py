@@ -114,7 +114,8 @@ def firmware_files(name: str, subject: Subject, path: Path) -> Rendered:
             "multiplied) by it first, these numbers assume it done."
         )
     sentences.append(f"To use it, {firmware.after}.")
-    text = head + "".join(f"{mark} {line}\n" for line in sentences) + f"\n{lines}"
+    said = "".join(f"{mark} {line}\n" for line in (*subject.warning, *sentences))
+    text = f"{head}{said}\n{lines}"
     return remaining.rendered(text, sentences)
 
 

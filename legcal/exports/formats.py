@@ -186,7 +186,7 @@ def export(
             _FILE.check_place(place, force=force)
         for place, content in zip(places, rendered.files.values(), strict=True):
             _FILE.write(place, content, force=force)
-    return Exported(to, places, rendered.notes, dict(rendered.figures))
+    return Exported(to, places, (*subject.warning, *rendered.notes), dict(rendered.figures))
 
 
 def formats_of(subject: Subject) -> tuple[str, ...]:

@@ -39,6 +39,12 @@ class Subject:
         """The name of the machine: from its URDF for a result, else from its file."""
         return model_name(self.machine) if self.result is None else self.machine.urdf.name
 
+    @property
+    def warning(self) -> tuple[str, ...]:
+        """The verdict of a calibration that is in doubt, else nothing."""
+        document = None if self.result is None else self.result.document
+        return () if document is None or document.trustworthy else (document.verdict,)
+
 
 @dataclass(frozen=True)
 class Rendered:

@@ -113,6 +113,8 @@ class Inspection(SparseDocument):
     idle_spins: int  # number of freedoms that only spin a leg about itself
     base_frame: list[str]
     home: Pose  # T_base_platform
+    reach: Number | None = None  # of the platform from the z axis of the base [m]; omitted if none
+    floor: Number | None = None  # its lowest z there [m]; omitted if none
     legs: list[InspectedLeg]
     actuators: dict[str, InspectedActuator] | None = None  # in the base link, with A at reading 0
     diagnostics: list[str]
@@ -143,6 +145,8 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         idle_spins=sum(leg.idle_spins for leg in machine.legs),
         base_frame=[machine.leg_names[j] for j in machine.frame_legs],
         home=Pose.of(machine.home),
+        reach=machine.reach if np.isfinite(machine.reach) else None,
+        floor=machine.floor if np.isfinite(machine.floor) else None,
         legs=[_leg(*one) for one in zip(machine.legs, readings, bodies, strict=True)],
         actuators=actuators or None,
         diagnostics=list(machine.diagnostics),

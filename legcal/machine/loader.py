@@ -62,8 +62,9 @@ from legcal.machine.parameters import geometries, n_frame_legs, parametrization_
 from legcal.machine.rods import both_readings, rod_mode
 from legcal.machine.shapes import (
     at_visible_heights,
+    meshes_of,
     occluders_of,
-    visual_solids,
+    shapes_of,
     with_arms,
     with_covers,
     with_cylinders,
@@ -167,6 +168,8 @@ def _load(source: Source) -> Machine:
     urdf, closures = with_separate_origins(source.urdf, source.closures, machine)
     if urdf is not source.urdf:
         machine = _assemble(replace(source, urdf=urdf, closures=closures), block)
+        bodies = rigid_bodies(urdf, closures, block.platform_joint)
+    machine = _with_occluders(machine, bodies)
     # A closed home.
     given = machine.home if block.home is not None else None
     if given is not None and source.is_drawn_open and not machine.actuators:
@@ -213,7 +216,7 @@ def _load(source: Source) -> Machine:
 
 
 def _assemble(source: Source, block: LegcalBlock) -> Machine:
-    """Return the mechanism, with its chain still open."""
+    """Return the mechanism, with its chain still open and nothing that hides its legs."""
     urdf, closures, yaml_path = source.urdf, source.closures, source.path
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = _legs_in_order(
@@ -229,8 +232,7 @@ def _assemble(source: Source, block: LegcalBlock) -> Machine:
     _check_legs(chains, spatial=normals is None, path=yaml_path)
     check_virtual_joint(block, bodies, urdf, normals, yaml_path)
     in_plane = None if normals is None else normals_in_links(normals, ends)
-    solids = visual_solids(urdf)
-    shown = [solid.cylinder for solid in solids if solid.cylinder is not None]
+    shown = [solid.cylinder for solid in shapes_of(urdf) if solid.cylinder is not None]
     if normals is not None:
         chains = at_visible_heights(chains, shown, bodies)
     stated = {joint: entry.gain for joint, entry in (block.motors or {}).items()}
@@ -258,7 +260,6 @@ def _assemble(source: Source, block: LegcalBlock) -> Machine:
     frame_legs = tuple(names.index(name) for name in base_frame)
     legs = redirected(legs, frame_legs) if normals is None else legs
     legs = with_arms(with_cylinders(legs, shown, bodies), shown, bodies, ends[0])
-    occluders = occluders_of(legs, solids, bodies, (block.base, block.platform), in_plane)
     machine = Machine(
         name=urdf.name,
         yaml_path=yaml_path,
@@ -266,7 +267,7 @@ def _assemble(source: Source, block: LegcalBlock) -> Machine:
         base=block.base,
         platform=block.platform,
         platform_joint=block.platform_joint,
-        legs=with_covers(legs, occluders),
+        legs=legs,
         frame_legs=frame_legs,
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
@@ -275,7 +276,6 @@ def _assemble(source: Source, block: LegcalBlock) -> Machine:
         urdf=urdf,
         base_normal=base_normal,
         platform_normal=platform_normal,
-        occluders=occluders,
         tolerance=block.built or NOT_STATED,
         spline_teeth=block.spline_teeth,
         reach=block.reach or math.inf,
@@ -283,6 +283,20 @@ def _assemble(source: Source, block: LegcalBlock) -> Machine:
     )
     _check_frames(machine)
     return machine
+
+
+def _with_occluders(machine: Machine, bodies: Bodies) -> Machine:
+    """Return the machine with all visuals that are not measured: CAD has meshes of megabytes."""
+    normal, other = machine.base_normal, machine.platform_normal
+    in_plane = None if normal is None or other is None else (normal, other)
+    occluders = occluders_of(
+        machine.legs,
+        [*shapes_of(machine.urdf), *meshes_of(machine.urdf)],
+        bodies,
+        (machine.base, machine.platform),
+        in_plane,
+    )
+    return replace(machine, legs=with_covers(machine.legs, occluders), occluders=occluders)
 
 
 def _actuators(

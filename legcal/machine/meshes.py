@@ -31,11 +31,17 @@ def mesh_of_file(urdf_path: Path, visual: etree._Element) -> tuple[Array, IntArr
     """Return a mesh as :func:`read_mesh`, with its corners in the frame of its file."""
     shape = visual.find("geometry/mesh")
     stated = [] if shape is None else [(str(k), str(v)) for k, v in shape.attrib.items()]
-    return _loaded(urdf_path, tuple(stated))
+    file = mesh_file(urdf_path, dict(stated).get("filename", ""))
+    written = None if file is None else file.stat().st_mtime_ns
+    return _loaded(urdf_path, tuple(stated), written)
 
 
 @lru_cache(maxsize=512)  # a CAD export has hundreds, which are read for each part of a model
-def _loaded(urdf_path: Path, shape: tuple[tuple[str, str], ...]) -> tuple[Array, IntArray]:
+def _loaded(
+    urdf_path: Path,
+    shape: tuple[tuple[str, str], ...],
+    written: int | None,  # when: another export is read again
+) -> tuple[Array, IntArray]:
     """Return corners and triangles of the scene in the file of a ``<mesh>``, scaled as it says."""
     import trimesh  # half a second: imported only for meshes
 

@@ -27,18 +27,27 @@ from legcal.machine.files import (
     motor_entries,
     yaml_text,
 )
+from legcal.machine.home import home_of_legs
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg
 from legcal.machine.loader import load_mechanism
 from legcal.machine.meshes import mesh_file
 from legcal.machine.model import Machine, readings_at
 from legcal.machine.origins import moved_arms, moved_origins
+from legcal.machine.parameters import (
+    geometries,
+    in_joint_frames,
+    parametrization_of,
+    vector_of,
+)
 from legcal.machine.rods import actuators_of
 from legcal.machine.topology import distinct_joint
 from legcal.machine.urdf import UrdfPatch, written
 
 CLOSES = 2.5e-9  # tolerance of home and the pose at its readings [mean leg lengths, rad]
 ROUNDING = 1e-15  # displacement that counts as none [mean leg lengths]
+RELOAD_TOLERANCE = 2.5e-11  # mean leg lengths, [rad] between reloaded and written parameters
+MAX_HOME_RESIDUAL = 0.2  # residual of calibrated legs at the nominal home [leg lengths]
 
 
 def mechanism_text(machine: Machine, urdf: str) -> str:
@@ -108,6 +117,42 @@ def _joint_of(machine: Machine, leg: Leg) -> str:
     chain = leg.urdf_chain
     fixed = (joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies)
     return distinct_joint(chain) or next(fixed)
+
+
+def urdf_of(yaml: Path) -> Path:
+    """Return the URDF beside the YAML of a written model."""
+    return yaml.with_suffix(".urdf")
+
+
+def write_calibrated(machine: Machine, legs: Sequence[Leg], yaml: Path) -> Machine:
+    """Write a machine with calibrated legs, and return it as loaded again.
+
+    Raises DidNotConverge if it does not load with these legs, or does not close near home.
+    """
+    start = f"{yaml}: the model could not be written: found"
+    write_urdf(machine, legs, urdf_of(yaml))
+    home = home_of_legs(machine, legs, MAX_HOME_RESIDUAL)
+    if home is None:
+        raise DidNotConverge(
+            f"{start} no closed pose of its legs near legcal.home, needed one; check legcal.home "
+            f"of {machine.yaml_path}, and the nominal model."
+        )
+    moved = None if home is machine.home else home
+    write_calibrated_yaml(machine, yaml, urdf_of(yaml).name, moved, legs)
+    loaded = reload_and_check(yaml)
+    parametrization = parametrization_of(loaded, twists=True)
+    wanted = in_joint_frames(legs, machine.frame_legs)
+    difference = vector_of(parametrization, geometries(loaded), wanted) - vector_of(
+        parametrization, wanted, wanted
+    )
+    unit = np.where([unit == "m" for unit in parametrization.units], machine.size, 1.0)
+    error = float(np.abs(difference / unit).max())
+    if not error <= RELOAD_TOLERANCE:
+        raise DidNotConverge(
+            f"{start} that its parameters, loaded again, differ by {error:.1e} leg lengths or rad "
+            f"from the computed ones, needed at most {RELOAD_TOLERANCE:.0e}; please report this."
+        )
+    return loaded
 
 
 def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None:

@@ -18,7 +18,7 @@ the sections of their leg that they enclose.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -240,6 +240,7 @@ ROUND = 0.02  # largest deviation of a section from a circle, and of radii, rela
 SECTIONS = 200  # across a mesh
 _SAMPLED = 10  # every so many are cut first: most meshes are round nowhere
 _MIN_CORNERS = 11  # of a section: fewer are a prism, as of a hexagonal spacer
+_SAME_AXIS = 10  # decimals of axes that are one [m]
 _MIN_LENGTH = 2.0  # of a cylinder, in its radii
 
 
@@ -261,6 +262,7 @@ def with_mesh_cylinders(
     With a *radius* [m] each leg without a cylinder of its own gets one of it.
     """
     axes = _axes(legs, bodies, base)
+    cut: dict[Hashable, tuple[float, float, float] | None] = {}  # legs that are alike share a mesh
     added: dict[str, list[str]] = {}
     parts: dict[tuple[str, str, float], list[str]] = {}  # legs by mesh, diameter, length
     for link in urdf.robot().findall("link"):
@@ -269,7 +271,7 @@ def with_mesh_cylinders(
             found = [
                 (part, visual)
                 for visual in link.findall("visual")
-                if (part := _round_part(urdf.path, visual, bodies.T_body_link[name], axis))
+                if (part := _round_part(urdf.path, visual, bodies.T_body_link[name], axis, cut))
             ]
             if not found:
                 continue
@@ -359,9 +361,16 @@ def _drawn(bodies: Bodies, link: str, axis: Axis, radius: float) -> str:
 
 
 def _round_part(
-    urdf_path: Path, visual: etree._Element, T_body_link: Array, axis: Axis
+    urdf_path: Path,
+    visual: etree._Element,
+    T_body_link: Array,
+    axis: Axis,
+    cut: dict[Hashable, tuple[float, float, float] | None],
 ) -> tuple[float, float, float] | None:
-    """Return radius, start and end [m] of the longest cylinder of a mesh about an axis, or None."""
+    """Return radius, start and end [m] of the longest cylinder of a mesh about an axis, or None.
+
+    *cut* are those by mesh and axis in its file: a mesh is cut once about one axis.
+    """
     mesh = visual.find("geometry/mesh")
     if mesh is None or mesh_file(urdf_path, mesh.get("filename", "")) is None:
         return None
@@ -370,9 +379,14 @@ def _round_part(
     except ValueError:  # pictures state the reason
         return None
     T = matrix_inverse(matrix_product(T_body_link, origins_of([visual])[0]))
-    turn = rotation_between(T[:3, :3] @ axis.along, np.array([0.0, 0.0, 1.0])).as_matrix()
-    seen = (corners - matrix_applied(T, axis.origin)) @ turn.T
-    return cylinder_about_z(seen, triangles, axis.start, axis.end)
+    origin, along = matrix_applied(T, axis.origin), T[:3, :3] @ axis.along
+    line = np.round([*origin, *along, axis.start, axis.end], _SAME_AXIS)
+    key = *sorted(mesh.attrib.items()), line.tobytes()
+    if key not in cut:
+        turn = rotation_between(along, np.array([0.0, 0.0, 1.0])).as_matrix()
+        seen = (corners - origin) @ turn.T
+        cut[key] = cylinder_about_z(seen, triangles, axis.start, axis.end)
+    return cut[key]
 
 
 def cylinder_about_z(
@@ -723,23 +737,10 @@ def _caster(mesh: Occluder) -> Any:
     return ray_caster(mesh.corners, mesh.triangles)
 
 
-def visual_solids(urdf: Urdf) -> list[VisualSolid]:
-    """Return the readable boxes, spheres, cylinders and meshes of a tree.
-
-    The meshes of a link are one: a CAD export draws each of its screws.
-    """
-    shown = [
-        (link.get("name", ""), visual, shape)
-        for link in urdf.robot().findall("link")
-        for visual in link.findall("visual")
-        for shape in visual.findall("geometry/*")
-    ]
-    solids, meshes = list[VisualSolid](), dict[str, list[tuple[Array, IntArray]]]()
-    for (link, visual, shape), T in zip(shown, origins_of([v for _, v, _ in shown]), strict=True):
-        if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
-            with suppress(ValueError):  # it hides nothing; pictures state the reason
-                mesh = read_mesh(urdf.path, visual)
-                meshes.setdefault(link, []).append(mesh)
+def shapes_of(urdf: Urdf) -> list[VisualSolid]:
+    """Return the readable boxes, spheres and cylinders of a tree."""
+    solids = list[VisualSolid]()
+    for link, _, shape, T in _shown(urdf):
         corners = _corners(str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
         if corners is not None:
             cylinder = None
@@ -747,12 +748,36 @@ def visual_solids(urdf: Urdf) -> list[VisualSolid]:
                 sizes = float(shape.get("radius", "")), float(shape.get("length", ""))
                 cylinder = VisualCylinder(link, T, *sizes)
             solids.append(VisualSolid(link, matrix_applied(T, corners), None, cylinder))
+    return solids
+
+
+def meshes_of(urdf: Urdf) -> list[VisualSolid]:
+    """Return the readable meshes of a tree, those of a link as one: CAD draws its screws."""
+    meshes: dict[str, list[tuple[Array, IntArray]]] = {}
+    for link, visual, shape, _ in _shown(urdf):
+        if shape.tag == "mesh" and mesh_file(urdf.path, shape.get("filename", "")) is not None:
+            with suppress(ValueError):  # it hides nothing; pictures state the reason
+                mesh = read_mesh(urdf.path, visual)
+                meshes.setdefault(link, []).append(mesh)
+    solids = list[VisualSolid]()
     for link, parts in meshes.items():
         first = np.cumsum([0, *(len(corners) for corners, _ in parts)])
         triangles = [k + shift for (_, k), shift in zip(parts, first, strict=False)]
         corners = np.concatenate([corners for corners, _ in parts])
         solids.append(VisualSolid(link, corners, np.concatenate(triangles)))
     return solids
+
+
+def _shown(urdf: Urdf) -> list[tuple[str, etree._Element, etree._Element, Array]]:
+    """Return the shapes of all visuals, with their link, visual and T_link_visual."""
+    shown = [
+        (link.get("name", ""), visual, shape)
+        for link in urdf.robot().findall("link")
+        for visual in link.findall("visual")
+        for shape in visual.findall("geometry/*")
+    ]
+    origins = origins_of([visual for _, visual, _ in shown])
+    return [(*one, T) for one, T in zip(shown, origins, strict=True)]
 
 
 def _corners(tag: str, sizes: Mapping[str, str]) -> Array | None:

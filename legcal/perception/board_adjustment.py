@@ -24,7 +24,7 @@ from legcal.data.corners import Corners
 from legcal.data.dataset import MIN_CORNERS
 from legcal.data.measurements import Measurements, row_names
 from legcal.data.reasons import Reason, Rejection
-from legcal.errors import DatasetError, NotVisible, Problem
+from legcal.errors import Cause, DatasetError, NotVisible, Problem
 from legcal.estimation.clusters import Clusters, clustered
 from legcal.estimation.loss import Huber
 from legcal.estimation.problem import (
@@ -349,19 +349,26 @@ def camera_poses_by_board(
 ) -> tuple[tuple[RigidTransform | None, ...], Corners]:
     """Return T_board_camera of all views by corners that are used, and corners without outliers.
 
-    A view whose images do not show the board has None. Raises NotVisible if that is a needed one,
-    or it is seen so that two poses explain it; DatasetError if corners are not those of this board
-    by the camera file, or the board moved between images of a view.
+    A view whose images do not show the board has None, and a single image of a camera in the hand
+    that no pose of the board explains; its corners are rejected. Raises NotVisible if a needed view
+    has None, or it is seen so that two poses explain it; DatasetError if corners are not those of
+    this board by the camera file, or the board moved between images of a view.
     """
     T_board_camera: list[RigidTransform | None] = []
     problems: dict[type[DatasetError] | type[NotVisible], list[Problem]] = {}
+    in_hand: list[Problem] = []  # of single images; the other ones may be right
     for v, view in enumerate(measurements.views):
         here = np.flatnonzero((measurements.view[corners.row] == v) & corners.used)
         pose = None
         try:
             pose = _joint_pose(view.name, corners.choose(here), board, measurements)
         except (DatasetError, NotVisible) as error:
-            if isinstance(error, DatasetError) or view.name in needed:
+            if isinstance(error, DatasetError) and view.hand_held:
+                in_hand += error.facts
+                wrong = measurements.view[corners.row] == v
+                why = Rejection(Reason.NO_BOARD_POSE, error.facts[0].found)
+                corners = corners.reject(wrong, [why] * len(corners))
+            elif isinstance(error, DatasetError) or view.name in needed:
                 problems.setdefault(type(error), []).extend(error.facts)
         else:
             if pose is None and view.name in needed:
@@ -381,6 +388,8 @@ def camera_poses_by_board(
         T_board_camera.append(None if pose is None else pose.T_camera_board[0].inv())
         if pose is not None:
             corners = _without_outliers(corners, here, pose)
+    if len(in_hand) > sum(T is not None for T in T_board_camera):
+        problems.setdefault(DatasetError, []).extend(in_hand)
     for kind, of_kind in problems.items():
         raise kind(of_kind)
     return tuple(T_board_camera), corners
@@ -474,7 +483,7 @@ def _joint_pose(
     rms = float(np.median(off)) / np.sqrt(2.0 * np.log(2.0))  # as of one coordinate
     limit = max(MAX_RESIDUAL_PX, MAX_RESIDUAL_SIGMA * float(np.median(corners.sigma_px)))
     if rms > limit:
-        found = f"{rms:.2g} px from the best pose of"
+        found = Cause("{:.2g} px from the best pose of", (rms,))
         raise DatasetError(_another_board(name, board, found, f"{limit:.2g} px"))
     if is_ambiguous(joint):
         raise NotVisible(
@@ -542,7 +551,7 @@ def _agree(one: AdjustedBoard, other: AdjustedBoard, shift_px: Array, limit: flo
     return bool(d @ np.linalg.solve(covariance, d) < limit)
 
 
-def _another_board(name: str, board: Board, found: str, needed: str) -> Problem:
+def _another_board(name: str, board: Board, found: str | Cause, needed: str) -> Problem:
     """Return the rejection of corners that do not fit this board with the camera file."""
     sizes = {
         "chessboard": "the numbers of squares",
@@ -551,7 +560,7 @@ def _another_board(name: str, board: Board, found: str, needed: str) -> Problem:
     }[board.kind]
     return Problem(
         f"view {name}: its camera could not be placed by the corners of the board",
-        f"{found} the {board.kind} of the dataset file",
+        Cause("{} the {} of the dataset file", (found, board.kind)),
         needed,
         f"check {sizes} there, and that the camera file is of this camera and lens",
         name=name,

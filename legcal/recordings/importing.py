@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from scipy.signal import correlate
 
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.dataset_file import listed
 from legcal.data.new_dataset import (
     DATASET_FOLDER,
     MIN_SIGMA,
@@ -136,6 +138,59 @@ class Import:
             views={view.name: view.block for view in self.views},
             written=[str(path) for path in written],
         ).document()
+
+
+def import_recordings(
+    sources: str | Path | Sequence[str | Path],
+    model: str | Path,
+    output: str | Path,
+    *,
+    cameras: str | Path | Sequence[str | Path],
+    readings: str | Path | Sequence[str | Path] = (),
+    lengths: bool = False,
+    offset: float | None = None,
+    force: bool = False,
+) -> Dataset:
+    """Make a dataset from recordings of a machine that rests at each pose, and load it.
+
+    Parameters
+    ----------
+    sources : path or sequence of path
+        A video, a ROS bag or a folder of images with times for each camera position; of a bag with
+        several cameras the topic of one: ``run.mcap:/left/image_raw``.
+    model : path or str
+        The nominal model, as for :func:`legcal.load_mechanism`.
+    output : path
+        The folder of the dataset.
+    cameras : path or sequence of str
+        Camera files: one of all views, or ``VIEW=FILE`` for each.
+    readings : path or sequence of path
+        One table with times for all recordings, or one for each; none for bags with joint states.
+    lengths : bool
+        The tables hold whole leg lengths.
+    offset : float, optional
+        Clock of the camera minus that of the readings [s]; otherwise found from the motion.
+    force : bool
+        Whether files that exist already are replaced.
+
+    Raises
+    ------
+    DatasetError, ModelError, UsageError
+        With one sentence for each problem.
+    OutOfResources
+        If the folder cannot be written.
+    """
+    plan = plan_import(
+        [Path(source) for source in listed(sources)],
+        model,
+        output,
+        readings=[Path(table) for table in listed(readings)],
+        cameras=listed(cameras),
+        lengths=lengths,
+        offset=offset,
+    )
+    write_import(plan, force=force)
+    return load_dataset(output)
 
 
 def plan_import(
@@ -319,7 +374,7 @@ def _changes(recording: Recording, progress: Report, name: str) -> tuple[Array, 
     return np.array(times), np.array(changes)
 
 
-def import_recordings(
+def write_import(
     plan: Import, *, force: bool = False, progress: Report = no_progress
 ) -> list[Path]:
     """Write the dataset of an import, complete or not at all; return its files but the images."""

@@ -122,6 +122,7 @@ def inspect_table(description: dict[str, Any]) -> Report:
         table(*columns_of_axes, rows=axes) if axes else None,
         [
             _home(description["home"]),
+            *_workspace(description),
             *_bodies(legs),
             Text(legend, style="dim"),
             *(f"note: {note}" for note in description["diagnostics"]),
@@ -200,6 +201,16 @@ def _home(home: dict[str, Sequence[float]]) -> str:
     turn = Rotation.from_quat(home["quat_xyzw"])
     angles = ", ".join(f"{degrees(x):z.3f}" for x in roll_pitch_yaw(turn.as_matrix()))
     return f"Home: platform at ({xyz}) mm in the base, roll pitch yaw ({angles}) deg."
+
+
+def _workspace(description: dict[str, Any]) -> list[str]:
+    """Return the limits of the platform, beside those of the motors, in one sentence."""
+    limits = []
+    if "reach" in description:
+        limits.append(f"within {1e3 * description['reach']:.2f} mm of the z axis of the base")
+    if "floor" in description:
+        limits.append(f"at or above z = {1e3 * description['floor']:z.2f} mm in the base")
+    return [f"The platform stays {' and '.join(limits)}."] if limits else []
 
 
 def _length(leg: dict[str, Any]) -> str:

@@ -816,7 +816,8 @@ def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str
     """Write a camera file in the form of a program; return lines that say what was done.
 
     The covariance of a camera that legcal calibrated is kept for ros, which alone can hold it. A
-    splined lens, which no other program reads, becomes the nearest one that the program has.
+    splined lens, which no other program reads, becomes the nearest one that the program has, and
+    one with k3 the nearest one of kalibr, which has none.
 
     Raises DatasetError if the camera file cannot be read; UsageError if the program has no such
     lens, or if another file stands there.
@@ -824,15 +825,18 @@ def convert_camera(path: Path, program: CameraProgram, output: Path) -> list[str
     CONVERTED.check_place(output)
     camera, block = read_camera(path), calibrated_block(path)
     lines = [f"written: {output}"]
+    why, spoken = "", {"kalibr": _SPOKEN[:1], "mrcal": _SPOKEN[1:]}.get(program, _SPOKEN)
     if not DISTORTION_MODELS[camera.model].is_of_opencv:
-        spoken = {"kalibr": _SPOKEN[:1], "mrcal": _SPOKEN[1:]}.get(program, _SPOKEN)
-        splined = camera.model
+        why = f"Only legcal reads the lens {camera.model}"
+    elif program == "kalibr" and camera.model == "plumb_bob" and any(camera.distortion[4:]):
+        why, spoken = "The lenses of kalibr have no k3", ("plumb_bob", "equidistant")
+    if why:
         ways = [_nearest(camera, model) for model in spoken]
         off_px = min(off for _, off in ways)
         camera = next(nearest for nearest, off in ways if off == off_px)
         lines.append(
-            f"Only legcal reads the lens {splined}: written as the nearest {camera.model}, at most "
-            f"{off_px:.2g} px off over the image."
+            f"{why}: written as the nearest {camera.model}, at most {off_px:.2g} px off over the "
+            "image."
         )
         if block:
             lines.append(f"Its covariance is left out; a session that is to use it needs {path}.")
@@ -853,9 +857,10 @@ _SIDES = 33, 25  # places along both sides of the image at which cameras are com
 
 
 def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
-    """Return the camera of a model that projects like a radial one, and how far it is off [px].
+    """Return the camera of a model that projects like another one, and how far it is off [px].
 
-    Least squares of pixels all over the image; the largest distance between them is returned.
+    Least squares of pixels all over the image; the largest distance between them is returned. Of
+    plumb_bob k3 stays zero.
     """
     pixels = camera.grid(*_SIDES)
     pixels = pixels[camera.reaches(pixels)]
@@ -865,13 +870,14 @@ def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
     radius = np.linalg.norm((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], axis=1)
     away = np.arctan(r) if DISTORTION_MODELS[model].is_fisheye else r
     times = radius / np.maximum(away, 1e-9)
-    powers = away[:, None] ** (2.0 * np.arange(1, 5))
+    powers = away[:, None] ** (2.0 * np.arange(1, 3 if model == "plumb_bob" else 5))
     if model == "rational_polynomial":  # times its denominator
         powers = np.hstack([powers[:, :3], -times[:, None] * powers[:, :3]])
     k = np.linalg.lstsq(powers, times - 1.0, rcond=None)[0]
     radial = k if model == "equidistant" else np.concatenate([k[:2], [0.0, 0.0], k[2:]])
     start = replace(camera, distortion=radial, model=model, covariance=None)
-    names = intrinsic_names(start)
+    numbers = dict(zip(intrinsic_names(start), intrinsic_values(start).tolist(), strict=True))
+    names = [name for name in numbers if (model, name) != ("plumb_bob", "k3")]
 
     def of(values: Array) -> Camera:
         return with_intrinsics(start, dict(zip(names, values.tolist(), strict=True)))
@@ -884,7 +890,7 @@ def _nearest(camera: Camera, model: DistortionModel) -> tuple[Camera, float]:
 
     from scipy.optimize import least_squares  # only where a camera is converted
 
-    values = intrinsic_values(start)
+    values = [numbers[name] for name in names]
     best = of(least_squares(residual, values, jac=jacobian, x_scale="jac", method="lm").x)
     return best, float(np.linalg.norm(best.distort(xy) - pixels, axis=1).max())
 
@@ -917,7 +923,7 @@ def camera_text(
         raise _no_such_lens(camera, program, "plumb_bob, rational_polynomial or thin_prism")
     lens = {"plumb_bob": "radtan", "equidistant": "equidistant"}.get(camera.model, "")
     if not lens or (lens == "radtan" and any(D[4:])):
-        raise _no_such_lens(camera, program, "radtan (plumb_bob with k3 = 0) or equidistant")
+        raise _no_such_lens(camera, program, "radtan (plumb_bob) or equidistant")
     block = {
         "cam_overlaps": [],
         "camera_model": "pinhole",

@@ -32,7 +32,10 @@ from legcal.machine.parameters import (
 )
 
 _MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
-_REMEDY = "add images from other directions, of other legs or at poses that differ more"
+_REMEDY = (
+    "add images from other directions, of other legs or at poses that differ more, or state what "
+    "is known: values with a prior, or tolerances (machine_kind) with --only all"
+)
 _MIN_SPREAD = 2.5e-12  # mean leg lengths: floor of the error of the nominal model
 
 
@@ -87,8 +90,7 @@ def undetermined_directions(normal: FitNormal) -> HeldDirections:
         description = _in_words(names, sparse_basis(basis)[0], problem.legs.names)
         raise NotIdentifiable(
             f"The fit is not determined: {len(basis)} of {len(names)} combinations of parameters "
-            f"are uncertain by more than a tenth of a leg length: {description}; {_REMEDY}, or "
-            "state known values with a prior."
+            f"are uncertain by more than a tenth of a leg length: {description}; {_REMEDY}."
         )
     weak: tuple[str, ...] = ()
     if len(
@@ -127,7 +129,7 @@ def refuse_undetermined_inliers(
         if accepted.all():
             raise NotIdentifiable(
                 f"The fit is not determined: at its minimum, {description} is uncertain by more "
-                f"than a tenth of a leg length; {_REMEDY}, or state known values with a prior."
+                f"than a tenth of a leg length; {_REMEDY}."
             )
         raise NotIdentifiable(
             f"The fit is not determined: without the rejected outlines, {description} is not "

@@ -21,7 +21,7 @@ from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.calibration.tuning import SCATTER_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
-from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
+from legcal.errors import Code, DidNotConverge, LegcalError, NotIdentifiable, Problem
 from legcal.estimation.solver import information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -66,7 +66,7 @@ def refuse_contradicted_priors(normal: FitNormal) -> None:
         for name, prior, estimate, apart in _contradicted(normal, names)
     ]
     if problems:
-        raise DidNotConverge(problems)
+        raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems])
 
 
 def _contradiction(
@@ -105,7 +105,7 @@ def refuse_contradicted_board(normal: FitNormal) -> None:
         if estimate.sigma <= _MAX_SCALE_SIGMA
     ]
     if problems:
-        raise DidNotConverge(problems)
+        raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems])
 
 
 def _contradicted(
@@ -188,7 +188,7 @@ def refuse_contradicted_values(
             if sigmas[k] > _SIGNIFICANT
         ]
         if problems:
-            raise DidNotConverge(problems)
+            raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems])
 
 
 def _fixed_by_choice(problem: FitProblem) -> tuple[str, ...]:

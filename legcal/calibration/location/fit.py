@@ -34,6 +34,7 @@ from legcal.calibration.location.frames import (
     kept_rows,
     residuals,
     tool_motions,
+    tool_motions_by_step,
 )
 from legcal.calibration.location.tool_poses import MIN_SIGMA, PoseNoise, ToolMeasurements
 from legcal.errors import NotIdentifiable
@@ -47,6 +48,7 @@ from legcal.estimation.problem import (
     all_free,
 )
 from legcal.estimation.solver import minimise
+from legcal.geometry.motions import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.configurations import random_poses
 
@@ -161,8 +163,12 @@ def _most_likely(
 
     def rows_of(state: _State) -> Residuals:
         by_step, by_model = _derivatives(pairs, state.frames, motions)
+        if motions is not None:
+            by_step = by_step + tool_motions_by_step(motions @ state.errors, state.frames, pairs)
+        left = residuals(state.frames, pairs)
+        by_step[:, 3:] += 0.5 * cross_matrices(left[:, 3:]) @ by_step[:, 3:]
         blocks = by_step[..., :6][..., _TURN_FIRST], by_step[..., 6:][..., _TURN_FIRST], by_model
-        r = by_model @ state.errors - residuals(state.frames, pairs)
+        r = by_model @ state.errors - left
         return Residuals.of(r, np.concatenate(blocks, axis=-1))
 
     n, k = len(pairs), 0 if motions is None else motions.shape[-1]

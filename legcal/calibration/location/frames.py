@@ -152,6 +152,19 @@ def tool_motions(motions: Array, frames: Array, pairs: PosePairs) -> Array:
     return np.concatenate([shift, turn], axis=1)
 
 
+def tool_motions_by_step(motion: Array, frames: Array, pairs: PosePairs) -> Array:
+    """Return the derivative of tool motions by platform motions (n, 6) by a step, (n, 6, 12).
+
+    Without it the fit creeps where measurements are far more precise than the model.
+    """
+    moved = tool_motions(motion[..., None], frames, pairs)[..., 0]
+    R_base, _, _, _ = components_of(frames)
+    J = np.zeros((len(pairs), 6, N_STEP))
+    J[:, :3, 3:6], J[:, 3:, 3:6] = -cross_matrices(moved[:, :3]), -cross_matrices(moved[:, 3:])
+    J[:, :3, 6:9] = R_base @ cross_matrices(motion[:, :3]) @ pairs.R
+    return J
+
+
 # The search
 
 

@@ -37,7 +37,7 @@ from legcal.machine.kinematics import forward_kinematics_many, platforms_in_base
 from legcal.machine.model import Machine
 from legcal.machine.parameters import geometries, parametrization_of
 
-MIN_SIGMA = 1e-9  # [m, rad]; no measurement is better, and files round
+MIN_SIGMA = 1e-8  # [m, rad]; no measurement is better, and files round
 MAX_ANGLE_SIGMA = 0.2  # [rad]; with a larger one the orientation was not measured
 FEWEST = 3  # poses with orientation that determine the frames
 FEWEST_POSITIONS = 4  # poses without orientation
