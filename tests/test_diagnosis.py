@@ -262,7 +262,7 @@ def test_a_board_of_another_size_is_named_without_further_guesses(
     keyed("dataset.yaml", board__square=1.04 * square)(folder)
     with pytest.raises(DidNotConverge, match="dimensions of the calibration board") as refused:
         calibrate(folder)
-    assert diagnosis.NONE_EXPLAINS not in refused.value.notes
+    assert NONE_EXPLAINS not in refused.value.notes
 
 
 @pytest.mark.parametrize(
