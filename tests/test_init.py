@@ -320,7 +320,7 @@ def test_readings_that_nobody_knows_stay_empty(tmp_path: Path) -> None:
 def test_a_camera_in_the_hand_and_its_board_are_written(tmp_path: Path) -> None:
     table(own_folder(tmp_path, FLAT))
     assert "--hand-held" in init(tmp_path).said
-    spec = "charuco:7x5:36mm:27mm:DICT_4X4_50"
+    spec = "charuco:7x5:40mm:30mm:DICT_4X4_50"
     outcome = init(tmp_path, "--force", "--hand-held", "--board", spec)
     assert outcome.code == 0
     assert "--hand-held" not in outcome.said
