@@ -15,13 +15,13 @@ from hypothesis import settings as drawn
 from hypothesis import strategies as st
 from simulated import settings
 
-from legcal import Calibration, calibrate, simulate
+from legcal import Calibration, calibrate, check, simulate
 from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
 from legcal.data.dataset import load_dataset
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import USED, Reason, Rejection
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, NotIdentifiable
 from legcal.vision.board import FixedBoard
 
 __all__ = ["folder"]
@@ -78,10 +78,24 @@ def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
     (note,) = [note for note in found.notes if "left out" in note]
     assert note.startswith("view c1-3: ")
     assert re.search(r"found [234]\.?\d* px from the best pose of the chessboard", note)
-    without = calibrate(folder, leave_out="c1-3").solution.estimates
+    without = calibrate(folder, output=tmp_path / "out", leave_out="c1-3").solution.estimates
     assert found.solution.estimates.values == pytest.approx(without.values, abs=1e-9)
+    assert note in calibrate(folder, leave_out="c1-1").notes
+    checked = check(folder, tmp_path / "out")
+    assert note in checked.notes
+    assert not checked.movement.moved
     with pytest.raises(DatasetError, match="view c1-3: its camera could not be placed"):
         calibrated([f"c1-{k}" for k in range(1, 9)] + ["c2-1"])
+
+
+def test_a_camera_in_the_hand_that_no_step_relates_to_the_machine_is_refused_for_that(
+    tmp_path: Path,
+) -> None:
+    """The board places all images to each other: none of them is to be taken again."""
+    chosen = settings(poses=5, board="chessboard", hand_held=True)
+    simulate("linear-delta", tmp_path / "d", chosen)
+    with pytest.raises(NotIdentifiable, match=r"no camera could be placed.*T_base_board"):
+        calibrate(tmp_path / "d")
 
 
 # The table of corners.

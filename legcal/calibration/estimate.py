@@ -156,7 +156,7 @@ def fit_outlines(
             "each view in dataset.yaml, so that it relies on readings."
         )
     if steps is None:
-        steps = four_steps(fitted, fitted_outlines, board, options)
+        steps = four_steps(fitted, fitted_outlines, placement, board, options)
     fitted_outlines, board = without_lost_images(fitted, fitted_outlines, placement, steps, board)
     fitted.progress("Joint fit", 0, 1)
     choices = options.choices

@@ -45,13 +45,19 @@ class Steps:
 
 
 def four_steps(
-    data: OrderedDataset, outlines: Outlines, board: BoardViews | None, options: Options
+    data: OrderedDataset,
+    outlines: Outlines,
+    placement: Placement,
+    board: BoardViews | None,
+    options: Options,
 ) -> Steps:
     """Run the four steps; a failure is returned, since the joint fit may not need them.
 
-    If only the later steps fail, the result contains the cameras alone.
+    If only the later steps fail, the result contains the cameras alone. Where the steps are left
+    out, they still place the cameras that nothing else does.
     """
-    if options.criteria is None:
+    criteria = options.criteria
+    if criteria is None and None not in placement.T_base_camera:
         return Steps(None, None, "They were left out.")
     data.progress("Four steps", 0, 1)
     measurements = data.measurements
@@ -65,18 +71,20 @@ def four_steps(
             axes, measurements, T_first_camera, new_view = in_one_camera(
                 axes, measurements, board.T_board_camera
             )
-        base = run_base_steps(nominal, axes, measurements, criteria=options.criteria)
+        base = run_base_steps(nominal, axes, measurements, criteria=criteria or "default")
         cameras = tuple(base.T_Rb_camera)
         if joined:
             moved = zip([cameras[v] for v in new_view.tolist()], T_first_camera, strict=True)
             cameras = tuple(
                 T if T is None or T_first is None else T * T_first for T, T_first in moved
             )
+        if criteria is None:
+            return Steps(None, cameras, "They were left out.")
         try:
             platform = run_platform_steps(
                 base,
                 measurements,
-                criteria=options.criteria,
+                criteria=criteria,
                 free_twists=any(name.endswith(".twist") for name in options.choices.free),
             )
         except (NotIdentifiable, DidNotConverge) as failure:
@@ -105,18 +113,17 @@ def without_lost_images(
 ) -> tuple[Outlines, BoardViews | None]:
     """Reject outlines and corners of single images, from a camera in the hand, that nothing places.
 
-    Other views are needed: :func:`starts` says what would place them.
+    Other views are needed: :func:`starts` says what would place them. So are images that the board
+    places to each other.
     """
     staged = steps.T_Rb_camera or placement.T_base_camera
-    lost = np.array(
-        [
-            view.hand_held and T is None and of_steps is None
-            for view, T, of_steps in zip(
-                data.measurements.views, placement.T_base_camera, staged, strict=True
-            )
-        ],
-        dtype=np.bool_,
-    )[data.measurements.view]
+    of_board = placement.T_base_camera if board is None else board.T_board_camera
+    places = zip(placement.T_base_camera, staged, of_board, strict=True)
+    is_lost = [
+        view.hand_held and all(T is None for T in of_view)
+        for view, of_view in zip(data.measurements.views, places, strict=True)
+    ]
+    lost = np.array(is_lost, dtype=np.bool_)[data.measurements.view]
     if board is not None and lost.any():
         of_lost = np.isin(board.corners.row, data.rows[lost])
         board = replace(board, corners=board.corners.reject(of_lost, Reason.NOT_PLACED))

@@ -224,6 +224,8 @@ def calibrate(
     on_images = notes_beside(
         found.diagnosis, (*found.image_notes, *found.fit_notes), "legcal calibrate"
     )
+    here = dataset_at(dataset, fitted)
+    corners = None if found.corners is None else found.corners.at(fitted)
     notes = [
         *(one.sentence for one in found.diagnosis),
         *dataset.notes,
@@ -235,16 +237,16 @@ def calibrate(
         *found.fitted.unreached_notes(),
         *_own_zero_notes(dataset, found.solution),
         *([f"Left out, as asked: {leave_out}."] if leave_out else ()),
-        *board_notes(dataset, found.solution, found.corners),
+        *board_notes(here, found.solution, corners),
         *found.solution.notes,
         *exact_cameras(dataset, choices),
     ]
     calibration = judge(
-        dataset_at(dataset, fitted),
+        here,
         found.solution,
         found.steps,
         notes,
-        corners=None if found.corners is None else found.corners.at(fitted),
+        corners=corners,
         held_out=prediction,
         diagnosis=found.diagnosis,
         group=group,

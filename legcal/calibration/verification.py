@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from legcal.brief import brief
+from legcal.calibration.board import board_notes
 from legcal.calibration.diagnosis import notes_beside
 from legcal.calibration.documents import (
     CheckDocument,
@@ -386,13 +387,15 @@ def check(
             "any image, needed some; take images that show the legs."
         )
         raise NotVisible([refusal, *estimate.image_notes])
-    solution = estimate.in_file_order().solution
+    found = estimate.in_file_order()
+    solution = found.solution
     answer = _compare(dataset, earlier, solution, prior, significance)
     sentences = (diagnosis.sentence for diagnosis in estimate.diagnosis)
     on_images = (*estimate.image_notes, *estimate.fit_notes)
     of_images = notes_beside(estimate.diagnosis, on_images, "legcal calibrate --check")
     known = "These images appear to be those of the earlier calibration itself: take new ones."
-    notes = (*sentences, *dataset.notes, *of_images, *solution.notes)
+    of_boards = board_notes(dataset, solution, found.corners)
+    notes = (*sentences, *dataset.notes, *of_images, *of_boards, *solution.notes)
     notes = (*[known] * (answer.movement.p_value > 1.0 - _BY_CHANCE), *notes)
     return replace(answer, notes=tuple(dict.fromkeys(notes)))
 
