@@ -198,6 +198,19 @@ def test_a_search_that_is_stopped_writes_its_best_and_says_so(
     assert any("stopped" in note for note in document["notes"])
 
 
+def test_a_machine_without_motors_is_planned_too(tmp_path: Path) -> None:
+    """The strut of constant length carries the scale."""
+    simulate("hexapod-strut", tmp_path / "d", SimulationSettings(level=Level.OUTLINES, poses=2))
+    model = tmp_path / "d/models/hexapod-strut.yaml"
+    keyed(model.name, name_mot=[])(model.parent)
+    found = legcal.plan(model, images=18, noise=WHITE, stop=lambda: True, workers=1)
+    write_session(found, tmp_path / "session")
+    dataset = load_dataset(tmp_path / "session", check_images=False)
+    assert len(dataset.machine.motors) == 0
+    assert dataset.measurements.n_rows == 18
+    assert found.error is None
+
+
 def test_a_better_known_machine_is_what_more_images_and_a_given_session_make(
     planned: Plan, shot: Path
 ) -> None:

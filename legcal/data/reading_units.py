@@ -221,7 +221,7 @@ def stated_sigma(legs: Sequence[Leg], sigma_q: Array) -> float | dict[str, float
     sigma_of = {str(legs[j].prismatic): float(sigma_q[j]) for j in motors}
     if len({*sigma_of.values()}) > 1 or any(legs[j].reads_angle for j in motors):
         return sigma_of
-    return float(sigma_q[motors[0]])
+    return float(sigma_q[motors[0] if motors else 0])
 
 
 def are_commands(leg: Leg, unit: ReadingUnit | None = None) -> bool:
