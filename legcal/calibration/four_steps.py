@@ -114,16 +114,16 @@ def without_lost_images(
     """Reject outlines and corners of single images, from a camera in the hand, that nothing places.
 
     Other views are needed: :func:`starts` says what would place them. So are images that the board
-    places to each other.
+    places to each other, and all where none is placed.
     """
     staged = steps.T_Rb_camera or placement.T_base_camera
     of_board = placement.T_base_camera if board is None else board.T_board_camera
     places = zip(placement.T_base_camera, staged, of_board, strict=True)
-    is_lost = [
-        view.hand_held and all(T is None for T in of_view)
-        for view, of_view in zip(data.measurements.views, places, strict=True)
-    ]
-    lost = np.array(is_lost, dtype=np.bool_)[data.measurements.view]
+    in_hand = np.array([view.hand_held for view in data.measurements.views], dtype=np.bool_)
+    is_lost = in_hand & [all(T is None for T in of_view) for of_view in places]
+    if np.array_equal(is_lost, in_hand):
+        return outlines, board
+    lost = is_lost[data.measurements.view]
     if board is not None and lost.any():
         of_lost = np.isin(board.corners.row, data.rows[lost])
         board = replace(board, corners=board.corners.reject(of_lost, Reason.NOT_PLACED))
@@ -176,16 +176,18 @@ def _start_cameras(
         on_platform = [row in board.T_camera_board for row in data.rows.tolist()]
         needed |= set(data.measurements.view[on_platform].tolist())
     unknown = [
-        view.name
-        for v, view in enumerate(data.measurements.views)
-        if v in needed and cameras[v] is None
+        view for v, view in enumerate(data.measurements.views) if v in needed and cameras[v] is None
     ]
     if unknown:
+        remedies = ["add a rough T_base_camera to dataset.yaml"]
+        if all(view.hand_held for view in unknown):  # such a view has none
+            remedies = [] if data.dataset.board_on("base") else ["put a board on the base"]
+        if data.dataset.board_on("base"):
+            remedies.append("add a rough T_base_board to the block board of dataset.yaml")
         raise NotIdentifiable(
-            f"{few_views(unknown)}: no camera could be placed: found no "
+            f"{few_views([view.name for view in unknown])}: no camera could be placed: found no "
             "T_base_camera, and the four steps do not locate it "
             f"({steps.failure or 'fewer than three base joints are seen'}); needed one of them; "
-            "add a rough T_base_camera to dataset.yaml"
-            + (", or T_base_board to its block board." if data.dataset.board_on("base") else ".")
+            f"{', or '.join(remedies)}."
         )
     return [T if T is not None else RigidTransform.identity() for T in cameras]

@@ -156,7 +156,8 @@ def shortest_order(machine: Machine, poses: Configurations, begin: Array) -> lis
     lower, upper = motor_travel(machine)
     q = np.concatenate([begin[None], poses.configurations])[:, columns]
     q = q / (upper - lower)
-    distance = np.pad(np.abs(q[:, None] - q).max(axis=2, initial=0.0), (0, 1))  # the end is near all
+    distance = np.abs(q[:, None] - q).max(axis=2, initial=0.0)
+    distance = np.pad(distance, (0, 1))  # the end is near all
     order, remaining = [0], set(range(1, len(q)))
     while remaining:
         order.append(min(remaining, key=lambda k: (distance[order[-1], k], k)))
