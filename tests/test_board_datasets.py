@@ -1,5 +1,6 @@
 """Datasets with a board: views of a camera in the hand, and the table ``corners.csv``."""
 
+import json
 import re
 import tempfile
 from collections.abc import Container
@@ -10,6 +11,7 @@ import pytest
 from boards import CHARUCO, LENS
 from csv_rows import read_rows, write_rows
 from dataset_folder import Folder, folder
+from edits import keyed
 from hypothesis import given
 from hypothesis import settings as drawn
 from hypothesis import strategies as st
@@ -96,6 +98,18 @@ def test_a_camera_in_the_hand_that_no_step_relates_to_the_machine_is_refused_for
     simulate("linear-delta", tmp_path / "d", chosen)
     with pytest.raises(NotIdentifiable, match=r"no camera could be placed.*T_base_board"):
         calibrate(tmp_path / "d")
+
+
+def test_a_right_board_is_not_accused_where_the_legs_hardly_tell_the_scale(tmp_path: Path) -> None:
+    """Readings are angles; the first minimum ends 0.1 % off in the scale, which counts 70 times."""
+    folder = tmp_path / "d"
+    chosen = settings(poses=8, views=3, seed=0, board="charuco", hand_held=True)
+    simulate("delta", folder, chosen)
+    truth = json.loads((folder / "truth/truth.json").read_text())["board"]["T_base_board"]
+    rough = {**truth, "xyz": [round(x + 0.004, 4) for x in truth["xyz"]]}
+    keyed("dataset.yaml", board__T_base_board=rough)(folder)
+    found = calibrate(folder, leave_out="c3-5").solution
+    assert found.estimates.values["board.scale"] == pytest.approx(1.0, abs=1e-4)
 
 
 # The table of corners.

@@ -259,7 +259,7 @@ def test_a_board_of_another_size_is_named_without_further_guesses(
     _try_only(("diameter for radius",), monkeypatch)
     folder = simulated(tmp_path / "set", "servo-hexapod", poses=5, board="chessboard").folder
     square = yaml.safe_load((folder / "dataset.yaml").read_text())["board"]["square"]
-    keyed("dataset.yaml", board__square=1.04 * square)(folder)
+    keyed("dataset.yaml", board__square=1.05 * square)(folder)
     with pytest.raises(DidNotConverge, match="dimensions of the calibration board") as refused:
         calibrate(folder)
     assert NONE_EXPLAINS not in refused.value.notes

@@ -363,7 +363,13 @@ def _refine_minimum(
     # The first minimum may hold directions that are open at its start
     normal = information(dataclasses.replace(first.linear, problem=problem), problem.loss)
     held = undetermined_directions(normal)
-    refuse_contradicted_board(normal)
+    try:
+        refuse_contradicted_board(normal)
+    except DidNotConverge:  # measurements that hardly tell the scale leave it where steps ended
+        weighted = first.linear.problem
+        settled = minimise(weighted, first.state, problem.loss, must_converge=False).linear
+        normal = information(dataclasses.replace(settled, problem=problem), problem.loss)
+        refuse_contradicted_board(normal)
     while True:
         try:
             fit = fit_in_rounds(problem, first, held)
