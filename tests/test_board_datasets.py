@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from simulated import settings
 
 from legcal import Calibration, calibrate, check, simulate
+from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
 from legcal.data.dataset import load_dataset
 from legcal.data.image_tables import canonical_order
@@ -98,6 +99,8 @@ def test_a_camera_in_the_hand_that_no_step_relates_to_the_machine_is_refused_for
     simulate("linear-delta", tmp_path / "d", chosen)
     with pytest.raises(NotIdentifiable, match=r"no camera could be placed.*T_base_board"):
         calibrate(tmp_path / "d")
+    notes = identifiability_of_dataset(load_dataset(tmp_path / "d")).notes
+    assert any(note.startswith("views c1-1, ") and "no T_base_camera" in note for note in notes)
 
 
 def test_a_right_board_is_not_accused_where_the_legs_hardly_tell_the_scale(tmp_path: Path) -> None:

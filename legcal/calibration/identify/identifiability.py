@@ -49,6 +49,7 @@ from legcal.calibration.joint_fit.predicted import (
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
+from legcal.data.measurements import few_views
 from legcal.data.outlines import join_outlines
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.estimation.uncertainty import compress, marginal_rows
@@ -495,11 +496,17 @@ def identifiability_of_dataset(
     analysis = _analysis_of(dataset, choices)
     session = analysis.session.with_outlines_of(dataset)
     analysis = replace(analysis, session=session, noise=noise)
-    report = _report_on(analysis, None)
-    if dataset.machine.is_determined:
-        return report
-    note = "The readings do not determine the poses of the images; random poses are used instead."
-    return report.model_copy(update={"notes": (*report.notes, note)})
+    report, m, notes = _report_on(analysis, None), dataset.measurements, list[str]()
+    unplaced = [m.view_names[v] for v in np.unique(m.view) if m.views[v].T_base_camera is None]
+    if unplaced:
+        notes.append(
+            f"{few_views(unplaced)}: no T_base_camera; assumed where the camera would see the legs."
+        )
+    if not dataset.machine.is_determined:
+        notes.append(
+            "The readings do not determine the poses of the images; random poses are used instead."
+        )
+    return report.model_copy(update={"notes": (*report.notes, *notes)})
 
 
 def _analysis_of(dataset: Dataset, choices: Choices) -> Analysis:
