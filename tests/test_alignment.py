@@ -133,6 +133,10 @@ def test_a_camera_in_the_hand_is_told_from_one_on_a_tripod() -> None:
     assert not is_moved(bumped.__getitem__, rows)
     plain = taken(np.full_like(texture(0), 110.0), still)
     assert not is_moved(plain.__getitem__, rows)
+    few = [*in_hand[:3], *plain[3:]]
+    assert not is_moved(few.__getitem__, rows)
+    strips = [image[:20] for image in in_hand]
+    assert not is_moved(strips.__getitem__, rows)
 
 
 def test_photographs_without_a_common_background_are_refused_as_taken_in_the_hand(
