@@ -67,8 +67,9 @@ def check_arguments(name: str, annotations: Mapping[str, Any], given: Mapping[st
         if argument not in annotations or _fits(value, annotations[argument]):
             continue
         needed, remedy = dict.fromkeys(_in_words(annotations[argument])), "correct it"
-        if "Machine" in needed and hasattr(type(value), "machine"):  # a calibration
-            remedy = "give its .machine, or the folder of its output"
+        if "Machine" in needed and "machine" in dir(value):  # a calibration, or a dataset
+            folder = ", or the folder that calibrate wrote" * ("a path" in needed)
+            remedy = f"give its .machine{folder}"
         elif "Machine" in needed and isinstance(value, str | os.PathLike):
             remedy = "load it with legcal.load_mechanism"
         wrong.append(

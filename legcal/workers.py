@@ -181,9 +181,6 @@ _ONE_THREAD = (  # variables for the number of threads, read when a process load
     "VECLIB_MAXIMUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
-# glibc gives large blocks back to the system, which clears each page of the next one again, unless
-# a larger one was freed before [bytes]
-_LARGE_BLOCK = 16 * 2**20
 
 
 class _Processes(ProcessPoolExecutor):
@@ -237,7 +234,6 @@ def _end_with(held: connection.Connection, lifeline: connection.Connection | Non
     pool's processes would then wait for work for ever. A forked process has a copy of that end.
     """
     leave_interrupts_to_parent()
-    bytearray(_LARGE_BLOCK)
     if lifeline is not None:
         lifeline.close()
     Thread(target=_wait_for_end, args=(held,), daemon=True).start()

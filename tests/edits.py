@@ -112,13 +112,13 @@ def each_row(name: str, change: Callable[[dict[str, str]], object]) -> Edit:
 
 def cell(name: str, row: int | None, /, **cells: str) -> Edit:
     """Change cells of a row of a table, counted from 1; of all rows without one."""
-    return table(
-        name,
-        lambda rows: [
-            line | cells if row in {None, number} else line
-            for number, line in enumerate(rows, start=1)
-        ],
-    )
+
+    def changed(rows: Rows) -> Rows:
+        assert cells.keys() <= rows[0].keys(), f"{name} has no {cells.keys() - rows[0].keys()}"
+        numbered = enumerate(rows, start=1)
+        return [line | cells if row in {None, k} else line for k, line in numbered]
+
+    return table(name, changed)
 
 
 def doubled(name: str) -> Edit:

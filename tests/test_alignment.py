@@ -1,8 +1,10 @@
 """Cameras that do not stand still between the images of a view: their moves, by the background."""
 
 import shutil
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from simulated import settings, small_camera, standing
 
 from legcal import calibrate, detect, load_dataset, simulate
 from legcal.calibration.diagnosis import NONE_EXPLAINS
+from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.measurements import Measurements, View
 from legcal.data.photograph_notes import notes_on_moves
 from legcal.errors import NotVisible
@@ -28,6 +31,8 @@ from legcal.workers import in_turn
 WIDTH, HEIGHT, N = 640, 480, 7
 K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
 CORNERS = np.array([[x, y, 1.0] for x in (-320.0, 320.0) for y in (-240.0, 240.0)])
+S = TypeVar("S")
+T = TypeVar("T")
 SIZES = np.array([1.0, 1.0, 1e-3, 1e-3, 2e-6, 2e-6])
 
 
@@ -133,6 +138,10 @@ def test_a_camera_in_the_hand_is_told_from_one_on_a_tripod() -> None:
     assert not is_moved(bumped.__getitem__, rows)
     plain = taken(np.full_like(texture(0), 110.0), still)
     assert not is_moved(plain.__getitem__, rows)
+    few = [*in_hand[:3], *plain[3:]]
+    assert not is_moved(few.__getitem__, rows)
+    strips = [image[:20] for image in in_hand]
+    assert not is_moved(strips.__getitem__, rows)
 
 
 def test_photographs_without_a_common_background_are_refused_as_taken_in_the_hand(
@@ -148,6 +157,21 @@ def test_photographs_without_a_common_background_are_refused_as_taken_in_the_han
     assert "in the hand" in str(refused.value)
     assert "hand_held: true" in str(refused.value)
     assert NONE_EXPLAINS not in refused.value.notes
+
+
+def test_processes_decode_all_photographs(tmp_path: Path) -> None:
+    """Decoding colours starts threads of OpenCV: a process that has them is not forked."""
+    views = standing("hexapod", 1, small_camera(tmp_path, WIDTH, HEIGHT))
+    shot = settings(level=Level.PHOTOGRAPHS, views=views, poses=5)
+    dataset, decoded = load_dataset(simulate("hexapod", tmp_path / "s", shot).folder), list[Any]()
+
+    def pool(task: Callable[[S], T], rows: Iterable[S], /) -> Iterable[T]:
+        asked = list(rows)
+        decoded.extend(asked)
+        return map(task, asked)
+
+    order_dataset(dataset, pool, no_progress)
+    assert decoded == list(range(5))
 
 
 def test_the_note_on_moves_counts_the_corners() -> None:

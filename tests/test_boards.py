@@ -380,6 +380,14 @@ def test_a_board_that_moved_in_an_image_is_named_with_how_far() -> None:
     )
 
 
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_a_view_from_the_hand_is_not_taken_for_another_board(n: int) -> None:
+    turns = Rotation.from_euler("z", np.linspace(0.0, 2.5, n)[:, None])
+    places = [before(CHARUCO, 0.6) * RigidTransform.from_rotation(turn) for turn in turns]
+    with pytest.raises(DatasetError, match=r"^view c1: .* elsewhere in .*; write hand_held: true"):
+        camera_poses_by_board(_corners(CHARUCO, places), CHARUCO, _measurements((n,)))
+
+
 OTHER_LENS = replace(LENS, K=LENS.K * np.array([[0.6], [1.0], [1.0]]))
 
 

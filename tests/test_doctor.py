@@ -10,11 +10,12 @@ from command_line import run
 from edits import each_row
 from hexapod_example import Spoiled, spoiled
 from photograph_files import exif, jpeg, undecodable_png
-from simulated import simulated
+from simulated import settings, simulated, small_camera
 
-from legcal import doctor
+from legcal import doctor, simulate
 from legcal.calibration.detection import CHECKS, Examination, Finding
 from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis
+from legcal.simulation.settings import Level
 
 pytestmark = pytest.mark.usefixtures("without_remedies")
 
@@ -143,8 +144,28 @@ def test_what_was_tried_in_vain_is_said_only_where_legs_are_missing(
     monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
     session = spoiled(tmp_path / "set", 3, ("c1", "c3"))
     assert NONE_EXPLAINS not in [one.what for one in doctor(session.write()).findings]
-    session.entry["views"]["c3"]["T_base_camera"]["xyz"] = [2.0, 2.0, 2.0]
+    session.change("c1", 0, lambda picture: 0 * picture)
+    assert NONE_EXPLAINS not in [one.what for one in doctor(session.write()).findings]
+    session.change("c3", 1, lambda picture: 0 * picture)
     assert NONE_EXPLAINS in [one.what for one in doctor(session.write()).findings]
+
+
+def test_a_photograph_in_the_hand_that_is_not_placed_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+    camera = small_camera(tmp_path, 480, 360)
+    shot = settings(
+        level=Level.PHOTOGRAPHS, views=1, poses=5, camera=camera, board="charuco", hand_held=True
+    )
+    folder = simulate("hexapod", tmp_path / "set", shot).folder
+    names = sorted((folder / "images").rglob("*.png"))
+    severities = []
+    for name in names[:2]:
+        cv2.imwrite(str(name), np.zeros((360, 480), dtype=np.uint8))
+        found = [one for one in doctor(folder).findings if "could not be placed" in one.what]
+        severities += [{one.severity for one in found}]
+    assert severities == [{"warning"}, {"error"}]
 
 
 def test_datasets_without_photographs_are_judged_by_what_they_have(tmp_path: Path) -> None:

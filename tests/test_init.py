@@ -13,7 +13,7 @@ from photograph_files import exif, jpeg
 from simulated import files_of, small_camera
 
 from legcal import load_dataset
-from legcal.vision.board import board_of
+from legcal.vision.board import board_document, board_of
 from legcal.vision.image_file import camera_of_photographs, read_facts
 
 PICTURE = np.zeros((48, 64), np.uint8)
@@ -327,7 +327,7 @@ def test_a_camera_in_the_hand_and_its_board_are_written(tmp_path: Path) -> None:
     dataset = load_dataset(tmp_path / "dataset")
     assert len(dataset.measurements.views) == dataset.measurements.n_rows == len(FLAT)
     (board,) = dataset.boards
-    assert (board.link, board.board) == ("base", board_of(spec))
+    assert (board.link, board_document(board.board)) == ("base", board_document(board_of(spec)))
 
 
 def test_without_a_camera_file_photographs_that_state_a_focal_length_give_a_rough_camera(

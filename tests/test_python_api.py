@@ -185,7 +185,16 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
         (lambda: public.evaluate(3, machine), "found 3 (int) as model, needed a text or a path"),
         (lambda: public.evaluate(machine, folder, dataset=0), "found 0 (int) as dataset"),
         (lambda: public.plot_machine("hexapod"), "(str) as machine, needed Machine; load it"),
-        (lambda: public.plot_machine(example_run.calibration), "needed Machine; give its .machine"),
+        (lambda: public.plot_machine(example_run.calibration), "Machine; give its .machine."),
+        (lambda: public.plot_machine(legcal.load_result(folder)), "Machine; give its .machine."),
+        (
+            lambda: public.export(example_run.calibration, "csv", tmp_path / "x"),
+            "give its .machine, or the folder that calibrate wrote.",
+        ),
+        (
+            lambda: public.inverse_kinematics(example_run.calibration, None),
+            "found a Calibration, needed a Machine; give its .machine.",
+        ),
         (lambda: public.calibrate(example, holdout="a"), "as holdout, needed a number or None;"),
         (lambda: public.new(family="delta", rod_length="0.2"), "as rod_length, needed a number"),
         (lambda: public.Follower("hexapod"), "found a str, needed a Machine"),

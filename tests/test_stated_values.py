@@ -157,12 +157,13 @@ def _sized(seen: BoardCorners, factor: float) -> BoardCorners:
     return replace(seen, boards=(other,))
 
 
-def test_a_board_of_other_dimensions_is_refused() -> None:
+@pytest.mark.parametrize("of_photographs", [False, True])
+def test_a_board_of_other_dimensions_is_refused(*, of_photographs: bool) -> None:
     session = machine_session("hexapod")
     seen, start = with_board(session, corners_of(session, seed=8))
     wrong = _sized(seen, 1.02)
     with pytest.raises(DidNotConverge, match=r"board contradict .* measure the bo") as refusal:
-        session.noisy(7).fit(start, board=wrong)
+        session.noisy(7).fit(start, board=wrong, choices=Choices(of_photographs=of_photographs))
     size = float(str(refusal.value).split("the board is ")[1].split(" times")[0])
     assert size == pytest.approx(1.0 / 1.02, rel=3e-3)
 

@@ -308,6 +308,9 @@ def test_images_most_of_whose_outlines_disagree_are_named(tmp_path: Path) -> Non
     (notes,) = outlier_images(_with_rejected(o, o.row == 1)).items()
     assert notes[0] == 1
     assert re.match(r"\d+ of its \d+ outlines disagree with the fit and were left", str(notes[1]))
+    assert "check its readings" in str(notes[1])
+    (in_hand,) = outlier_images(_with_rejected(o, o.row == 1), [1]).values()
+    assert "no board places its camera" in str(in_hand)
     for legs, edges in (((0,), ()), ((0, 1), ()), ((0,), (1,))):
         wrong = (o.row == 1) & (np.isin(o.leg, legs) | np.isin(o.edge, edges))
         assert outlier_images(_with_rejected(o, wrong)) == {}

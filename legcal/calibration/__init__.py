@@ -6,7 +6,7 @@ recognises and measures the legs, runs the four steps (``four_steps``) and the j
 (``joint_fit``), measures again (sections 3.1 to 3.5), judges the accuracy of the platform
 (``verdict``) and writes the result (``result_folder``). The output is a :class:`Calibration` and
 its document :class:`Result`, which ``check`` (``verification``) reads back.
-``doctor`` and ``detect`` (``doctor``, ``examination``) and ``check`` use the same phases;
+``doctor`` and ``detect`` (``doctor``, ``detection``) and ``check`` use the same phases;
 ``evaluate`` (eq 20), ``calibrate_camera`` and ``locate`` are independent. The output of ``--json``
 is a document model for each job.
 """

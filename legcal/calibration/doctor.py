@@ -37,6 +37,7 @@ from legcal.calibration.detection import (
     write_detection,
 )
 from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, notes_beside
+from legcal.calibration.doubts import MAX_LEFT_OUT
 from legcal.calibration.estimate import unseen_legs
 from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit.parameter_choices import Choices
@@ -141,7 +142,7 @@ def doctor(
         views = _conditions(dataset, exposures, detection)
         if detection is not None:
             _look_at_legs(checklist, detection, views, choices)
-        if tried == () and (detection is None or checklist.state("legs") in ("error", "warning")):
+        if tried == () and _explains_little(checklist, detection, views):
             checklist.add("mistakes", "note", NONE_EXPLAINS)
         examination = Examination(
             dataset=str(dataset.folder),
@@ -520,8 +521,13 @@ def _look_at_legs(
         f"{sum(view.legs_visible or 0 for view in views)} found, "
         f"{np.count_nonzero(outlines.used)} of {len(outlines)} outlines can be used"
     )
+    m = detection.dataset.measurements
+    n_images = dict(zip(m.view_names, np.bincount(m.view).tolist(), strict=True))
+    # A few images of a camera in the hand are left out, as single images of other views are
+    is_few = len(detection.unplaced) <= MAX_LEFT_OUT * m.n_rows
+    is_left_out = is_few and all(n_images[name] == 1 for name in detection.unplaced)
     for message in unplaced_notes(detection.unplaced):
-        checklist.add("legs", "error", message)
+        checklist.add("legs", "warning" if is_left_out else "error", message)
     texts = {text.what for text in checklist.findings}
     new_notes = [text for text in detection.image_notes if text not in texts]
     for message in notes_beside(checklist.diagnosis, new_notes, "legcal doctor"):
@@ -540,6 +546,16 @@ def _look_at_legs(
                 "detect, and improve light and background.",
             )
     _check_remaining_images(checklist, detection, choices)
+
+
+def _explains_little(
+    checklist: _Checklist, detection: Detection | None, views: Sequence[ViewCondition]
+) -> bool:
+    """Whether so many images or legs are not found that a mistake may be the cause."""
+    if detection is None or checklist.state("legs") == "error":
+        return True
+    few = any((v.legs_found or 0) < FEW_LEGS * (v.legs_visible or 0) for v in views)
+    return few or len(detection.left_out) > MAX_LEFT_OUT * len(detection.rows)
 
 
 def _check_remaining_images(checklist: _Checklist, detection: Detection, choices: Choices) -> None:

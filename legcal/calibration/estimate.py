@@ -19,7 +19,7 @@ likelihood is flat, the first gamma stays.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -36,6 +36,7 @@ from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementS
 from legcal.calibration.ordered_dataset import Options, OrderedDataset
 from legcal.calibration.tuning import GAMMA_SIGMA, LIMB_BIAS_PX
 from legcal.data.corners import Corners
+from legcal.data.landmarks import LANDMARKS_NAME
 from legcal.data.measurements import Measurements, few_views, image_notes
 from legcal.data.outlines import (
     Outlines,
@@ -91,7 +92,10 @@ class Estimate:
     @cached_property
     def outliers(self) -> dict[int, Cause]:
         """Causes for images that contradict the fit, by row."""
-        return outlier_images(self.solution.outlines)
+        m, boards = self.fitted.measurements, self.solution.posterior.problem.boards
+        shown = np.concatenate([np.zeros(0, dtype=np.intp), *(board.view for board in boards)])
+        lone = (np.bincount(m.view)[m.view] == 1) & ~np.isin(m.view, shown)
+        return outlier_images(self.solution.outlines, np.flatnonzero(lone).tolist())
 
     def in_file_order(self) -> Estimate:
         """Return a copy with legs, views and images in the order of the files."""
@@ -107,10 +111,11 @@ class Estimate:
         )
 
 
-def outlier_images(outlines: Outlines) -> dict[int, Cause]:
+def outlier_images(outlines: Outlines, lone: Collection[int] = ()) -> dict[int, Cause]:
     """Return the images most of whose outlines a fit rejects, of two legs all, by row.
 
-    Wrong readings of photographs are told before any fit, where legs are recognised.
+    Wrong readings of photographs are told before any fit, where legs are recognised. *lone* images
+    have a camera pose of their own, by their legs alone.
     """
     rejected, causes = outlines.rejected_for(Reason.DISAGREES), dict[int, Cause]()
     for row in np.unique(outlines.row[rejected]).tolist():
@@ -119,12 +124,15 @@ def outlier_images(outlines: Outlines) -> dict[int, Cause]:
         legs = set(outlines.leg[judged & rejected].tolist())
         legs -= set(outlines.leg[judged & outlines.used].tolist())
         if n_out >= MIN_REJECTED * n and len(legs) >= MIN_REJECTED_LEGS:
-            causes[row] = Cause(
-                "{} of its {} outlines disagree with the fit and were left out; check its "
-                "readings, which image belongs to which row, and that nobody moved camera or "
-                "machine.",
-                (n_out, n),
+            remedy = (
+                "no board places its camera, and its legs may have placed it wrongly: show the "
+                f"board, or click its joints ({LANDMARKS_NAME})"
+                if row in lone
+                else "check its readings, which image belongs to which row, and that nobody moved "
+                "camera or machine"
             )
+            said = f"{{}} of its {{}} outlines disagree with the fit and were left out; {remedy}."
+            causes[row] = Cause(said, (n_out, n))
     return causes
 
 

@@ -45,7 +45,7 @@ from legcal.perception.alignment import camera_moves
 from legcal.perception.candidate_pairs import CandidatePairs
 from legcal.perception.photographs import Photographs
 from legcal.progress import Report
-from legcal.workers import Run, in_turn
+from legcal.workers import Run
 
 # largest leg residual that errors of a nominal model explain, relative to the mean leg length
 MAX_NOMINAL_RESIDUAL = 0.03
@@ -258,9 +258,7 @@ def _with_moves(dataset: Dataset, plan: DetectionPlan, pool: Run, progress: Repo
         is_read |= bool(dataset.boards) and dataset.corners is None
         rows = [row for row in rows_with_image(dataset).tolist() if is_read[row]]
         load = dataset.image_reader(range(m.n_rows))
-        # Photographs that stay decoded are read here: processes that are forked later have them.
-        run = in_turn if load.keeps(rows) else pool
-        found = camera_moves(load, m, rows, run, progress)
+        found = camera_moves(load, m, rows, pool, progress)
         moves = {m.image[row]: move for row, move in found.items()}
     notes = (*dataset.file_notes, *notes_on_moves(m, moves))
     return replace(dataset, moves=moves, file_notes=notes) if moves else dataset

@@ -104,7 +104,6 @@ class Finding:
     sigma: float
     # the images, or views, before and after a change; None where it is of all images
     between: tuple[str, str] | None
-    p_value: float  # probability of such a score by chance, times the number of tests
     # (p, c): the error of the kinematic parameters of the fit without the number, as in the
     # parametrization of its problem; of noise, c independent errors
     steps: Array
@@ -323,7 +322,7 @@ def _tests(
         solved = scores.solved([number.test for number in lacking])
         lacking, _ = _forward_selection(scores, solved, len(tests))
     named = [number for number in lacking if number.test.of.kind != "camera_file"]
-    findings = [fit.finding(number, measurements, len(tests)) for number in named]
+    findings = [fit.finding(number, measurements) for number in named]
     if noise is not None:
         findings.append(fit.scattering(noise, hypotheses))
     least_slips = {motor: float(np.median(sizes)) for motor, sizes in slips.items()}
@@ -810,7 +809,7 @@ class _Fit:
                     least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 
-    def finding(self, number: _Solved, measurements: Measurements, n_tests: int) -> Finding:
+    def finding(self, number: _Solved, measurements: Measurements) -> Finding:
         """Return a number that the fit lacks."""
         test, hypothesis = number.test, number.test.of
         holds = test.holds.astype(np.float64)[:, None]
@@ -819,7 +818,6 @@ class _Fit:
             self._changed(number),
             *_size(number),
             test.between,
-            number.p_value * n_tests,
             self._effect(hypothesis, holds, number.amount[:, None]),
             _side(measurements, self.course, test),
         )
@@ -859,7 +857,6 @@ class _Fit:
             noise.ratio * noise.stated,
             sigma_of_ratio * noise.stated,
             None,
-            noise.p_value,
             np.hstack(steps),
             stated=noise.stated,
         )

@@ -165,10 +165,6 @@ class ImageReader:
         levels, move = _decoded(path, self.cameras[k], self.places[k]), self.moves[k]
         return levels if move is None else move.undone(levels.astype(np.float32))
 
-    def keeps(self, images: Sequence[int]) -> bool:
-        """Whether a process that reads some images, of 8 bits, has all of them decoded then."""
-        return sum(self.cameras[k].width * self.cameras[k].height for k in images) <= MAX_KEPT
-
 
 _Decoded = NDArray[np.uint8] | Grey
 _kept = OrderedDict[tuple[str | int, ...], _Decoded]()  # by file; the last used at the end

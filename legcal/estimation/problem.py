@@ -286,7 +286,6 @@ class Sparsity:
     groups: _Groups
     columns: IntArray  # (n_groups, m) columns in x; n_kept for fixed coordinates
     element: IntArray | None  # (n,)
-    n_kept: int
     # ((n_kept + 2 + d) * n_elements, n_cells * (m + 1 + d)) adds [J, r, J_element]^T J_element of
     # cells to the rows of kept unknowns, of fixed coordinates, of the gradient, and of elements
     to_elements: csc_array | None
@@ -315,7 +314,7 @@ def _sparsity(
 ) -> Sparsity:
     """Build the matrix that sums the products of cells."""
     if element is None:
-        return Sparsity(groups, columns, None, n_kept, None)
+        return Sparsity(groups, columns, None, None)
     (n_elements, d), n_groups = sizes, len(columns)
     first_of_cell = slice(None, None, groups.cell)
     order = slice(None) if groups.order is None else groups.order
@@ -327,7 +326,7 @@ def _sparsity(
     summing = csc_array(
         (np.ones(n_products), target.ravel(), np.arange(n_products + 1)), shape=shape
     )
-    return Sparsity(groups, columns, element, n_kept, summing)
+    return Sparsity(groups, columns, element, summing)
 
 
 @dataclass(frozen=True, eq=False)

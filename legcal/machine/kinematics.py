@@ -321,9 +321,11 @@ def _disagreement(
 def _check_machine(machine: object) -> None:
     """Raise UsageError unless it is a machine."""
     if not isinstance(machine, Machine):
+        has_one = "machine" in dir(machine)
+        remedy = "give its .machine" if has_one else "load it with legcal.load_mechanism"
         raise UsageError(
             f"The machine could not be used: found a {type(machine).__name__}, needed a Machine; "
-            "load it with legcal.load_mechanism."
+            f"{remedy}."
         )
 
 

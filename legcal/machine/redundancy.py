@@ -83,7 +83,6 @@ class Contradiction:
     """Readings of a pose that no platform pose can have together."""
 
     legs: tuple[int, ...]  # legs of which one motor reads wrong, by increasing error
-    off: float  # error of the first reading relative to the others [m or rad]
     distances: tuple[float, ...]  # error of each if it alone is wrong, as joint motion [m]
     allowed: float  # largest error of the first if readings agree, as joint motion [m]
 
@@ -162,7 +161,6 @@ def contradictions(
         i = alike[0]
         by_pose[pose] = Contradiction(
             tuple(machine.motors[motor] for motor in alike),
-            float(off[k, i] * sigma_m[i] * unit[i]),
             tuple(distance[alike].tolist()),
             float(REJECTION * sigma_m[i] / np.sqrt(redundancy[k, i])),
         )

@@ -27,7 +27,8 @@ out. :func:`measure_photographs` measures again near any Placement, as that of a
       v
     Placement, Outlines, rejections -> joint fit -> Placement -> outline, once more
 
-Beside them: corners of calibration boards (``board_corners`` by ``corner_lattice``)
-and where boards stand (``board_adjustment``), ``agreement`` of images with assumptions on a
-session, ``overlays``. ``tuning`` has the numbers on which most depends.
+Beside them: ``alignment`` of images whose camera did not stand still, corners of calibration boards
+(``board_corners`` by ``corner_lattice``) and where boards stand (``board_adjustment``),
+``agreement`` of images with assumptions on a session, ``overlays``. ``tuning`` has the numbers on
+which most depends.
 """

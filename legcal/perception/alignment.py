@@ -99,20 +99,25 @@ def camera_moves(
 
 
 def is_moved(load: Load, rows: Sequence[int]) -> bool:
-    """Return whether images one after the other share no background, as of a camera in the hand."""
+    """Return whether images one after the other share no background, as of a camera in the hand.
+
+    Where most of them show too little of a background, nobody knows.
+    """
     if len(rows) < MIN_IMAGES:
         return False
-    squares = [_squares(load, row)[:, MARGIN:-MARGIN, MARGIN:-MARGIN] for row in rows]
+    inner = slice(MARGIN, -MARGIN)
+    squares = [_squares(load, row)[:, inner, inner] for row in rows[:MOST_IMAGES]]
     if len({len(own) for own in squares}) > 1:
         return False
-    flat = np.stack([own.reshape(len(own), -1) for own in squares])
+    flat = np.stack(squares).reshape(len(squares), -1, SIDE**2)
     flat = flat - flat.mean(axis=2, keepdims=True)
     spread = flat.std(axis=2)
     shown = np.minimum(spread[1:], spread[:-1]) > SHOWS
     alike = np.mean(flat[1:] * flat[:-1], axis=2) > ALIKE * spread[1:] * spread[:-1]
     n = np.count_nonzero(shown, axis=1)
-    share = np.count_nonzero(shown & alike, axis=1)[n >= MIN_SQUARES] / n[n >= MIN_SQUARES]
-    return bool(len(share) and np.median(share) < LEAST_ALIKE)
+    told = n >= MIN_SQUARES
+    share = np.count_nonzero(shown & alike, axis=1)[told] / n[told]
+    return bool(2 * len(share) > len(n) and np.median(share) < LEAST_ALIKE)
 
 
 def _known(rows: Sequence[int], found: Sequence[Move | None]) -> dict[int, Move]:

@@ -477,7 +477,8 @@ def _joint_pose(
         for row, poses in of_row.items()
         if poses
     }
-    _require_still(name, single, scale, board, camera, row_names(measurements))
+    of_image = [_scale(pose, corners.choose(corners.row == row)) for row, pose in single.items()]
+    _require_still(name, single, max(of_image), board, camera, row_names(measurements))
     # Corners that no pose of this board explains.
     off = np.linalg.norm(best.residual, axis=1)
     rms = float(np.median(off)) / np.sqrt(2.0 * np.log(2.0))  # as of one coordinate
@@ -511,10 +512,10 @@ def _require_still(
 ) -> None:
     """Refuse images of a view in which the board stands elsewhere than in most of them.
 
-    ``single`` are the poses of single images, by row; residuals are ``scale`` times the standard
-    deviations of corners; ``names`` are those of the rows.
+    ``single`` are the poses of single images, by row, from which residuals are up to ``scale``
+    times the standard deviations of corners; ``names`` are those of the rows.
     """
-    rows = list(single)
+    rows, remedy = list(single), "leave those images out, or give them a view of their own"
     if len(rows) < 2:
         return
     limit = float(chdtri(6, SIGNIFICANCE / len(rows))) * scale**2
@@ -529,14 +530,15 @@ def _require_still(
         return
     moves = [T[rows[most]].inv() * T[row] for row in others]
     middle = board.points.mean(axis=0)
+    if 2 * len(others) >= len(rows):
+        remedy = f"write hand_held: true for the view if its camera was in the hand, else {remedy}"
     far = max(float(np.linalg.norm(move.apply(middle) - middle)) for move in moves)
     turn = max(float(move.rotation.magnitude()) for move in moves)
     raise DatasetError(
         f"view {name}: its camera could not be placed: found the board elsewhere in "
         f"{few([names[row] for row in others])} than in {names[rows[most]]}, by up to "
         f"{1e3 * far:.2g} mm and {np.rad2deg(turn):.2g} degrees, needed a camera and a board that "
-        "stand still in all images of a view; leave those images out, or give them a view of "
-        "their own."
+        f"stand still in all images of a view; {remedy}."
     )
 
 

@@ -581,10 +581,15 @@ def _without_weak_views(
         if group.hint is not None or T[group.views[0]] is None or is_sure:
             continue
         n, n_images = 0 if fit is None else int(fit.n_outlines.sum()), len(group.rows)
+        remedy = "add images at other readings, in better light, or a rough T_base_camera"
+        if len(group.views) > 1:
+            remedy = (
+                "check the dimensions of the board in dataset.yaml, by which these views stand to "
+                "each other; else add images in better light"
+            )
         why = Cause(
             "its camera could not be placed: found only {} outlines that agree in its {} image"
-            f"{'s' * (n_images != 1)}, needed more than other edges give by chance; add images at "
-            "other readings, in better light, or a rough T_base_camera.",
+            f"{'s' * (n_images != 1)}, needed more than other edges give by chance; {remedy}.",
             (n, n_images),
         )
         unplaced |= group.not_placed(search.measurements, why)

@@ -87,15 +87,15 @@ def _contradiction(
     )
 
 
-def refuse_contradicted_board(normal: FitNormal) -> None:
-    """Refuse a calibration board whose dimensions in the dataset contradict the measurements.
+def contradicted_boards(normal: FitNormal) -> list[Problem]:
+    """Return calibration boards whose dimensions in the dataset contradict the measurements.
 
     Encoders and radii carry the scale too. A board with a stated prior is tested with the priors.
-    *normal* is the information at a first minimum.
+    *normal* is the information at a minimum.
     """
     board_of = {board_scale(link): "" if link == "base" else f" on the {link}" for link in LINKS}
     names = board_of.keys() - normal.problem.choices.priors.keys()
-    problems = [
+    found = [
         f"The dimensions of the calibration board{board_of[name]} contradict the readings and the "
         f"legs: the board is {estimate.mean:.4g} times the size stated in the dataset "
         f"({apart:.0f} standard deviations; assumed accuracy {1e2 * prior.sigma:.2g} %); "
@@ -104,8 +104,7 @@ def refuse_contradicted_board(normal: FitNormal) -> None:
         for name, prior, estimate, apart in _contradicted(normal, names)
         if estimate.sigma <= _MAX_SCALE_SIGMA
     ]
-    if problems:
-        raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems])
+    return [Problem(one, code=Code.BAD_VALUE) for one in found]
 
 
 def _contradicted(

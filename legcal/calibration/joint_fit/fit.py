@@ -21,7 +21,7 @@ from legcal.calibration.joint_fit.determinacy import (
 from legcal.calibration.joint_fit.diagnostics import (
     arms_of_other_widths,
     blaming_stated_values,
-    refuse_contradicted_board,
+    contradicted_boards,
     refuse_contradicted_priors,
     refuse_contradicted_values,
     rejected_notes,
@@ -363,21 +363,28 @@ def _refine_minimum(
     # The first minimum may hold directions that are open at its start
     normal = information(dataclasses.replace(first.linear, problem=problem), problem.loss)
     held = undetermined_directions(normal)
-    try:
-        refuse_contradicted_board(normal)
-    except DidNotConverge:  # measurements that hardly tell the scale leave it where steps ended
+    contradicted = contradicted_boards(normal)
+    if contradicted:  # measurements that hardly tell the scale leave it where steps ended
         weighted = first.linear.problem
         settled = minimise(weighted, first.state, problem.loss, must_converge=False).linear
-        normal = information(dataclasses.replace(settled, problem=problem), problem.loss)
-        refuse_contradicted_board(normal)
+        at_minimum = information(dataclasses.replace(settled, problem=problem), problem.loss)
+        contradicted = contradicted_boards(at_minimum)
+    # Edges of photographs may share errors, by which radii seem to contradict a board: they are
+    # estimated in the rounds
+    if contradicted and not problem.choices.of_photographs:
+        raise DidNotConverge(contradicted)
     while True:
         try:
             fit = fit_in_rounds(problem, first, held)
             normal = information(fit.minimum.linear, problem.loss)
+            if contradicted and (still := contradicted_boards(normal)):
+                raise DidNotConverge(still)
             refuse_undetermined_inliers(normal, held, fit.accepted)
             _refuse_other_radii(problem, fit.state)
             break
         except (DidNotConverge, NotIdentifiable) as failure:
+            if contradicted:
+                raise DidNotConverge(contradicted) from None
             within, at = held_at_nominal(problem, first.state, held)
             if len(held.basis):
                 at = first_minimum(within, at, must_converge=False).state
