@@ -4,6 +4,7 @@ import json
 import re
 import tempfile
 from collections.abc import Container
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,13 @@ from edits import keyed
 from hypothesis import given
 from hypothesis import settings as drawn
 from hypothesis import strategies as st
-from simulated import settings
+from simulated import settings, simulated
 
 from legcal import Calibration, calibrate, check, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
 from legcal.data.dataset import load_dataset
+from legcal.data.image_choice import image_sequences
 from legcal.data.image_tables import canonical_order
 from legcal.data.measurements import Measurements, View
 from legcal.data.reasons import USED, Reason, Rejection
@@ -177,3 +179,18 @@ def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path)
     assert corners.used.tolist() == [True, True, False]
     write_corners(tmp_path / "again.csv", corners, MEASUREMENTS)
     assert "c2,a.png,5,,,,rejected,hidden,edited" in (tmp_path / "again.csv").read_text()
+
+
+def test_a_camera_in_the_hand_has_one_order_of_images(tmp_path: Path) -> None:
+    made = simulated(
+        tmp_path / "set", "hexapod", views=1, poses=24, board="charuco", hand_held=True
+    )
+    dataset = load_dataset(made.folder, check_images=False)
+    m = dataset.measurements
+    (sequence,) = image_sequences(m, {})
+    assert len(sequence) == m.n_rows == 24
+    q = m.q.copy()
+    q[sequence[10:], 1] += 1e-3
+    doubt = calibrate(replace(dataset, measurements=replace(m, q=q))).doubts[0]
+    assert doubt.code == "encoder"
+    assert "leg2" in doubt.what

@@ -42,16 +42,19 @@ def image_sequences(
     """Return the rows in the order of their images, one array for each order that is known.
 
     Times order the images of all views; *taken_at* has those of files by image, as EXIF writes
-    them. Numbers in names order the images of one view: nothing says which view came first.
-    The order of rows in the table has no meaning.
+    them. Numbers in names order the images of one view, or of one camera in the hand: nothing says
+    which view came first. The order of rows in the table has no meaning.
     """
     times = _times(measurements, taken_at)
     if times is not None:
         return (np.argsort(times, kind="stable"),)
     names = row_names(measurements)
-    sequences = []
-    for v in range(len(measurements.views)):
-        rows = np.flatnonzero(measurements.view == v)
+    cameras = [
+        view.name.rpartition("-")[0] if view.hand_held else view.name for view in measurements.views
+    ]
+    of_row, sequences = np.array(cameras)[measurements.view], []
+    for camera in dict.fromkeys(cameras):
+        rows = np.flatnonzero(of_row == camera)
         numbers = _numbers([names[row] for row in rows.tolist()])
         if numbers is not None:
             sequences.append(rows[np.argsort(numbers)])
