@@ -247,12 +247,14 @@ class _Judge:
     def in_the_rest(self) -> list[Mistake]:
         """Return readings shifted from where images cease to agree: a row too many, or missing.
 
-        In several views, of which the last may agree nowhere.
+        Through the rest of several views, of which the last may agree nowhere; in the rest of one
+        view they are among those of some images.
         """
         in_file = np.argsort(self.data.order.rows, kind="stable")
         agrees = np.isin(in_file, self.own.row[self.own.agrees])
         first = 1 + int(np.argmax(np.cumsum(np.where(agrees, 1, -1))))
-        if len(self.groups) == 1 or len(in_file) - first < MIN_IMAGES or not agrees[:first].any():
+        n_views = len(np.unique(self.data.measurements.view[in_file[first:]]))
+        if n_views < 2 or len(in_file) - first < MIN_IMAGES or not agrees[:first].any():
             return []
         return shifted_from(self.data, self.given, first)
 
