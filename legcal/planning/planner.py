@@ -21,6 +21,7 @@ from legcal.calibration.joint_fit.predicted import (
     Contributions,
     Predictor,
     fitted_covariance,
+    joined,
     predicted_outlines,
 )
 from legcal.errors import NotIdentifiable, NotVisible
@@ -378,13 +379,10 @@ def choose_places(
         replace(part, rows=np.sqrt(share) * part.rows).of_shared()
         for part, share in zip((*shown, *given), shares, strict=True)
     ]
-    names: dict[str, int] = {}
-    columns = [[names.setdefault(name, len(names)) for name in part.names] for part in parts]
-    information = np.zeros((len(parts), len(names), len(names)))
-    prior = np.zeros((len(names), len(names)))
+    columns, prior = joined(parts)
+    information = np.zeros((len(parts), *prior.shape))
     for of_part, part, at in zip(information, parts, columns, strict=True):
         of_part[np.ix_(at, at)] = part.rows[0].T @ part.rows[0]
-        prior[np.ix_(at, at)] = part.prior
     p, free_places = shown[0].basis.shape[1], information[: len(shown)]
     base = prior + information[len(shown) :].sum(axis=0)
 

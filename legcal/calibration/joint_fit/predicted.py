@@ -92,11 +92,6 @@ class Contributions:
     at_site: Array  # (n_images, r) variances of what photographs of a site share, in the rows
     site: IntArray  # (n_images,)
 
-    @property
-    def prior(self) -> Array:
-        """Prior information, (m, m)."""
-        return self.known.T @ self.known
-
     def gains(self, images: IntArray, number: IntArray) -> Array:
         """Return the rows (n, r, m) that images add as that many-th ones of their sites."""
         shared, number = self.at_site[images], np.reshape(number, (-1, 1))
