@@ -377,8 +377,6 @@ def _refine_minimum(
         try:
             fit = fit_in_rounds(problem, first, held)
             normal = information(fit.minimum.linear, problem.loss)
-            if contradicted and (still := contradicted_boards(normal)):
-                raise DidNotConverge(still)
             refuse_undetermined_inliers(normal, held, fit.accepted)
             _refuse_other_radii(problem, fit.state)
             break
@@ -397,6 +395,8 @@ def _refine_minimum(
                     raise blaming_stated_values(problem, failure) from None
                 raise
             held = more
+    if contradicted and contradicted_boards(normal):
+        raise DidNotConverge(contradicted)
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(problem, start, first.state, with_priors=True)
     refuse_contradicted_priors(normal)
