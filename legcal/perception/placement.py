@@ -60,6 +60,8 @@ class Search:
     occluders: Sequence[Occluder] = ()  # occluders besides legs and arms
     still: Mapping[int, Still] = field(default_factory=dict)  # static background by view
     joint_error: float = JOINT_ERROR  # of the joints of the model, of the size
+    # (n_legs, 6, 6) of errors of A and B, where other views have shown them [m^-1]
+    shift_whitening: Array | None = None
 
     @property
     def n_legs(self) -> int:

@@ -43,8 +43,14 @@ from legcal.perception.placement import (
     Search,
     group_views,
 )
-from legcal.perception.tuning import EVIDENCE_RATIO
-from legcal.perception.view_fit import ViewFit, fit_view, min_evidence, refine_views
+from legcal.perception.tuning import EVIDENCE_RATIO, JOINT_ERROR
+from legcal.perception.view_fit import (
+    ViewFit,
+    fit_view,
+    min_evidence,
+    refine_views,
+    with_common_shift,
+)
 from legcal.workers import Run, in_turn
 
 MIRRORED_EDGES = 1.06  # legs along edges of mirrored images, over the original images
@@ -59,6 +65,7 @@ MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of
 # Of the evidence for a pose to that for any other one: where edge pairs are convincing by
 # themselves, of a single image, and from which on no margin is needed.
 RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
+KNOWN_JOINTS = 0.5 * JOINT_ERROR  # from which on a single image needs no greater ratio than others
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 TWO_POSES = (
     "its camera could not be placed: two poses explain its images about equally well ({:.1f} and "
@@ -112,7 +119,8 @@ def place_views(
     shift = np.zeros((len(T), n_legs, 2, 3))
     error: Array = np.full((len(T), n_legs), search.joint_error)
     place = run if unclear else in_turn
-    for group, (one, swapped) in zip(groups, place(partial(_placed, search), tasks), strict=True):
+    placed = _all_placed(search, tasks, place)
+    for group, (one, swapped) in zip(groups, placed, strict=True):
         if swapped or not one.is_convincing:
             alone = len(group.views) == 1 and not swapped
             moved = alone and is_moved(search.load, group.rows)
@@ -158,6 +166,44 @@ def _placed(search: Search, task: _Task) -> tuple[PoseCandidates, bool]:
     return best, _is_mirrored(search, group, pictures, best)
 
 
+def _all_placed(search: Search, tasks: Sequence[_Task], run: Run) -> list[tuple[PoseCandidates, bool]]:
+    """Return the cameras of all groups, and whether their images are mirrored.
+
+    What is left is placed by the joints as the groups that are placed show them: poses that look
+    alike from one image of a symmetric machine need other errors of its joints.
+    """
+    placed = list(run(partial(_placed, search), tasks))
+    while True:
+        left = [k for k, (one, swapped) in enumerate(placed) if swapped or not one.is_convincing]
+        if not left or len(left) == len(tasks):
+            return placed
+        at = [(tasks[k].group, one) for k, (one, _) in enumerate(placed) if k not in left]
+        fits = [fit for fit in run(partial(_fitted, search), at) if fit is not None]
+        shown, shift = with_common_shift(search, fits)
+        again = [_seen_by(shown, tasks[k]) for k in left]
+        n_left = len(left)
+        for k, (one, swapped) in zip(left, run(partial(_placed, shown), again), strict=True):
+            if one.is_convincing and not swapped:
+                poses = replace(one.poses, shift=one.poses.shift + shift)
+                placed[k], n_left = (replace(one, poses=poses), False), n_left - 1
+        if n_left == len(left):
+            return placed
+
+
+def _fitted(search: Search, placed: tuple[Group, PoseCandidates]) -> ViewFit | None:
+    """Return the fit of a group that is placed to outlines in a few of its images."""
+    group, one = placed
+    return _measure_at(search, replace(group, rows=group.some), one, 0).fit
+
+
+def _seen_by(search: Search, task: _Task) -> _Task:
+    """Return a task with the legs of another model predicted."""
+    pictures = {
+        row: search.picture(row, pairs=picture.pairs) for row, picture in task.pictures.items()
+    }
+    return task._replace(pictures=pictures)
+
+
 def _is_mirrored(
     search: Search, group: Group, pictures: Mapping[int, Picture], placed: PoseCandidates
 ) -> bool:
@@ -186,9 +232,9 @@ def _decided_by_outlines(
         return candidates
     few = replace(group, rows=group.some)
     trials = [_measure_at(search, few, candidates, 0)]
-    if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
+    if not (candidates.leads_clearly and _is_decided(search, trials, candidates, few)):
         trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
-        if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
+        if not (candidates.is_convincing and _is_decided(search, trials, candidates, few)):
             by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
             for i in np.argsort(-by_both, kind="stable")[:N_REFINED].tolist():
                 one = trials[i]
@@ -197,7 +243,7 @@ def _decided_by_outlines(
                     trials[i] = _Trial(again[0], again[1], again[2][0])
     best = _best(trials)
     fit = trials[best].fit
-    if fit is None or not _is_decided(trials, candidates, few):
+    if fit is None or not _is_decided(search, trials, candidates, few):
         return replace(candidates, by_outlines=False)
     pose = CameraPoses.one(fit.T_base_group, fit.shift)
     of_group = group.pictures(pictures, list(pictures))
@@ -277,7 +323,9 @@ def _best(trials: Sequence[_Trial]) -> int:
     return int(np.argmax([trial.evidence for trial in trials]))
 
 
-def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Group) -> bool:
+def _is_decided(
+    search: Search, trials: Sequence[_Trial], candidates: PoseCandidates, group: Group
+) -> bool:
     """Return whether outlines support one pose clearly more than any other."""
     best = _best(trials)
     others = [
@@ -286,7 +334,9 @@ def _is_decided(trials: Sequence[_Trial], candidates: PoseCandidates, group: Gro
         if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
     alone = len(group.rows) == 1
-    margin, ratio = (MARGIN_ALONE, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
+    margin, ratio = (MARGIN_ALONE if alone else MARGIN), EVIDENCE_RATIO
+    if alone and search.joint_error > KNOWN_JOINTS:
+        ratio = RATIO_ALONE
     fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False

@@ -38,6 +38,7 @@ from legcal.estimation.problem import (
 from legcal.estimation.solver import NormalEquations, information
 from legcal.geometry.covariances import whitener
 from legcal.geometry.lines import cross
+from legcal.geometry.motions import cross_matrices
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import main_cylinders
 from legcal.perception.outline import measure_outlines
@@ -145,10 +146,11 @@ def fit_view(
     weight = np.ones(lines.n_items)
     size, usual = search.size, search.joint_error * search.size
     joint_sigma, image_sigma = usual, IMAGE_SIGMA * size
+    known = search.shift_whitening
     try:
         linear = linearize(problem, state)
         for iteration in range(ITERATIONS):
-            normal = _normal_equations(linear, weight, joint_sigma, image_sigma)
+            normal = _normal_equations(linear, weight, _whitening(known, joint_sigma), image_sigma)
             step, _ = normal.step(0.0)
             distance = float(np.linalg.norm(state.pose.t))
             overshoot = max(
@@ -174,7 +176,7 @@ def fit_view(
                 )
     except NotVisible:
         return None
-    normal = _normal_equations(linear, weight, joint_sigma, image_sigma)
+    normal = _normal_equations(linear, weight, _whitening(known, joint_sigma), image_sigma)
     R = state.pose.R[0]
     T_group_base = RigidTransform.from_components(
         state.pose.t[0] - R @ middle, Rotation.from_matrix(R)
@@ -191,7 +193,7 @@ def fit_view(
         state.offset,
         np.sqrt(square / lines.size),
         middle,
-        _evidence(lines, linear["outlines"], state, max(joint_sigma, usual), size),
+        _evidence(lines, linear, state, _whitening(known, max(joint_sigma, usual)), size),
     )
 
 
@@ -261,21 +263,26 @@ def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -
 def _normal_equations(
     linear: Linearization[EstimationProblem[_State], _State],
     weight: Array,
-    joint_sigma: float,
+    of_shifts: Array,
     image_sigma: float,
 ) -> NormalEquations[EstimationProblem[_State], _State]:
-    """Return the normal equations with weights (n_items,) of legs in images, by sigmas of priors.
+    """Return the normal equations with weights (n_items,) of legs in images, by their priors.
 
-    A weight is that of all that an image says of a leg, the prior of its offset included.
+    ``of_shifts`` whitens shifts; the offsets in images have one standard deviation [m]. A weight is that of all that an image says of a leg, the prior of its offset included.
     """
     root = np.sqrt(weight)
     item = linear.problem.factor("outlines").element
     rows = {
         "outlines": linear["outlines"].whitened(root[item][:, None, None]),
         "offsets": linear["offsets"].whitened((root / image_sigma)[:, None, None]),
-        "shifts": linear["shifts"].whitened(np.asarray(1.0 / joint_sigma)),
+        "shifts": linear["shifts"].whitened(of_shifts),
     }
     return information(replace(linear, rows=rows))
+
+
+def _whitening(known: Array | None, joint_sigma: float) -> Array:
+    """Return what whitens shifts of joints: what is known of them, or one standard deviation."""
+    return np.asarray(1.0 / joint_sigma) if known is None else known
 
 
 def _squared_distances(
@@ -298,13 +305,53 @@ def _squared_distances(
 
 
 def _evidence(
-    lines: "_Lines", rows: Residuals, state: _State, joint_sigma: float, size: float
+    lines: "_Lines",
+    linear: Linearization[EstimationProblem[_State], _State],
+    state: _State,
+    of_shifts: Array,
+    size: float,
 ) -> float:
     """Return the evidence of outlines for a state, by leg and image."""
-    square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA * size)
+    square, _ = _squared_distances(lines, linear["outlines"], state.offset, IMAGE_SIGMA * size)
     n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
     of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
-    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint_sigma**2)
+    shifts = linear["shifts"].whitened(of_shifts).r
+    return float(of_legs - SHIFT_COST * np.sum(shifts**2))
+
+
+def with_common_shift(search: Search, fits: Sequence[ViewFit]) -> tuple[Search, Array]:
+    """Return the search with the joints where fits of several groups have them, and their shifts.
+
+    All groups show one machine: what the outlines of each say besides its prior adds up, to shifts
+    (n_legs, 2, 3) of A and B [m]. Motions of all joints as one body are the cameras'.
+    """
+    usual, n = search.joint_error * search.size, 6 * search.n_legs
+    N, b = np.eye(n) / usual**2, np.zeros(n)
+    for fit in fits:
+        inverse = np.linalg.inv(fit.covariance[6:, 6:])
+        N += inverse - np.eye(n) / fit.joint_sigma**2
+        b += inverse @ fit.shift.ravel()
+    A, B = search.A_base.mean(axis=0), search.B_base.mean(axis=0)
+    X = np.stack([A, B], axis=1).reshape(-1, 3)
+    turns = -cross_matrices(X - X.mean(axis=0)).reshape(n, 3)
+    rigid = np.linalg.qr(np.hstack([np.tile(np.eye(3), (len(X), 1)), turns]))[0]
+    own = np.eye(n) - rigid @ rigid.T
+    covariance = np.linalg.inv(N)
+    shift = (covariance @ b).reshape(search.n_legs, 2, 3)
+    legs = np.arange(search.n_legs)
+    of_legs = (own @ covariance @ own).reshape(search.n_legs, 6, search.n_legs, 6)[legs, :, legs]
+    of_legs += (IMAGE_SIGMA * search.size) ** 2 * np.eye(6)
+    u = (B - A) / np.linalg.norm(B - A, axis=1)[:, None]
+    ends = np.stack([of_legs[:, :3, :3], of_legs[:, 3:, 3:]], axis=1)
+    across = np.trace(ends, axis1=2, axis2=3) - np.einsum("li,leij,lj->le", u, ends, u)
+    moved = replace(
+        search,
+        A_base=search.A_base + shift[:, 0],
+        B_base=search.B_base + shift[:, 1],
+        joint_error=float(np.sqrt(across.mean() / 2.0)) / search.size,
+        shift_whitening=whitener(of_legs),
+    )
+    return moved, shift
 
 
 def min_evidence(group: Group) -> float:
