@@ -166,28 +166,29 @@ def _placed(search: Search, task: _Task) -> tuple[PoseCandidates, bool]:
     return best, _is_mirrored(search, group, pictures, best)
 
 
-def _all_placed(search: Search, tasks: Sequence[_Task], run: Run) -> list[tuple[PoseCandidates, bool]]:
+def _all_placed(
+    search: Search, tasks: Sequence[_Task], run: Run
+) -> list[tuple[PoseCandidates, bool]]:
     """Return the cameras of all groups, and whether their images are mirrored.
 
     What is left is placed by the joints as the groups that are placed show them: poses that look
     alike from one image of a symmetric machine need other errors of its joints.
     """
     placed = list(run(partial(_placed, search), tasks))
+    fits = dict[int, ViewFit | None]()
     while True:
         left = [k for k, (one, swapped) in enumerate(placed) if swapped or not one.is_convincing]
-        if not left or len(left) == len(tasks):
+        new = [k for k in range(len(tasks)) if k not in left and k not in fits]
+        if not left or not new:
             return placed
-        at = [(tasks[k].group, one) for k, (one, _) in enumerate(placed) if k not in left]
-        fits = [fit for fit in run(partial(_fitted, search), at) if fit is not None]
-        shown, shift = with_common_shift(search, fits)
-        again = [_seen_by(shown, tasks[k]) for k in left]
-        n_left = len(left)
-        for k, (one, swapped) in zip(left, run(partial(_placed, shown), again), strict=True):
+        at = [(tasks[k].group, placed[k][0]) for k in new]
+        fits |= dict(zip(new, run(partial(_fitted, search), at), strict=True))
+        shown, shift = with_common_shift(search, [fit for fit in fits.values() if fit is not None])
+        again = run(partial(_placed, shown), [_seen_by(shown, tasks[k]) for k in left])
+        for k, (one, swapped) in zip(left, again, strict=True):
             if one.is_convincing and not swapped:
                 poses = replace(one.poses, shift=one.poses.shift + shift)
-                placed[k], n_left = (replace(one, poses=poses), False), n_left - 1
-        if n_left == len(left):
-            return placed
+                placed[k] = replace(one, poses=poses), False
 
 
 def _fitted(search: Search, placed: tuple[Group, PoseCandidates]) -> ViewFit | None:

@@ -268,7 +268,8 @@ def _normal_equations(
 ) -> NormalEquations[EstimationProblem[_State], _State]:
     """Return the normal equations with weights (n_items,) of legs in images, by their priors.
 
-    ``of_shifts`` whitens shifts; the offsets in images have one standard deviation [m]. A weight is that of all that an image says of a leg, the prior of its offset included.
+    ``of_shifts`` whitens shifts; offsets in images have one standard deviation [m]. A weight is
+    that of all that an image says of a leg, the prior of its offset included.
     """
     root = np.sqrt(weight)
     item = linear.problem.factor("outlines").element
