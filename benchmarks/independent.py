@@ -1,7 +1,7 @@
 """Calibrations of photographs by a renderer that is not legcal's, against their truth.
 
     OMP_NUM_THREADS=1 python benchmarks/independent.py FOLDER... [--as none rough half ...]
-        [--worst 12] [--overlays FOLDER] [--lines FILE]
+        [--only GROUP] [--worst 12] [--overlays FOLDER] [--lines FILE]
 
 Datasets in the formats of the documentation; beside each FOLDER stands FOLDER-truth with
 ``models/`` and ``truth.json``: of every image the legs' true contours in the camera frame. Where
@@ -220,7 +220,13 @@ def click_joints(folder: Path, truth: Path) -> None:
         print(f"    {view.name}: clicks {1e3 * far:.1f} mm, {np.degrees(turned):.2f} deg off")
 
 
-def outcome(folder: Path, variant: str, overlays: Path | None, worst: int) -> Outcome:
+def outcome(
+    folder: Path,
+    variant: str,
+    overlays: Path | None = None,
+    worst: int = 0,
+    only: str | None = None,
+) -> Outcome:
     """Calibrate a variant of a dataset, and compare it with the truth."""
     truth = folder.with_name(folder.name + "-truth")
     with TemporaryDirectory() as scratch:
@@ -237,6 +243,7 @@ def outcome(folder: Path, variant: str, overlays: Path | None, worst: int) -> Ou
                 output=into,
                 overlays=overlays is not None,
                 use_cache=False,
+                only=only,
                 fixed=("*.radius*",) if variant == "radii" else (),
             )
         except LegcalError as error:
@@ -319,13 +326,14 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--as", dest="variants", nargs="+", default=["none"], choices=VARIANTS)
     parser.add_argument("--worst", type=int, default=0)
+    parser.add_argument("--only", choices=["zeros", "lengths", "all"])
     parser.add_argument("--overlays", type=Path)
     parser.add_argument("--lines", type=Path)
     given = parser.parse_args()
     print(HEADER, flush=True)
     for folder in given.folders:
         for variant in given.variants:
-            found = outcome(folder.resolve(), variant, given.overlays, given.worst)
+            found = outcome(folder.resolve(), variant, given.overlays, given.worst, given.only)
             print(found.line(), flush=True)
             if given.lines is not None:
                 with given.lines.open("a") as file:

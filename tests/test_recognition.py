@@ -434,7 +434,9 @@ def test_views_of_one_machine_share_the_errors_of_its_joints() -> None:
         moved, shift = with_common_shift(search, fits)
         before, after = (_own_errors(search, errors) for errors in (wrong, wrong - shift))
         assert np.square(after).sum() < 0.1 * np.square(before).sum()
-        assert np.square(np.einsum("lij,lj->li", moved.shift_whitening, after)).mean() < 1.0
+        whitening = moved.shift_whitening
+        assert whitening is not None
+        assert np.square(np.einsum("lij,lj->li", whitening, after)).mean() < 1.0
         assert moved.joint_error < 0.6 * search.joint_error
 
 
