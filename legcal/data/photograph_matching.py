@@ -25,6 +25,7 @@ from legcal.files.schema import (
     closest,
     describe,
     few,
+    in_order,
     is_name,
     read_bytes,
 )
@@ -149,14 +150,6 @@ def find_photographs(folder: Path) -> list[Photograph]:
             f"TIFF files there or in folders in it; {remedy}."
         )
     return sorted(photographs, key=lambda photograph: in_order(photograph.name))
-
-
-def in_order(name: str) -> tuple[object, ...]:
-    """Return a key by which numbers in names are in order: ``img2`` before ``img10``."""
-    parts = PurePosixPath(name.casefold()).parts
-    split = [_NUMBERS.split(part) for part in parts]
-    keys = [tuple((int(x), "") if x.isdecimal() else (-1, x) for x in words) for words in split]
-    return (len(parts), *keys, name)
 
 
 def match(
