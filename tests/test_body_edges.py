@@ -253,7 +253,7 @@ def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) ->
     at = problem.begin(Start(session.fitted.nominal, views, poses, "here"))
     normal = information(linearize(problem, at), problem.loss)
     line = 10 * (6 * session.view[edges.row] + edges.leg) + edges.edge
-    same = (line[:, None] == np.unique(line)) * problem.loss.efficiency(1)
+    same = line[:, None] == np.unique(line)
     moved, n = response(normal, {"edges": same[:, None]}), problem.n_kinematic
     alone = normal.kept_covariance()
     stated = np.sqrt(np.diagonal(alone + moved @ moved.T)[:n])
