@@ -12,6 +12,7 @@ import os
 import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from decimal import Decimal
 from functools import wraps
 from pathlib import Path
@@ -53,7 +54,10 @@ def with_arguments_in_words(function: Callable[..., Any], public: str) -> Callab
                 raise error from None
             kinds = bound.signature.parameters
             given = {k: v for k, v in bound.arguments.items() if kinds[k].kind not in _SEVERAL}
-            check_arguments(f"{public}.{function.__name__}", _annotations(function, public), given)
+            annotations = _annotations(function, public)
+            for argument in list(given):
+                _add_options(argument, annotations, given, public)
+            check_arguments(f"{public}.{function.__name__}", annotations, given)
             raise
 
     called.__module__ = public  # where processes that are handed it find it
@@ -80,8 +84,22 @@ def check_arguments(name: str, annotations: Mapping[str, Any], given: Mapping[st
         raise UsageError(wrong)
 
 
+def _add_options(
+    argument: str, annotations: dict[str, Any], given: dict[str, Any], public: str
+) -> None:
+    """Add what an argument holds to the arguments: a dataclass whose fields have defaults."""
+    value = given[argument]
+    if is_dataclass(value) and not any(
+        one.default is one.default_factory is MISSING for one in fields(value)
+    ):
+        for name, annotation in _annotations(type(value), public).items():
+            field = f"{name} of {argument}"
+            annotations[field], given[field] = annotation, getattr(value, name)
+            _add_options(field, annotations, given, public)
+
+
 def _annotations(function: Callable[..., Any], public: str) -> dict[str, Any]:
-    """Return the types of a function, also those that its module does not import."""
+    """Return the types of a function or class, also those that its module does not import."""
 
     class Names(dict[str, Any]):
         def __missing__(self, name: str) -> Any:
