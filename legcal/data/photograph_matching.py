@@ -289,7 +289,8 @@ def _refuse_names(
                 "the photographs could not be matched by name",
                 f"none that is named like {describe(images[named[0]])}",
                 f"the names of files such as {describe(photographs[0].name)}",
-                "correct the column image, or remove it to match rows and photographs in order",
+                f"correct the column {table.heading('image')}, or remove it to match rows and "
+                "photographs in order",
                 str(table.path),
                 code=Code.MISSING_FILE,
             )
@@ -417,7 +418,7 @@ def _by_time(table: Table, photographs: Sequence[Photograph]) -> Matched:
             f"{table.path}: the photographs could not be matched by time: found {len(dated)} "
             f"photographs with a time in their EXIF data for {n} rows, needed as many or "
             "more; copy the files from the camera as they are, add a column image, or remove the "
-            "column time to match rows and photographs in order."
+            f"column {table.heading('time')} to match rows and photographs in order."
         )
     times = seconds_of_column(texts, taken[dated[0].name])
     for k, when in enumerate(times):
