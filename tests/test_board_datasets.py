@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from boards import CHARUCO, LENS
+from command_line import run
 from csv_rows import read_rows, write_rows
 from dataset_folder import Folder, folder
 from edits import keyed
@@ -90,6 +91,8 @@ def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
     checked = check(folder, tmp_path / "out")
     assert note in checked.notes
     assert not checked.movement.moved
+    judged = run("identify", folder, "--noise", tmp_path / "out", "--json").document["notes"]
+    assert [note.split(":")[0] for note in judged if "T_base_camera" in note] == ["view c1-3"]
     with pytest.raises(DatasetError, match="view c1-3: its camera could not be placed") as refused:
         calibrated([f"c1-{k}" for k in range(1, 9)] + ["c2-1"])
     found_by_doctor = [one.what for one in doctor(folder).findings if one.severity == "error"]
