@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from boards import CHARUCO, LENS
+from command_line import run
 from csv_rows import read_rows, write_rows
 from dataset_folder import Folder, folder
 from edits import keyed
@@ -18,7 +19,7 @@ from hypothesis import settings as drawn
 from hypothesis import strategies as st
 from simulated import settings, simulated
 
-from legcal import Calibration, calibrate, check, simulate
+from legcal import Calibration, calibrate, check, doctor, simulate
 from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.data.corners import COLUMNS, Corners, read_corners, write_corners
 from legcal.data.dataset import load_dataset
@@ -82,6 +83,7 @@ def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
     found = calibrated(["c1-3"])
     (note,) = [note for note in found.notes if "left out" in note]
     assert note.startswith("view c1-3: ")
+    assert note in [one.what for one in doctor(folder).findings if one.severity == "warning"]
     assert re.search(r"found [234]\.?\d* px from the best pose of the chessboard", note)
     without = calibrate(folder, output=tmp_path / "out", leave_out="c1-3").solution.estimates
     assert found.solution.estimates.values == pytest.approx(without.values, abs=1e-9)
@@ -89,8 +91,12 @@ def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
     checked = check(folder, tmp_path / "out")
     assert note in checked.notes
     assert not checked.movement.moved
-    with pytest.raises(DatasetError, match="view c1-3: its camera could not be placed"):
+    judged = run("identify", folder, "--noise", tmp_path / "out", "--json").document["notes"]
+    assert [note.split(":")[0] for note in judged if "T_base_camera" in note] == ["view c1-3"]
+    with pytest.raises(DatasetError, match="view c1-3: its camera could not be placed") as refused:
         calibrated([f"c1-{k}" for k in range(1, 9)] + ["c2-1"])
+    found_by_doctor = [one.what for one in doctor(folder).findings if one.severity == "error"]
+    assert set(refused.value.problems) <= set(found_by_doctor)
 
 
 def test_a_camera_in_the_hand_that_no_step_relates_to_the_machine_is_refused_for_that(

@@ -21,6 +21,7 @@ from legcal.calibration.joint_fit.predicted import DEFAULT_NOISE, Predictor, fit
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.variables import Start
 from legcal.calibration.ordered_dataset import nominal_poses
+from legcal.calibration.tuning import EDGE_SHARE
 from legcal.data.outlines import no_outlines
 from legcal.data.reasons import Reason
 from legcal.estimation.problem import Frames, linearize
@@ -253,7 +254,7 @@ def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) ->
     at = problem.begin(Start(session.fitted.nominal, views, poses, "here"))
     normal = information(linearize(problem, at), problem.loss)
     line = 10 * (6 * session.view[edges.row] + edges.leg) + edges.edge
-    same = (line[:, None] == np.unique(line)) * problem.loss.efficiency(1)
+    same = EDGE_SHARE * (line[:, None] == np.unique(line))
     moved, n = response(normal, {"edges": same[:, None]}), problem.n_kinematic
     alone = normal.kept_covariance()
     stated = np.sqrt(np.diagonal(alone + moved @ moved.T)[:n])

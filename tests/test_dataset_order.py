@@ -13,7 +13,7 @@ from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.image_choice import dataset_at, split_images
 from legcal.data.image_tables import Order, canonical_order, reorder_measurements
-from legcal.data.measurements import Measurements
+from legcal.data.measurements import Measurements, images_in_words
 from legcal.errors import NotIdentifiable, UsageError
 
 FAST = settings(deadline=None, max_examples=25)
@@ -70,6 +70,21 @@ def test_tables_follow_their_images_and_legs_and_are_restored(seed: int) -> None
     for row, leg, edge, h in keys:
         np.testing.assert_array_equal(h, of_key[row, leg, edge])
     assert_same(order.restore(moved), outlines.sort())
+
+
+def test_numbers_in_names_are_in_order() -> None:
+    """Notes list views and images so."""
+    names = [f"phone-{k}" for k in (1, 10, 2, 11)]
+    m = recorded(tuple(names))
+    m = replace(m, view=np.zeros(4, dtype=np.intp))
+    order = canonical_order(m, LEG_NAMES)
+    assert [m.image[row] for row in order.rows] == ["phone-1", "phone-2", "phone-10", "phone-11"]
+    views = tuple(replace(m.views[0], name=name) for name in names)
+    in_hand = replace(m, views=views, view=np.arange(4), image=("",) * 4)
+    found = reorder_measurements(in_hand, canonical_order(in_hand, LEG_NAMES))
+    assert images_in_words(found, range(4)).startswith(
+        "4 images of views phone-1, phone-2, phone-10, phone-11 "
+    )
 
 
 # Held-out images.

@@ -210,6 +210,28 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
     assert found.verdict.is_to_be_refused
 
 
+def test_a_platform_no_better_known_than_built_has_tolerances_as_its_next_step(
+    healthy: Calibration,
+) -> None:
+    """As well as is stated, else as printed machines are; not of what has had them as priors."""
+
+    def offered(calibration: Calibration) -> list[str]:
+        steps = next_steps(calibration, "out", "legcal calibrate set --fix q -o out")
+        return [one.what for one in steps if one.command.endswith("-o out-zeros --only zeros")]
+
+    kinematic, machine = healthy.solution.kinematic, healthy.dataset.machine
+    assert healthy.platform is not None
+    known = (healthy.platform.workspace or healthy.platform.sigma).mean_displacement
+    assert offered(healthy) == []
+    times = (0.6e-3 / known) ** 2
+    vague = _judged(healthy, kinematic=replace(kinematic, covariance=times * kinematic.covariance))
+    (what,) = offered(vague)
+    assert "machine_kind" in what
+    stated = replace(machine, tolerance=replace(machine.tolerance, joints=0.5 * known))
+    (what,) = offered(replace(healthy, dataset=replace(healthy.dataset, machine=stated)))
+    assert "machine_kind" not in what
+
+
 def test_left_out_images_contradict_a_model_that_was_led_away(healthy: Calibration) -> None:
     posterior = healthy.solution.posterior
     found = cross_validate(posterior.problem, posterior.state)

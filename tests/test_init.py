@@ -245,9 +245,10 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (TWO, {"n": 4}, (), ("folder a", "3 photographs for 4 rows")),
     (FLAT[:2], {"columns": {"image": ("IMG_2", "IMG_10", "IMG_12")}}, (),
      ("'IMG_12'", "add the file, or remove the row")),
-    (FLAT, {"columns": {"image": ("IMG_2", "IMG_10", "IMG_12")}}, (),
-     ("row 3 (line 4)", "'IMG_12'", "'IMG_11.JPG'")),
-    (FLAT, {"columns": {"image": ("a", "b", "c")}}, (), ("'a'", "'IMG_2.JPG'", "in order")),
+    (FLAT, {"columns": {"Foto": ("IMG_2", "IMG_10", "IMG_12")}}, (),
+     ("row 3 (line 4), column Foto", "'IMG_12'", "'IMG_11.JPG'")),
+    (FLAT, {"columns": {"Foto": ("a", "b", "c")}}, (),
+     ("'a'", "'IMG_2.JPG'", "correct the column Foto", "in order")),
     (FLAT, {"columns": {"image": ("IMG_2", "img_2.jpg", "IMG_10")}}, (), ("row 2", "row 1")),
     (("1.jpg", "1.png", "2.png"), {"columns": {"image": "112"}}, (), ("row 1", "1.jpg, 1.png")),
     (SAME, {"n": 6, "columns": {"image": "123123"}}, (), ("a/1.png", "column view")),
@@ -313,7 +314,7 @@ def test_readings_that_nobody_knows_stay_empty(tmp_path: Path) -> None:
     (folder / "own.csv").write_text("\n".join(",".join(row) for row in [["image", *LEGS], *rows]))
     refused = init(folder, output="other")
     assert refused.code == 2
-    assert "row 2 (line 3), column leg1_prismatic: the reading could not be used" in refused.said
+    assert "row 2 (line 3), column leg1: the reading could not be used" in refused.said
     assert not (folder / "other").exists()
 
 

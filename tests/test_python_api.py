@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import simulated
 
 import legcal
-from legcal.errors import UsageError
+from legcal.errors import DatasetError, UsageError
 from legcal.simulation.settings import Level
 
 
@@ -181,6 +181,16 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
     machine, folder = legcal.load_mechanism("hexapod"), example_run.output
     public: Any = legcal  # without its types
     example = ROOT / "examples/hexapod"
+
+    def made_with(**options: Any) -> object:
+        sheet, into = public.SheetOptions(**options), tmp_path / "made"
+        table = example / "measurements.csv"
+        return public.init(example / "images", table, "hexapod", into, options=sheet)
+
+    def shot_with(**looks: Any) -> object:
+        looks = public.SimulationSettings("photographs", appearance=public.Appearance(**looks))
+        return public.simulate("hexapod", tmp_path / "shot", looks)
+
     calls: list[tuple[Any, str]] = [
         (lambda: public.evaluate(3, machine), "found 3 (int) as model, needed a text or a path"),
         (lambda: public.evaluate(machine, folder, dataset=0), "found 0 (int) as dataset"),
@@ -198,11 +208,18 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
         (lambda: public.calibrate(example, holdout="a"), "as holdout, needed a number or None;"),
         (lambda: public.new(family="delta", rod_length="0.2"), "as rod_length, needed a number"),
         (lambda: public.Follower("hexapod"), "found a str, needed a Machine"),
+        (lambda: made_with(board=3), "found 3 (int) as board of options, needed a text or a path"),
+        (lambda: made_with(cameras=3), "as cameras of options, needed a text or a list;"),
+        (lambda: shot_with(ambient="x"), "found 'x' (str) as ambient of appearance of settings"),
+        (lambda: shot_with(lights=3), "found lights = 3, needed some of Light"),
+        (lambda: shot_with(camera=3), "found camera = 3, needed industrial, "),
     ]
     for call, sentence in calls:
         with pytest.raises(UsageError) as refused:
             call()
         assert sentence in str(refused.value)
+    with pytest.raises(DatasetError, match=r"^none\.yaml: "):
+        made_with(cameras="none.yaml")
     with pytest.raises(TypeError, match="unexpected keyword argument 'hold_out'"):
         public.calibrate(folder, hold_out=0.2)
     size = {"base_radius": 300, "platform_radius": 150, "min_length": 345, "max_length": 489}

@@ -21,6 +21,7 @@ from legcal.machine.leg import Cylinder
 from legcal.perception import recognition
 from legcal.perception.camera_search import (
     PoseCandidates,
+    is_mirrored,
     mirrored,
     place_by_edges,
     place_camera,
@@ -161,6 +162,9 @@ def test_the_two_rods_of_an_arm_are_not_exchanged(name: str, width: float) -> No
     placed = place_camera(pictures, 6)
     assert placed.is_convincing
     assert _is_right(placed, T)
+    nowhere = place_camera(pictures[:0], 6)
+    assert len(nowhere.poses) == 0
+    assert not is_mirrored(placed, nowhere)
     for k, picture in enumerate(pictures):
         nominal = picture.targets.ends.mean(axis=1)[:6]
         at = [pose.inv().apply(x) for pose, x in ((placed.pose(), nominal), (T, (A[k] + B[k]) / 2))]

@@ -280,14 +280,19 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
     """Return notes on views without the board on the base, and on wrong poses of boards."""
     if corners is None:
         return []
+    lost = solution.outlines.row[solution.outlines.rejected_for(Reason.NOT_PLACED)]
+    return [*notes_on_views(dataset, corners, lost), *_misplaced(dataset, solution)]
+
+
+def notes_on_views(dataset: Dataset, corners: Corners, lost: IntArray) -> list[str]:
+    """Return notes on views that the board on the base does not place, nor legs the rows *lost*."""
     measurements, notes = dataset.measurements, []
     fixed = dataset.board_on("base")
     if fixed is None:
-        return _misplaced(dataset, solution)
+        return []
     on_base = corners.used & fixed.has(corners.corner)
     shown_views = set(measurements.view[corners.row[on_base]].tolist())
     used = np.unique(measurements.view).tolist()
-    lost = solution.outlines.row[solution.outlines.rejected_for(Reason.NOT_PLACED)]
     why: dict[str, Cause] = {}  # single images of a camera in the hand were left out, by view
     for row, reason in zip(corners.row.tolist(), corners.reason, strict=True):
         view = measurements.views[measurements.view[row]]
@@ -306,7 +311,7 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
             f"No image of {', '.join(without)} shows the calibration board so that it places "
             f"the camera: only {others} can."
         )
-    return [*notes, *_misplaced(dataset, solution)]
+    return notes
 
 
 def _misplaced(dataset: Dataset, solution: Solution) -> list[str]:

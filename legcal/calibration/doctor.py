@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from legcal.calibration.board import notes_on_views, observe_board
 from legcal.calibration.detection import (
     CHECKS,
     DETECTION,
@@ -139,6 +140,8 @@ def doctor(
             data = order_dataset(dataset_at(dataset, np.array(usable)), pool, report)
             tried = _diagnose(checklist, data)
             detection = _searched(checklist, data) if exposures else None
+            if not exposures:
+                _look_at_boards(checklist, data)
         views = _conditions(dataset, exposures, detection)
         if detection is not None:
             _look_at_legs(checklist, detection, views, choices)
@@ -341,6 +344,20 @@ def _look_at_cameras(checklist: _Checklist, choices: Choices) -> None:
         checklist.add("camera", "error" if note.is_certain else "warning", note.what)
     for message in exact_cameras(dataset, choices):
         checklist.add("camera", "note", message)
+
+
+def _look_at_boards(checklist: _Checklist, data: OrderedDataset) -> None:
+    """Check whether boards place the cameras of given outlines, which nothing else is asked of."""
+    try:
+        board = observe_board(data)
+    except (DatasetError, NotVisible) as error:
+        for problem in error.problems:
+            checklist.add("camera", "error", problem)
+        return
+    if board is not None:
+        corners, rows = data.order.restore(board.corners), np.arange(data.measurements.n_rows)
+        for note in notes_on_views(data.dataset, corners, rows):
+            checklist.add("camera", "warning", note)
 
 
 def _look_at_parameters(checklist: _Checklist, rows: Sequence[int], choices: Choices) -> None:

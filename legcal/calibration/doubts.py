@@ -416,7 +416,7 @@ class _Evidence:
         if not doubts:
             return []
         wrong_in = np.any([one.error.any(axis=1) for one in doubts], axis=0)  # that share a file
-        views = sorted(names[v] for v in np.flatnonzero(wrong_in).tolist())
+        views = [names[v] for v in np.flatnonzero(wrong_in).tolist()]
         error = None if self.platform is None else self.platform.effects.get(FITTED_CAMERA)
         wrong = max(doubts, key=lambda one: one.apart)
         kind = {"centre": "principal point"}.get(wrong.kind, wrong.kind.replace("_", " "))

@@ -15,8 +15,14 @@ import numpy as np
 
 from legcal.data.measurements import Measurements
 from legcal.data.reasons import Reason, Rejection
+from legcal.files.schema import in_order
 from legcal.geometry.tables import Table
 from legcal.geometry.types import BoolArray, IntArray
+
+
+def _order_of(keys: Sequence[Any]) -> IntArray:
+    """Return the indices that sort keys."""
+    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +39,7 @@ class ImageTable(Table):
 
     def sort(self) -> Self:
         """Return the rows sorted by their keys."""
-        keys = self.row_keys()
-        return self.choose(np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp))
+        return self.choose(_order_of(self.row_keys()))
 
     def at(self, rows: IntArray) -> Self:
         """Return the observations in some images, as a table for :func:`measurements_at` them."""
@@ -93,13 +98,15 @@ class Order:
 
 
 def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Order:
-    """Return legs and views by name, and rows by view, image, pose label and readings."""
+    """Return legs and views by name, and rows by view, image, pose label and readings.
+
+    Numbers in names of views, images and poses are in order, since they are listed so.
+    """
     legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
-    view_names = np.array(measurements.view_names, dtype=object)
-    views = np.argsort(view_names, kind="stable")
+    views = _order_of([in_order(name) for name in measurements.view_names])
     labels = measurements.pose_labels or ("",) * measurements.n_poses
     keys = [
-        (measurements.views[v].name, image, labels[p], readings)
+        (in_order(measurements.views[v].name), in_order(image), in_order(labels[p]), readings)
         for v, image, p, readings in zip(
             measurements.view.tolist(),
             measurements.image,
@@ -108,8 +115,7 @@ def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Ord
             strict=True,
         )
     ]
-    rows = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
-    return Order(rows, views, legs)
+    return Order(_order_of(keys), views, legs)
 
 
 def reorder_measurements(measurements: Measurements, order: Order) -> Measurements:

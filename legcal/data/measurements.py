@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -239,7 +238,6 @@ def readings_in(
     *,
     place: UnitPlace,
     lengths: bool = False,
-    headings: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the readings in a table (n_rows, n_motors) [m or rad], and notes on odd ones.
 
@@ -248,11 +246,11 @@ def readings_in(
     in a larger one are refused as well.
 
     *units* are stated in a *place*; *sigma* (n_motors,) are their standard deviations. The numbers
-    may be whole *lengths* of legs, under *headings* of the owner.
+    may be whole *lengths* of legs.
     """
     motors = legs_with_readings(legs)
     values = table.numbers(str(leg.prismatic) for leg in motors)
-    names = [headings.get(str(leg.prismatic), str(leg.prismatic)) for leg in motors]
+    names = [str(leg.prismatic) for leg in motors]
     stated = [units[str(leg.prismatic)] for leg in motors]
     readings = joint_values(values, stated)
     readings = readings_of_lengths(readings, motors) if lengths else readings
@@ -276,8 +274,8 @@ def readings_in(
                 often.setdefault((leg.reads_angle, unit.name), []).append(j)
         elif np.any(is_odd):
             notes.append(
-                f"{table.path}, column {names[j]}: {what} are a little outside the travel "
-                f"{travel}: {_some(table, values[:, j], is_odd, unit.name)}."
+                f"{table.path}, column {table.heading(names[j])}: {what} are a little outside the "
+                f"travel {travel}: {_some(table, values[:, j], is_odd, unit.name)}."
             )
     notes += still_encoders(table.path, motors, readings)
     usual = f"correct the {what} or the limits"
@@ -288,7 +286,7 @@ def readings_in(
             kept = {columns: text for columns, text in remedies.items() if columns[0] not in alike}
             remedies = {**kept, tuple(alike): cause}
     for columns, remedy in remedies.items():
-        where = f"in {names[columns[0]]} " * (len(columns) > 1)
+        where = f"in {table.heading(names[columns[0]])} " * (len(columns) > 1)
         said = f"{what} are outside the travel: {where}{outside[columns[0]]}"
         of_columns = tuple(names[k] for k in columns)
         table.refuse_file(Problem(said, remedy=remedy, file=str(table.path), columns=of_columns))

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from legcal.data.dataset import Dataset, load_dataset
-from legcal.data.dataset_file import MEASUREMENTS, dataset_texts
+from legcal.data.dataset_file import MEASUREMENTS, dataset_texts, listed
 from legcal.data.measurements import few_views
 from legcal.data.photograph_matching import (
     ONE_VIEW,
@@ -166,7 +166,7 @@ class SheetOptions:
 
     Attributes
     ----------
-    cameras : sequence of str
+    cameras : str or sequence of str
         Camera files: one for all views, or ``VIEW=FILE`` for each; by default those beside the
         photographs.
     unit : str, optional
@@ -184,7 +184,7 @@ class SheetOptions:
         Whether the camera was in the hand: each photograph has a camera pose of its own.
     """
 
-    cameras: Sequence[str] = ()
+    cameras: str | Sequence[str] = ()
     unit: str | None = None
     lengths: bool = False
     encoder_sigma: float | str | Mapping[str, float] | None = None
@@ -257,7 +257,7 @@ def plan_new_dataset(
     sheet_readings = sheet.readings(options.unit, lengths=options.lengths)
     pairs, matched, matching_notes = match(table, photographs)
     matches = [photograph for _, photograph in pairs]
-    cameras, made = _cameras(folder, destination, matches, options.cameras)
+    cameras, made = _cameras(folder, destination, matches, listed(options.cameras))
     stated = options.encoder_sigma
     if isinstance(stated, Mapping):
         stated = {joint: x for joint, x in stated.items() if joint not in sheet.unknown}

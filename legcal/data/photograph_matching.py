@@ -25,6 +25,7 @@ from legcal.files.schema import (
     closest,
     describe,
     few,
+    in_order,
     is_name,
     read_bytes,
 )
@@ -149,14 +150,6 @@ def find_photographs(folder: Path) -> list[Photograph]:
             f"TIFF files there or in folders in it; {remedy}."
         )
     return sorted(photographs, key=lambda photograph: in_order(photograph.name))
-
-
-def in_order(name: str) -> tuple[object, ...]:
-    """Return a key by which numbers in names are in order: ``img2`` before ``img10``."""
-    parts = PurePosixPath(name.casefold()).parts
-    split = [_NUMBERS.split(part) for part in parts]
-    keys = [tuple((int(x), "") if x.isdecimal() else (-1, x) for x in words) for words in split]
-    return (len(parts), *keys, name)
 
 
 def match(
@@ -296,7 +289,8 @@ def _refuse_names(
                 "the photographs could not be matched by name",
                 f"none that is named like {describe(images[named[0]])}",
                 f"the names of files such as {describe(photographs[0].name)}",
-                "correct the column image, or remove it to match rows and photographs in order",
+                f"correct the column {table.heading('image')}, or remove it to match rows and "
+                "photographs in order",
                 str(table.path),
                 code=Code.MISSING_FILE,
             )
@@ -424,7 +418,7 @@ def _by_time(table: Table, photographs: Sequence[Photograph]) -> Matched:
             f"{table.path}: the photographs could not be matched by time: found {len(dated)} "
             f"photographs with a time in their EXIF data for {n} rows, needed as many or "
             "more; copy the files from the camera as they are, add a column image, or remove the "
-            "column time to match rows and photographs in order."
+            f"column {table.heading('time')} to match rows and photographs in order."
         )
     times = seconds_of_column(texts, taken[dated[0].name])
     for k, when in enumerate(times):

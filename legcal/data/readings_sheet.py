@@ -120,6 +120,7 @@ class ReadingsSheet:
             unknown=unknown,
             reshape=self._renamed_columns,
         )
+        self.table.headings = {name: text for text, name in self.taken.items()}
         self.unknown = [joint for joint in self._joints if not any(self.table.text(joint))]
         self._joints = tuple(x for x in self._joints if x not in self.unknown)
         self.motors = [leg for leg in self.motors if str(leg.prismatic) not in self.unknown]
@@ -137,10 +138,7 @@ class ReadingsSheet:
         The columns are whole *lengths* of legs also if nothing else fits.
         """
         units, unit_from, lengths = self._units(unit, lengths, in_si)
-        headings = {name: text for text, name in self.taken.items()}
-        q, notes = readings_in(
-            self.table, self.motors, units, place="headings", lengths=lengths, headings=headings
-        )
+        q, notes = readings_in(self.table, self.motors, units, place="headings", lengths=lengths)
         self.table.check()
         last = [
             abs(units[joint].size)

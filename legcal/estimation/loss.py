@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from math import gamma
 from typing import Protocol
 
 import numpy as np
+from scipy.special import roots_genlaguerre
 
 from legcal.geometry.types import Array
 
@@ -114,9 +114,9 @@ def biweights(s: Array) -> Array:
 
 @cache
 def _efficiency(k: float, m: int) -> float:
-    node, weight = np.polynomial.laguerre.laggauss(60)
-    weight = weight * node ** (0.5 * m - 1.0) / gamma(0.5 * m)
-    s = 2.0 * node  # the squared norm of m unit Gaussians has the density s^(m/2-1) exp(-s/2)
+    # The squared norm of m unit Gaussians has the density s^(m/2-1) exp(-s/2), infinite for m = 1
+    node, weight = roots_genlaguerre(60, 0.5 * m - 1.0)
+    s, weight = 2.0 * node, weight / weight.sum()
     w = 1.0 / np.sqrt(1.0 + k * s)
     slope = w - k * s * w**3 / m
     return float((weight @ slope) ** 2 / (weight @ (w**2 * s / m)))

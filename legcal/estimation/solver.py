@@ -8,7 +8,7 @@ tangent space of the constraints (:class:`Tangent`), and every step ends with a 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic
@@ -263,6 +263,7 @@ class NormalEquations(Generic[P, S]):
     g_elements: Array  # (n_elements, f)
     tangent: Tangent | None  # None where eliminated elements are free
     held_directions: Array  # (w, n_kept) directions without a step
+    weight: Mapping[str, float]  # of the squares of each factor
 
     @property
     def problem(self) -> P:
@@ -430,7 +431,8 @@ def _normal_equations_of(
     held_directions[:, : problem.held_directions.shape[1]] = problem.held_directions
     if tangent is not None and len(tangent.ties):
         held_directions = np.concatenate([held_directions, tangent.ties])
-    return NormalEquations(linear, U, W, V, g_kept, g_elements, tangent, held_directions)
+    weight = {name: of_factor for name, (_, of_factor) in weighted.items()}
+    return NormalEquations(linear, U, W, V, g_kept, g_elements, tangent, held_directions, weight)
 
 
 def _summed_products(

@@ -171,9 +171,9 @@ def residual_changes(linear: Linearization[Any, Any], block: str, error: Array) 
 def response(normal: NormalEquations[Any, Any], changes: Mapping[str, Array]) -> Array:
     """Return the shift (n_kept, c) of the kept unknowns for c changes of whitened residuals.
 
-    *changes* has (n, q, c) for factors by name.
+    *changes* has (n, q, c) for factors by name, which count as much as these do in *normal*.
     """
-    kept, _, _ = _gradients(normal, changes)
+    kept, _, _ = _gradients(normal, {name: normal.weight[name] * x for name, x in changes.items()})
     return -normal.moved_by(kept.T)
 
 

@@ -9,7 +9,7 @@ import reprlib
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
@@ -41,6 +41,7 @@ MAX_NAMED = 5  # maximum number of names in one sentence
 _MOST_NAMES = 30  # maximum number of names in a hint that lists all
 _NEAREST_NAMES = 10  # in a hint that does not
 _LONGEST_WORD = 100  # maximum length of words for the search of a similar one
+_NUMBERS = re.compile(r"(\d+)", re.ASCII)
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 _NEEDED = {
@@ -293,6 +294,14 @@ def few(names: Sequence[str], most: int = MAX_NAMED) -> str:
     """Return a list of at most a few names: ``c1, c2 and 3 more``."""
     more = len(names) - most
     return ", ".join(names[:most]) + f" and {more} more" * (more > 0)
+
+
+def in_order(name: str) -> tuple[object, ...]:
+    """Return a key by which numbers in names are in order: ``img2`` before ``img10``."""
+    parts = PurePosixPath(name.casefold()).parts
+    split = [_NUMBERS.split(part) for part in parts]
+    keys = [tuple((int(x), "") if x.isdecimal() else (-1, x) for x in words) for words in split]
+    return (len(parts), *keys, name)
 
 
 class _Short(reprlib.Repr):

@@ -15,8 +15,8 @@ import math
 import re
 import unicodedata
 import zipfile
-from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
 from functools import cache
@@ -114,6 +114,7 @@ class Table:
         self.path = path
         self.thing = thing  # noun for a row in messages
         self.columns = {column.name: column for column in columns}  # in the order of the header
+        self.headings: Mapping[str, str] = {}  # as their owner has them, of renamed columns
         self.where: list[Place] = []  # of each row, with its file
         self._cells: list[list[str]] = []
         self._numbers: dict[str, Array] = {}  # of the columns of numbers
@@ -129,6 +130,10 @@ class Table:
     def places(self) -> list[str]:
         """The place of each row in the file."""
         return [f"row {place.row} (line {place.line})" for place in self.where]
+
+    def heading(self, name: str) -> str:
+        """Return the heading of a column in the file."""
+        return self.headings.get(name, name)
 
     def text(self, name: str) -> tuple[str, ...]:
         """Return the cells of a column; empty cells for an absent column."""
@@ -237,7 +242,9 @@ class Table:
         """Raise DatasetError with everything that is wrong, by line."""
         if self._problems:
             self._problems.sort(key=lambda problem: problem.line or 0)
-            raise DatasetError(self._problems)
+            headings = [tuple(map(self.heading, problem.columns)) for problem in self._problems]
+            pairs = zip(self._problems, headings, strict=True)
+            raise DatasetError([replace(problem, columns=columns) for problem, columns in pairs])
 
     def _add(self, lines: Iterable[tuple[int, list[str]]], header: Sequence[str]) -> None:
         """Add the lines below the header; incomplete lines are refused."""

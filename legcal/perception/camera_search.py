@@ -499,9 +499,11 @@ def is_mirrored(original: PoseCandidates, other: PoseCandidates) -> bool:
     """
     if not original.is_convincing:
         return other.is_clear
+    if not other.is_convincing:  # it may have no pose at all
+        return False
     lead = float(other.score[0] - original.score[0])
     legs, part = MIRRORED_LEAD
-    return other.is_convincing and lead >= max(legs, part * float(other.score[0]))
+    return lead >= max(legs, part * float(other.score[0]))
 
 
 N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second

@@ -371,9 +371,9 @@ def read_series(path: Path, machine: Machine, *, lengths: bool = False) -> Serie
     for text, time in zip(texts, times, strict=True):
         if time is None or is_number(text) is not are_numbers:
             raise DatasetError(
-                f"{path}, column time: the time could not be read: found {describe(text)}, needed "
-                "seconds, Unix times or dates such as 2026-11-23T10:15:00.125, one form in all "
-                "rows; correct it."
+                f"{path}, column {sheet.table.heading('time')}: the time could not be read: found "
+                f"{describe(text)}, needed seconds, Unix times or dates such as "
+                "2026-11-23T10:15:00.125, one form in all rows; correct it."
             )
     in_words, notes = f"{readings.unit}, {readings.unit_from}", (*sheet.notes, *readings.notes)
     series = Series(str(path), np.array(times, dtype=float), readings.q, in_words, notes)

@@ -31,6 +31,7 @@ from legcal.calibration.summary import (
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import few
 from legcal.machine.leg import ParameterId
+from legcal.machine.tolerance import TYPICAL
 from legcal.pages.document import Light, Table, Verdict
 from legcal.report.render import Report, report, table, verdict_line
 
@@ -114,12 +115,12 @@ def document(calibration: Calibration, output: Path, command: str) -> dict[str, 
     return calibration.result.model_copy(update={"next": steps}).document()
 
 
-def _written_beside(command: str) -> str:
+def _written_beside(command: str, suffix: str) -> str:
     """Return a command with another output folder, so that the result of the first stays."""
     words = shlex.split(command)
     for k, word in enumerate(words[:-1]):
         if word in ("-o", "--output"):
-            words[k + 1] = f"{words[k + 1].rstrip('/')}-holdout"
+            words[k + 1] = f"{words[k + 1].rstrip('/')}-{suffix}"
     return shlex.join(words)
 
 
@@ -129,6 +130,7 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Next
 
     result, steps = calibration.result, list[NextStep]()
     dataset, out = shlex.quote(str(calibration.dataset.folder)), shlex.quote(folder)
+    command = command or f"legcal calibrate {dataset} -o {out}"
 
     def add(what: str, command: str = "") -> None:
         steps.append(NextStep(what=what, command=command))
@@ -145,10 +147,9 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Next
             "move to a few poses whose place you can measure."
         )
         if result.holdout is None and calibration.dataset.machine.is_determined:
-            again = _written_beside(command or f"legcal calibrate {dataset} -o {out}")
             add(
                 "See how well it predicts images that it has not seen:",
-                f"{again} --holdout 0.2",
+                f"{_written_beside(command, 'holdout')} --holdout 0.2",
             )
         add(
             "Where the base stands in the cell and the tool on the platform is not seen in "
@@ -167,6 +168,16 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Next
             "Look at the worst outlines in report.html: blur, reflections and wrong edges "
             "show there."
         )
+    if _is_left_open(calibration):
+        stated = "that you state"
+        if not calibration.dataset.machine.tolerance.says_parts:
+            stated = "of its kind (machine_kind in dataset.yaml: printed, machined or bought)"
+        add(
+            "These images do not tell all parameters to better than a machine is built; with the "
+            f"tolerances {stated} as priors they may tell the zeros of its motors (or lengths, or "
+            "all):",
+            f"{_written_beside(command, 'zeros')} --only zeros",
+        )
     if exact_cameras(calibration.dataset, calibration.solution.posterior.problem.choices):
         add(
             "Calibrate the camera, with the board that you have: its file then states how well "
@@ -176,6 +187,16 @@ def next_steps(calibration: Calibration, folder: str, command: str) -> list[Next
     elif gain := _gain_of_a_board(calibration.platform):
         add(gain, "legcal camera BOARDS --board chessboard:9x6:25mm -o FILE")
     return steps
+
+
+def _is_left_open(calibration: Calibration) -> bool:
+    """Return whether the platform stays as uncertain as a machine is built, or directions open."""
+    machine, platform = calibration.dataset.machine, calibration.platform
+    if platform is None or calibration.group is not None:
+        return False
+    built = machine.tolerance.joints or TYPICAL["printed"].joints or 0.0
+    error = (platform.workspace or platform.sigma).mean_displacement
+    return error > built or (bool(calibration.result.held) and not calibration.verdict.trustworthy)
 
 
 def _gain_of_a_board(platform: PlatformAccuracy | None) -> str:

@@ -7,11 +7,13 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from numbers import Integral, Real
+from numbers import Real
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 
+from legcal.arguments import fits, in_words
 from legcal.calibration.joint_fit.parameter_choices import joints_of_length
 from legcal.errors import UsageError
 from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
@@ -278,29 +280,15 @@ class SimulationSettings:
 
     def _of_other_kinds(self) -> Iterator[str]:
         """Yield values of a wrong type, in words."""
-        path, of_board = str | Path | None, Board | str | Path | None
-        needed = {
-            "errors": (self.errors, ParameterErrors, "ParameterErrors"),
-            "readings": (self.readings, Spread, "Spread"),
-            "angles": (self.angles, Spread | None, "Spread"),
-            "appearance": (self.appearance, Appearance, "Appearance"),
-            "sigma_px": (self.sigma_px, Real, "number"),
-            "poses": (self.poses, Integral | str | Path, "whole number or the path of a CSV"),
-            "views": (self.views, Integral | list | tuple, "whole number or Viewpoints"),
-            "images": (self.images, Integral, "whole number"),
-            "seed": (self.seed, Integral, "whole number"),
-            "camera": (self.camera, path, "path"),
-            "plan": (self.plan, path, "path"),
-            "board": (self.board, of_board, "Board"),
-            "platform_board": (self.platform_board, of_board, "Board"),
-        }
+        hints = get_type_hints(type(self))
+        given = {name: (value, hints[name]) for name, value in vars(self).items()}
         if isinstance(self.errors, ParameterErrors):
-            needed |= {f"errors.{k}": (getattr(self.errors, k), Spread, "Spread") for k in KINDS}
-        if isinstance(self.views, list | tuple):
-            needed |= {f"view {k}": (x, Viewpoint, "Viewpoint") for k, x in enumerate(self.views)}
-        for name, (value, kind, kind_name) in needed.items():
-            if isinstance(value, bool) or not isinstance(value, kind):
-                yield f"found {value!r} as {name}, needed a {kind_name}; correct it."
+            given |= {f"errors.{kind}": (getattr(self.errors, kind), Spread) for kind in KINDS}
+        del given["level"], given["sampling"]
+        for name, (value, hint) in given.items():
+            if hint is not bool and (isinstance(value, bool) or not fits(value, hint)):
+                needed = " or ".join(in_words(hint))
+                yield f"found {value!r} as {name}, needed {needed}; correct it."
         for name, choices in (("level", Level), ("sampling", Sampling)):
             if getattr(self, name) not in list(choices):
                 yield (

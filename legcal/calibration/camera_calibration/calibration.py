@@ -34,7 +34,7 @@ from legcal.calibration.camera_calibration.document import (
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.data.photograph_notes import differences, recorded
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
-from legcal.files.schema import MAX_IMAGE, describe, few, read_bytes
+from legcal.files.schema import MAX_IMAGE, describe, few, in_order, read_bytes
 from legcal.perception.board_adjustment import SHEET, BoardImages
 from legcal.perception.board_corners import (
     NumberedCorners,
@@ -406,11 +406,12 @@ def _matching(name: str) -> list[Path]:
         return []
     path, suffixes = Path(name), image_suffixes()
     if path.is_dir():
-        files = (p for p in sorted(path.iterdir()) if not p.name.startswith("."))
-        return [p for p in files if p.suffix.lower() in suffixes and p.is_file()]
-    if os.path.lexists(path):
+        hits = [p for p in path.iterdir() if not p.name.startswith(".")]
+    elif os.path.lexists(path):
         return [path]
-    hits = [Path(hit) for hit in sorted(glob.glob(name, recursive=True))]
+    else:
+        hits = [Path(hit) for hit in glob.glob(name, recursive=True)]
+    hits.sort(key=lambda hit: in_order(hit.as_posix()))
     return [hit for hit in hits if hit.suffix.lower() in suffixes and hit.is_file()]
 
 

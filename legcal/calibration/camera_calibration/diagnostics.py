@@ -169,7 +169,7 @@ def refuse_divided(fit: RobustFit, names: Sequence[str]) -> None:
         )
     n_others = len(fit.left_out)
     if n_others > len(largest):
-        reasons = sorted({f"{names[k]}: {reason}" for k, reason in fit.left_out.items()})
+        reasons = [f"{names[k]}: {reason}" for k, reason in sorted(fit.left_out.items())]
         raise NotIdentifiable(
             f"The camera could not be calibrated: found that only {len(largest)} of "
             f"{len(largest) + n_others} images agree on a camera ({few(largest)}; {few(reasons)}), "

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.calibration.documents import Result
 from legcal.calibration.identify.report import (
     ConditionBlock,
     Identifiability,
@@ -49,7 +50,7 @@ from legcal.calibration.joint_fit.predicted import (
 )
 from legcal.calibration.joint_fit.variables import RefinementSettings
 from legcal.data.dataset import Dataset
-from legcal.data.measurements import few_views
+from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import join_outlines
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.estimation.uncertainty import compress, marginal_rows
@@ -369,7 +370,8 @@ def answer(
     board: bool = False,
     platform_board: bool = False,
     hand_held: bool = False,
-    noise: Path | None = None,  # earlier result whose errors of outlines are to be expected
+    # earlier result whose errors of outlines are to be expected, of a dataset also its cameras
+    noise: Path | None = None,
     only: Group | None = None,  # parts whose tolerances are priors
 ) -> Identifiability:
     """Return the report on a model with views, or on a dataset.
@@ -404,7 +406,20 @@ def answer(
     from legcal.data.dataset import load_dataset
 
     dataset = load_dataset(path, check_images=False)
+    if noise is not None:
+        dataset = replace(dataset, measurements=_placed_by(noise, dataset.measurements))
     return identifiability_of_dataset(dataset, choices_of(dataset, only=only), expected)
+
+
+def _placed_by(result: Path, measurements: Measurements) -> Measurements:
+    """Return measurements whose cameras stand, where nothing says that, as in an earlier result."""
+    found = Result.read(result / "result.json" if result.is_dir() else result).views
+    places = {name: view.T_base_camera.motion() for name, view in found.items()}
+    views = tuple(
+        replace(view, T_base_camera=view.T_base_camera or places.get(view.name))
+        for view in measurements.views
+    )
+    return replace(measurements, views=views)
 
 
 def identifiability(

@@ -50,12 +50,8 @@ def sensitivity_to_cameras(
     of_priors = np.zeros(problem.n_kept + 1)
     of_priors[place] = error
     pull = problem.priors.whitened(of_priors[problem.priors.unknown])
-    changes = dict[str, Array]()
-    for name, change in cameras.changes(np.where(place == problem.n_kept, error, 0.0)).items():
-        factor = problem.factor(name)
-        weight = problem.loss.efficiency(factor.n_rows) if factor.robust else 1.0
-        changes[name] = weight * change[..., None]
-    steps = response(normal, changes)
+    changes = cameras.changes(np.where(place == problem.n_kept, error, 0.0))
+    steps = response(normal, {name: change[..., None] for name, change in changes.items()})
     steps += normal.kept_covariance() @ normal.linear.prior_J.T @ pull[:, None]
     return {FITTED_CAMERA: kinematic_steps(problem, steps)}
 

@@ -150,7 +150,7 @@ class Appearance:
             if is_number and not least <= value <= most:
                 raise _refused(name, f"{value:g}", f"{least:g} to {most:g}; correct it.")
         if self.camera not in CAMERAS:
-            kinds = f"{', '.join(CAMERAS)}; {closest(self.camera, CAMERAS)}"
+            kinds = f"{', '.join(CAMERAS)}; {closest(str(self.camera), CAMERAS)}"
             raise _refused("camera", describe(self.camera), kinds)
         for name, choices in (("bits", (8, 16)), ("samples", SAMPLES)):
             if getattr(self, name) not in choices:
@@ -159,6 +159,9 @@ class Appearance:
         if self.pipeline.jpeg and self.bits != 8:
             needed = "8 where the camera writes JPEG files; leave out the bits."
             raise _refused("bits", self.bits, needed)
+        is_list = isinstance(self.lights, list | tuple)
+        if not is_list or not all(isinstance(light, Light) for light in self.lights):
+            raise _refused("lights", describe(self.lights), "some of Light; correct it.")
         for light in self.lights:
             if not (math.hypot(*light.direction) > 0.0 and 0.0 < light.distance < 1e6):
                 raise UsageError(
