@@ -71,7 +71,6 @@ from legcal.machine.parameters import (
     sparse_basis,
     split_by_motion,
 )
-from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import by_step, independent, ties_in_words
 from legcal.paper.conditions import (
     Condition,
@@ -606,11 +605,9 @@ def _rough_notes(analysis: Analysis) -> list[str]:
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    bodies = bodies_of(machine.occluders, len(machine.legs))
-    hidden = [j for j, leg in enumerate(machine.legs) if not (leg.cylinders or bodies[j])]
     notes = []
-    if hidden:
-        which = legs_in_words(hidden, machine.leg_names)
+    if machine.unseen_legs:
+        which = legs_in_words(machine.unseen_legs, machine.leg_names)
         notes.append(
             f"The model has no <visual> cylinder along {which}: visible cylinders with a radius of "
             f"{100 * THIN:g} % of the mean leg length are assumed; add one to each."
@@ -712,14 +709,8 @@ def read_views(
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
     """Describe why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
-    bodies = bodies_of(dataset.machine.occluders, len(dataset.machine.legs))
-    unseen = [
-        leg.name
-        for leg, of_leg in zip(dataset.machine.legs, bodies, strict=True)
-        if not (leg.cylinders or of_leg)
-    ]
-    if unseen:
-        names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
+    if unseen := dataset.machine.unseen_legs:
+        names = legs_in_words(unseen, report.legs)
         remedies.insert(0, f"add a <visual> cylinder along {names}: without it, no image shows it")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (
