@@ -321,28 +321,18 @@ def limited_to(data: OrderedDataset, given: Assumed, mistake: Mistake, rows: Int
     )
 
 
-def rows_of_views(data: OrderedDataset) -> list[IntArray]:
-    """Return the rows of each view in the order of the file."""
-    view, to_file = data.measurements.view, data.order.rows
-    return [
-        np.flatnonzero(view == v)[np.argsort(to_file[view == v], kind="stable")]
-        for v in range(len(data.measurements.views))
-    ]
-
-
 def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield readings shifted by a row, in all views or in one, and readings in order of text."""
-    of_view = rows_of_views(data)
+    whole, views = np.argsort(data.order.rows, kind="stable"), data.measurements.views
+    of_view = [whole[data.measurements.view[whole] == v] for v in range(len(views))]
     nonempty = [rows for rows in of_view if len(rows)]
-
     parts = [(nonempty, "")]
     if len(nonempty) > 1:
-        names = [f" of view {view.name}" for view in data.measurements.views]
+        names = [f" of view {view.name}" for view in views]
         parts += [([rows], name) for rows, name in zip(of_view, names, strict=True)]
     for shifted, name in parts:
         if all(len(rows) > 2 for rows in shifted):
             yield from (_shifted(given, shifted, k, name) for k in _LATE)
-    whole = np.argsort(data.order.rows, kind="stable")
     for tables in (nonempty, [whole])[: len(nonempty)]:
         yield from _text_order(tables, given)
 

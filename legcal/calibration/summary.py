@@ -96,20 +96,12 @@ class Quantity:
 
 def parameters_of(result: Result) -> list[Quantity]:
     """Return the parameters of a result that tables have, joints and axes in R_b and R_e."""
-    return [
-        Quantity.of(
-            row.name, frame_of(row.name), row.unit, (row.value, row.nominal, row.sigma), row.status
-        )
-        for row in result.parameters
-        if row.is_shown
-    ]
-
-
-def frame_of(name: str) -> str:
-    """Return the frame of a parameter; "" if it has none."""
-    parameter = ParameterId.parse(name)
-    side = parameter.kind.removesuffix("_axis")
-    return FRAMES[side] if parameter.component and side in FRAMES else ""
+    quantities = []
+    for row in filter(lambda row: row.is_shown, result.parameters):
+        parameter, numbers = ParameterId.parse(row.name), (row.value, row.nominal, row.sigma)
+        frame = FRAMES.get(parameter.kind.removesuffix("_axis"), "") if parameter.component else ""
+        quantities.append(Quantity.of(row.name, frame, row.unit, numbers, row.status))
+    return quantities
 
 
 def joints_of(result: Result, *sides: Link) -> Iterator[Quantity]:

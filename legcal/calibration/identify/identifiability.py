@@ -96,10 +96,6 @@ class Analysis:
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
     noise: PredictedNoise = DEFAULT_NOISE
 
-    def with_board(self, link: Link = "base") -> Analysis:
-        """Analyse the same images with a board on a link in all of them."""
-        return replace(self, session=self.session.with_board(link))
-
     @cached_property
     def contributions(self) -> Contributions:
         """The information of the joint fit, without the unknowns of single views."""
@@ -194,7 +190,7 @@ def undetermined(
 ) -> Array:
     """Return an orthonormal basis (w, c) of the directions that rows (m, c) do not determine."""
     _, singular, basis = np.linalg.svd(compress(information))
-    return np.asarray(basis[singular <= _limit(session, sigma)])
+    return np.asarray(basis[singular * sigma * session.mean_length <= 1.0])
 
 
 def missing(session: Session, rows: Array) -> int:
@@ -233,10 +229,6 @@ def _direction(session: Session, row: Array, harmless: bool) -> WeakDirection:
         dE_rad,
         harmless,
     )
-
-
-def _limit(session: Session, sigma: float = _MAX_SIGMA) -> float:
-    return 1.0 / (sigma * session.mean_length)
 
 
 # The scale
@@ -527,7 +519,7 @@ def check_identifiable(
     # A rank does not depend on errors that edges share, and many images have many of these.
     analysis = replace(_analysis_of(dataset, choices), noise=WHITE)
     full = analysis.full
-    is_open = bool(analysis.session.actuators) and is_scale_open(analysis)
+    is_open = bool(dataset.machine.actuators) and is_scale_open(analysis)
     n_harmless = sum(direction.harmless for direction in full.weak)
     if is_open and n_open_with_radii(analysis) <= n_harmless:  # nothing else is open
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
@@ -582,7 +574,7 @@ def _report_on(
         platform_sigma=analysis.platform_sigma if full.complete else None,
         remedies=() if full.complete else find_remedies(analysis, replanned),
         notes=tuple(notes),
-        scale_is_open=bool(session.actuators) and is_scale_open(analysis),
+        scale_is_open=bool(machine.actuators) and is_scale_open(analysis),
         parts=analysis.parts or None,
         paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )
@@ -625,10 +617,11 @@ def conditions_of(session: Session) -> tuple[Condition, ...]:
     leg.
     """
     image, leg = session.seen[session.view].nonzero()
+    spatial = session.machine.spatial
     counts = count_conditions(
         session.views,
         session.n_legs,
-        spatial=session.spatial,
+        spatial=spatial,
         revolute=[j for j, x in enumerate(session.legs) if x.base_joint is JointType.REVOLUTE],
         passive=[j for j, has in enumerate(session.with_length) if not has],
         board=bool(session.board.all()),
@@ -643,7 +636,7 @@ def conditions_of(session: Session) -> tuple[Condition, ...]:
     return (
         *counts,
         replace(directions, ok=not standing, legs=standing),
-        three_legs_at_once(session.views, geometries(session.machine), spatial=session.spatial),
+        three_legs_at_once(session.views, geometries(session.machine), spatial=spatial),
     )
 
 
@@ -819,12 +812,14 @@ def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
 
 def _board(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield a calibration board on the base, and one on the platform."""
-    if len(set(analysis.session.frame.tolist())) > 1:
-        text = "put a calibration board on the base, visible to every camera"
-        yield text, analysis.with_board(), ()
-    if not analysis.session.platform_board.any():
-        text = "put a calibration board on the platform, visible to every camera"
-        yield text, analysis.with_board("platform"), ()
+    session, links = analysis.session, list[Link]()
+    if len(set(session.frame.tolist())) > 1:
+        links.append("base")
+    if not session.platform_board.any():
+        links.append("platform")
+    for link in links:
+        text = f"put a calibration board on the {link}, visible to every camera"
+        yield text, replace(analysis, session=session.with_board(link)), ()
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:
@@ -851,7 +846,7 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
     seen[0, list(legs)] = True
     A, B = (end.mean(axis=0) for end in session.ends)
     rng = np.random.default_rng(_SEED)
-    (further,) = default_cameras(A, B, [legs], session.spatial, rng)
+    (further,) = default_cameras(A, B, [legs], session.machine.spatial, rng)
     extended = replace(
         session,
         found=None,

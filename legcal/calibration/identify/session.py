@@ -38,7 +38,6 @@ from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.actuator import Actuator
 from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
 from legcal.machine.equations import pose_sensitivity
@@ -56,13 +55,11 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
     geometries,
-    is_spatial,
     moved_legs,
     parametrization_of,
 )
 from legcal.machine.rods import (
     actuator_index,
-    actuators_of,
     ends_at_poses,
 )
 from legcal.machine.ties import machine_ties, on_ties
@@ -257,20 +254,10 @@ class Session:
         frame = np.where(self.board, first, np.arange(self.n_views))
         return np.asarray(np.unique(frame, return_inverse=True)[1])
 
-    @property
-    def spatial(self) -> bool:
-        """Whether the platform moves in space and not in a plane."""
-        return is_spatial(self.machine.frame_legs)
-
     @cached_property
     def views(self) -> tuple[tuple[int, ...], ...]:
         """The legs of each view."""
         return tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in self.seen)
-
-    @cached_property
-    def actuators(self) -> tuple[Actuator, ...]:
-        """What moves joints at A, each once."""
-        return actuators_of(self.legs)
 
     @cached_property
     def carried_by(self) -> IntArray:
@@ -287,7 +274,7 @@ class Session:
         """The legs on each actuator, and whether it turns."""
         return tuple(
             (tuple(np.flatnonzero(self.carried_by == a).tolist()), actuator.turns)
-            for a, actuator in enumerate(self.actuators)
+            for a, actuator in enumerate(self.machine.actuators)
         )
 
     @cached_property
