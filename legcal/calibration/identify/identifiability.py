@@ -519,7 +519,7 @@ def check_identifiable(
     # A rank does not depend on errors that edges share, and many images have many of these.
     analysis = replace(_analysis_of(dataset, choices), noise=WHITE)
     full = analysis.full
-    is_open = bool(dataset.machine.actuators) and is_scale_open(analysis)
+    is_open = bool(analysis.session.machine.actuators) and is_scale_open(analysis)
     n_harmless = sum(direction.harmless for direction in full.weak)
     if is_open and n_open_with_radii(analysis) <= n_harmless:  # nothing else is open
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
