@@ -254,8 +254,8 @@ class LegcalError(Exception):
         code = code_of_kind(type(self).__name__)
         return [{"code": code, **fact.document()} for fact in (*self.facts, *self.consequences)]
 
-    def told(self, change: Callable[[Problem], Problem]) -> LegcalError:
-        """Return an error of the same kind whose problems are changed."""
+    def map_problems(self, change: Callable[[Problem], Problem]) -> LegcalError:
+        """Return an error of the same kind with every problem replaced by *change* of it."""
         error = type(self)([change(problem) for problem in self.facts])
         error.diagnosis, error.notes = self.diagnosis, self.notes
         error.consequences = tuple(map(change, self.consequences))

@@ -44,7 +44,6 @@ from legcal.workers import in_turn
 
 PATH = Path("dataset.yaml")
 SIGMA = 0.05
-FISHEYE = replace(LENS, distortion=np.array([0.02, -0.01, 0.0, 0.0]), model="equidistant")
 
 
 # What a board is, and how files describe it.
@@ -307,22 +306,6 @@ def _corners(
 def _turn(one: RigidTransform | None, other: RigidTransform) -> float:
     assert one is not None
     return float((one.rotation * other.rotation.inv()).magnitude())
-
-
-@pytest.mark.parametrize(
-    ("board", "camera"),
-    [(APRILGRID, LENS), (CHARUCO, FISHEYE)],
-    ids=lambda x: x.kind if isinstance(x, Board) else x.model,
-)
-def test_without_noise_the_pose_is_exact(board: Board, camera: Camera) -> None:
-    turned = RigidTransform.from_rotation(Rotation.from_euler("z", 0.5))
-    places = [before(board, 0.6), before(board, 0.6) * turned]
-    corners = _corners(board, places, camera=camera, sigma=0.0)
-    for pose, T in zip(
-        camera_poses_by_board(corners, board, _measurements((1, 1), camera))[0], places, strict=True
-    ):
-        assert pose is not None
-        assert pose.as_matrix() == pytest.approx(T.as_matrix(), abs=1e-8)
 
 
 def test_errors_are_as_large_as_the_information_says_and_images_add_up() -> None:

@@ -22,7 +22,6 @@ from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.variables import Start
 from legcal.calibration.ordered_dataset import nominal_poses
 from legcal.calibration.tuning import EDGE_SHARE
-from legcal.data.outlines import no_outlines
 from legcal.data.reasons import Reason
 from legcal.estimation.problem import Frames, linearize
 from legcal.estimation.solver import information
@@ -32,7 +31,6 @@ from legcal.machine.parameters import geometries
 from legcal.machine.shapes import SECTIONS, PlacedOccluders, bodies_of
 from legcal.perception.body_edges import bodies_in_view, edges_of_body
 from legcal.perception.photographs import nominal_placement
-from legcal.simulation.cameras import mild_lens
 from legcal.simulation.settings import Level
 
 BODY = (
@@ -217,20 +215,6 @@ def test_edges_in_photographs_point_along_their_legs(with_bodies: Path, tmp_path
             assert abs(float(off[0])) < 0.7
             found += 1
     assert found >= 6
-
-
-def test_plans_count_edges_of_bodies(with_bodies: Path) -> None:
-    machine, lens = load_mechanism(with_bodies), mild_lens()
-    views = {view.name: view.T_base_camera for view in standing("hexapod", 1)}
-    home = machine.home_of_frames
-    known = []
-    for occluders in (machine.occluders, ()):
-        nominal, sigma = replace(machine, occluders=occluders), np.full(6, 1e-5)
-        predictor = Predictor(nominal, lens, DEFAULT_NOISE, sigma)
-        added = predictor.contributions(views, np.zeros(1, dtype=np.intp), [home], no_outlines())
-        known.append(np.sum(added.all_gains()[:, : added.basis.shape[1]] ** 2))
-    assert known[0] > 0.0
-    assert known[1] < 0.5 * known[0]
 
 
 def test_identify_and_plan_count_what_edges_keep_in_a_view(with_bodies: Path) -> None:

@@ -23,7 +23,7 @@ from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.summary import sentences
 from legcal.calibration.verdict import judge
-from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
+from legcal.errors import DatasetError, LegcalError, NotVisible
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import SimulatedDataset
@@ -195,40 +195,6 @@ def test_a_model_of_the_four_steps_that_does_not_load_is_left_out_with_a_note(
 
 
 # Files, refusals and notes.
-
-
-@pytest.mark.usefixtures("without_remedies")
-@pytest.mark.parametrize(
-    ("shown", "named"),
-    [
-        ("one pose", r"determine at most \d+ of 30"),
-        ("one outline an image", r"give \d+ equations for \d+ unknowns"),
-    ],
-)
-def test_images_that_cannot_do_it_are_refused_in_one_sentence(
-    tmp_path: Path, shown: str, named: str
-) -> None:
-    folder = _simulated(tmp_path, "hexapod", shared_poses=True).folder
-    leg_of = dict[tuple[str, str], str]()
-
-    def is_kept(row: Row) -> bool:
-        if shown == "one pose":
-            return row["image"] == "p01"
-        leg = leg_of.setdefault((row["view"], row["image"]), f"leg{len(leg_of) % 6 + 1}")
-        return row["leg"] == leg and row["edge"] == "1"
-
-    kept = _change(folder / "observations.csv", lambda rows: [r for r in rows if is_kept(r)])
-    left = {(row["view"], row["image"]) for row in kept}
-    _change(
-        folder / "measurements.csv",
-        lambda rows: [r for r in rows if (r["view"], r["pose"]) in left],
-    )
-    before = files_of(folder)
-    with pytest.raises(NotIdentifiable, match=named) as refused:
-        calibrate(folder, output=tmp_path / "out")
-    assert len(refused.value.problems) == 1
-    assert not (tmp_path / "out").exists()
-    assert files_of(folder) == before
 
 
 # A calibration board.

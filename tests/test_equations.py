@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from random_legs import changed, leg_and_pose
 from scipy.spatial.transform import Rotation
 
-from legcal.geometry.lines import normal_basis
 from legcal.machine.equations import leg_equations
 from legcal.machine.leg import LegColumns, LegKind
 from legcal.machine.parameters import parametrize, vector_of
@@ -52,38 +51,6 @@ def test_equations_of_a_leg_are_met_where_it_closes_and_have_their_derivatives(
         )
         difference = (one - other) / (2.0 * STEP)
         np.testing.assert_allclose(found.by_local[0, :, column], difference, atol=1e-6, rtol=1e-5)
-
-
-@pytest.mark.parametrize("joints", [j for j in TYPES if j[1:] == ""])
-@FAST
-@given(seed=SEEDS)
-def test_a_turn_of_the_direction_in_the_platform_is_a_turn_of_the_platform(
-    joints: str, seed: int
-) -> None:
-    leg, R, t = leg_and_pose(joints, seed)
-    found = leg_equations(leg, R[None], t[None])
-    assert leg.platform_axis is not None
-    for column, e in zip((9, 10), normal_basis(leg.platform_axis), strict=True):
-        rows = found.by_pose[0, 1:, :3] @ (R @ e)
-        arm = np.cross(e, leg.B)  # the platform's turn moves B as well
-        tied = found.by_local[0, 1:, column] + found.by_local[0, 1:, 3:6] @ arm
-        np.testing.assert_allclose(rows, tied, atol=1e-9)
-
-
-@FAST
-@given(seed=SEEDS)
-def test_equations_of_a_leg_do_not_depend_on_the_frames(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    leg, R, t = leg_and_pose("UU", seed)
-    Q, s = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
-    assert leg.base_axis is not None
-    elsewhere = replace(leg, A=Q @ leg.A + s, base_axis=Q @ leg.base_axis)
-    flipped = replace(leg, base_axis=-leg.base_axis)
-    here = leg_equations(leg, R[None], t[None]).values
-    there = leg_equations(elsewhere, (Q @ R)[None], (Q @ t + s)[None]).values
-    np.testing.assert_allclose(there, here, atol=1e-12)
-    same = leg_equations(flipped, R[None], t[None]).values
-    np.testing.assert_allclose(same[0, 1:], here[0, 1:], atol=1e-12)
 
 
 # --- parameters ---------------------------------------------------------------------------------

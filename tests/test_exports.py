@@ -311,35 +311,6 @@ def test_mujoco_loads_the_mjcf_closed_and_has_the_same_forward_kinematics(
 # --- controllers --------------------------------------------------------------------------------
 
 
-def test_genhexkins_has_the_readings_of_the_model(
-    calibrated: Callable[[str], Subject], tmp_path: Path
-) -> None:
-    machine = calibrated("hexapod").machine
-    text = written(calibrated("hexapod"), "linuxcnc", tmp_path / "hexapod.hal").read_text()
-    pins = {
-        words[1]: float(words[2])
-        for line in text.splitlines()
-        if (words := line.split())[:1] == ["setp"]
-    }
-    assert not re.search(r"setp .*\.\d{10}", text)  # people read them
-    base, platform = (
-        np.array([[pins[f"genhexkins.{side}.{j}.{axis}"] for axis in "xyz"] for j in range(6)])
-        for side in ("base", "platform")
-    )
-    offsets = [float(line.split()[-1]) for line in text.splitlines() if "HOME_OFFSET =" in line]
-    limits = [float(line.split()[-1]) for line in text.splitlines() if "MIN_LIMIT =" in line]
-    assert len(offsets) == len(limits) == 6
-    for q, T in zip(*poses_of(machine, 5), strict=True):
-        a, b, c = T.rotation.as_euler("xyz", degrees=True)  # about fixed axes
-        cos, sin = (np.vectorize(f)(np.deg2rad([a, b, c])) for f in (np.cos, np.sin))
-        Rx = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
-        Ry = np.array([[cos[1], 0, sin[1]], [0, 1, 0], [-sin[1], 0, cos[1]]])
-        Rz = np.array([[cos[2], -sin[2], 0], [sin[2], cos[2], 0], [0, 0, 1]])
-        joints = np.linalg.norm(1e3 * T.translation + platform @ (Rz @ Ry @ Rx).T - base, axis=1)
-        np.testing.assert_allclose((joints - offsets) * machine.sign, 1e3 * q, atol=1e-9)
-        assert (joints >= limits).all()
-
-
 def test_the_options_of_earlier_exports_name_what_stands_in_their_place() -> None:
     with pytest.raises(AttributeError, match=r"ExportOptions: legcal\.export takes nodes="):
         getattr(legcal, "ExportOptions")  # noqa: B009

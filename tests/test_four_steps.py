@@ -19,7 +19,7 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import BoolArray
 from legcal.machine.equations import leg_equations
 from legcal.machine.kinematics import platforms_in_base
-from legcal.machine.leg import EquationKind, Leg, LegKind
+from legcal.machine.leg import EquationKind, LegKind
 from legcal.machine.loader import load_mechanism
 from legcal.paper.criteria import Criteria
 from legcal.paper.equations import axis_frames, closure_of_leg, end_of_leg, leg_across_axis
@@ -171,24 +171,6 @@ def test_turned_cameras_change_nothing(name: str) -> None:
         for axes in (session.axes, turned)
     )
     np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-6)
-
-
-def larger(legs: tuple[Leg, ...], scale: float) -> tuple[Leg, ...]:
-    return tuple(replace(g, A=scale * g.A, B=scale * g.B, q0=scale * g.q0) for g in legs)
-
-
-def test_scaling_all_lengths_scales_the_result() -> None:
-    scale = 100.0
-    session, first = noisy()
-    axes, m, nominal = session.axes, session.measurements, session.nominal
-    by = np.array([1.0, 1.0, scale, scale])
-    second = run_steps(
-        replace(nominal, legs=larger(nominal.legs, scale)),
-        replace(axes, M=scale * axes.M, covariance=axes.covariance * np.outer(by, by)),
-        replace(m, q=scale * m.q, sigma_q=scale * m.sigma_q),
-    )
-    apart = session.legs.vector(larger(first.legs, scale)) - session.legs.vector(second.legs)
-    assert np.abs(apart).max() < 1e-7 * scale
 
 
 # Which legs and images take part, and refusals

@@ -81,38 +81,6 @@ def pairs(folder: Path) -> list[tuple[str, str, int]]:
     ]
 
 
-def test_lengths_in_mm_and_odd_names_give_the_dataset_of_the_example(tmp_path: Path) -> None:
-    lines = ["Photo;" + ";".join(f"L{j} [mm]" for j in range(1, 7)) + ";Remark"]
-    for row in read_rows(HEXAPOD / "measurements.csv"):
-        k = int(row["image"][-6:-4])
-        path = tmp_path / "photos" / row["view"] / f"IMG_{k:04d}.JPG"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.hardlink_to(HEXAPOD / row["image"])
-        lengths = [1e3 * float(row[f"leg{j}_prismatic"]) + 345.0 for j in range(1, 7)]
-        numbers = ";".join(f"{length:.4f}".replace(".", ",") for length in lengths)
-        lines.append(f"{row['view']}\\img_{k:04d}.heic;{numbers};fine")
-    (tmp_path / "own.csv").write_text("\n".join(lines))
-    before = files_of(tmp_path / "photos")
-    camera = HEXAPOD / "camera_info.yaml"
-    words = ("--camera", str(camera), "--encoder-sigma", "2um")
-    outcome = init(tmp_path, *words)
-    assert outcome.code == 0
-    out = outcome.said
-    assert "Unit of the whole lengths of legs: mm" in out
-    assert "45 photographs, 3 views, 6 encoders" in out
-    assert "whatever its extension" in out
-    assert "'Remark'" in out
-    assert files_of(tmp_path / "photos") == before
-    made, example = load_dataset(tmp_path / "dataset"), load_dataset(HEXAPOD)
-    np.testing.assert_allclose(made.measurements.q, example.measurements.q, atol=1e-9)
-    np.testing.assert_array_equal(made.measurements.sigma_q, example.measurements.sigma_q)
-    for k in range(45):
-        one, two = made.image_path(k), example.image_path(k)
-        assert one is not None
-        assert two is not None
-        assert one.read_bytes() == two.read_bytes()
-
-
 FLAT = ("IMG_2.JPG", "IMG_10.JPG", "IMG_11.JPG")
 TWO = ("a/IMG_2.jpg", "a/IMG_10.jpg", "a/IMG_11.jpg", "b/IMG_3.jpg", "b/IMG_4.jpg", "b/IMG_12.jpg")
 BACK = ("a/IMG_10.jpg", "a/IMG_11.jpg", "b/IMG_8.jpg", "b/IMG_9.jpg")

@@ -1,11 +1,9 @@
 """What ``legcal inspect`` and ``legcal evaluate`` say and draw of machines, hostile names too."""
 
 import io
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,30 +27,6 @@ from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 from legcal.machine.parameters import geometries
 from legcal.machine.picture import draw_machine
 from legcal.report.machine import inspect_table
-
-
-def _described(name: str | Path) -> dict[str, Any]:
-    document = json.loads(json.dumps(machine_document(load_mechanism(name)), allow_nan=False))
-    assert isinstance(document, dict)
-    return document
-
-
-def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
-    expected = {  # n, n_d, r, n_ac, idle spins
-        "hexapod": (6, 3, 0, 6, 0),
-        "hexapod-strut": (7, 3, 0, 6, 1),
-        "3-rps": (3, 3, 3, 3, 0),
-        "3-rpr": (3, 2, 3, 3, 0),
-        "3-upu-tilted": (3, 3, 0, 3, 0),
-    }
-    for name, counts in expected.items():
-        document = _described(name)
-        assert tuple(document[key] for key in ("n", "n_d", "r", "n_ac", "idle_spins")) == counts
-    cylinders = _described("hexapod")["legs"][0]["cylinders"]
-    assert cylinders == [
-        {"link": "leg1_b2_link", "radius": 0.01},
-        {"link": "leg1_tube", "radius": 0.01},
-    ]
 
 
 @pytest.mark.parametrize(

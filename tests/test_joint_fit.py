@@ -12,15 +12,11 @@ import numpy as np
 import pytest
 from dense_fit import allowed, by_differences, projected_move, residuals
 from fit_sessions import (
-    BOARD_SCALE,
     PINHOLE,
     MachineSession,
-    corners_of,
     disturbed_start,
     irregular_hexapod,
     machine_session,
-    place_of_board,
-    with_board,
 )
 from thinned import thinned
 
@@ -30,7 +26,6 @@ from legcal.calibration.joint_fit.parameter_choices import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State
-from legcal.data.measurements import View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation.problem import Frames, linearize
@@ -263,21 +258,6 @@ def test_a_leg_that_one_view_takes_for_another_is_left_out_and_named(
     found = session.moved(by * (o.row == o.row[wrong].min())[:, None]).fit()  # in one image
     assert not found.outlines.used.all()
     assert not found.left_out
-
-
-def test_a_fit_with_a_board_and_cameras_by_hand_is_exact_without_noise() -> None:
-    session = machine_session("3-rps")
-    seen, start = with_board(session, corners_of(session))
-    m = session.measurements  # with a camera position of its own for every image
-    views = tuple(View(f"hand-{i + 1}", m.views[v].camera) for i, v in enumerate(m.view.tolist()))
-    start = replace(start, T_camera_Rb=tuple(start.T_camera_Rb[v] for v in m.view.tolist()))
-    by_hand = replace(session, measurements=replace(m, views=views, view=np.arange(m.n_rows)))
-    solution = by_hand.fit(start, board=seen)
-    assert max(errors(session, solution).values()) < 1e-8
-    apart = place_of_board(session).inv() * solution.T_frame_board["base"]
-    assert np.linalg.norm(apart.translation) < 1e-8
-    assert solution.estimates.values[BOARD_SCALE] == pytest.approx(1.0, abs=1e-8)
-    assert solution.estimates.status[BOARD_SCALE] == "estimated"
 
 
 # Refusals

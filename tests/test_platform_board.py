@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,16 +20,6 @@ from legcal.data.outlines import no_outlines
 from legcal.simulation.settings import Level
 
 __all__ = ["folder"]
-
-PATH = Path("dataset.yaml")
-CHARUCO: dict[str, Any] = {
-    "kind": "charuco", "squares_x": 7, "squares_y": 5, "square": 0.03, "marker": 0.02,
-    "dictionary": "DICT_4X4_50",
-}  # fmt: skip
-CHESSBOARD: dict[str, Any] = {
-    "kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03
-}  # fmt: skip
-ON_PLATFORM = {"on": "platform"}
 
 
 def test_a_board_alone_gives_the_machine_exactly_without_noise() -> None:

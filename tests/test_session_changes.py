@@ -17,7 +17,7 @@ from simulated import settings, simulated, standing
 from legcal import Calibration, Dataset, calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
-from legcal.calibration.session_changes import ALL_MOTORS, Finding, session_tests
+from legcal.calibration.session_changes import ALL_MOTORS, UnmodelledEffect, session_tests
 from legcal.calibration.verdict import commanded
 from legcal.data.image_choice import chosen_images, dataset_at, image_sequences, own_zeros
 from legcal.data.reading_units import sigmas_of_legs
@@ -69,7 +69,7 @@ def start(unordered: Calibration) -> Start:
     return Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "nominal")
 
 
-def _findings(dataset: Dataset, start: Start) -> tuple[Finding, ...]:
+def _findings(dataset: Dataset, start: Start) -> tuple[UnmodelledEffect, ...]:
     m, outlines = dataset.measurements, dataset.observations
     assert outlines is not None
     solution = refine(fitted_legs(dataset.machine), m, outlines, start)

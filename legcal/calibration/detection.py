@@ -230,14 +230,21 @@ def require_images(dataset: Dataset) -> IntArray:
     return rows
 
 
-def detected(data: OrderedDataset, images: IntArray) -> Detection:
-    """Recognise and measure the legs; return the detection in the order of the files."""
+def detected(data: OrderedDataset, images: IntArray, to_click: Sequence[str] = ()) -> Detection:
+    """Recognise and measure the legs; return the detection in the order of the files.
+
+    Nothing is searched where views have to be clicked first: see :func:`views_to_click`.
+    """
     dataset, order, photographs = data.dataset, data.order, data.photographs
-    scene, board = rough_placement(data)
-    outlines, cylinders = given_outlines(photographs), photographs.cylinders
-    unplaced = dict[str, NotPlaced]()
+    if to_click:
+        scene = nominal_placement(data.machine, data.measurements, data.T_base_platform)
+        board, outlines, unplaced = None, no_outlines(), _to_click(data, to_click)
+    else:
+        scene, board = rough_placement(data)
+        outlines, unplaced = given_outlines(photographs), dict[str, NotPlaced]()
+    cylinders = photographs.cylinders
     notes_on_images, notes = list[str](), list[str]()
-    if len(photographs.detect):
+    if len(photographs.detect) and not to_click:
         T_board_camera = None if board is None else board.T_board_camera
         measured = place_and_measure(photographs, scene, data.progress, T_board_camera)
         cameras, cylinders = measured.placement.T_base_camera, measured.photographs.cylinders
@@ -297,10 +304,8 @@ def views_to_click(data: OrderedDataset) -> list[str]:
     return views_without_rough_camera(m, rows, [view.T_base_camera for view in m.views])
 
 
-def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> Detection:
-    """Return a detection without outlines, for clicking, in file order."""
-    nominal = nominal_placement(data.machine, data.measurements, data.T_base_platform)
-    rows, legs = inverse(data.order.rows), inverse(data.order.legs)
+def _to_click(data: OrderedDataset, views: Sequence[str]) -> dict[str, NotPlaced]:
+    """Return why no view is searched where some need clicks, by name."""
     no_pose = Cause(
         "its images could not be searched: found no rough camera pose, needed one, since the "
         "motors do not determine the pose of the platform; click its joints at the base "
@@ -310,22 +315,8 @@ def unsearched(data: OrderedDataset, images: IntArray, views: Sequence[str]) -> 
         "its images could not be searched: found a rough camera pose here and none of other views, "
         "needed one of every view."
     )
-    dataset = data.dataset
-    return Detection(
-        dataset=dataset,
-        outlines=no_outlines(),
-        A_base=nominal.A_base[rows][:, legs],
-        B_base=nominal.B_base[rows][:, legs],
-        cylinders=tuple(leg.cylinders for leg in dataset.machine.legs),
-        T_base_camera=tuple(view.T_base_camera for view in dataset.measurements.views),
-        rows=images,
-        unplaced={
-            view.name: NotPlaced(view.name, no_pose if view.name in views else no_other_pose)
-            for view in dataset.measurements.views
-        },
-        image_notes=(),
-        leg_notes=(),
-    )
+    names = data.dataset.measurements.view_names
+    return {name: NotPlaced(name, no_pose if name in views else no_other_pose) for name in names}
 
 
 def _nominal_arms(data: OrderedDataset) -> dict[int, PlacedArm]:

@@ -33,7 +33,6 @@ from legcal.calibration.detection import (
     check_detection_destination,
     detected,
     require_images,
-    unsearched,
     views_to_click,
     write_detection,
 )
@@ -515,10 +514,8 @@ def _searched(checklist: _Checklist, data: OrderedDataset) -> Detection | None:
     for message in notes_on_moves(m, data.dataset.moves):
         checklist.add("photographs", "note", message)
     rows = np.array([row for row in range(m.n_rows) if m.image[row]], dtype=np.intp)
-    if checklist.refuses and (views := views_to_click(data)):  # on the written page
-        return unsearched(data, rows, views)
     try:
-        return detected(data, rows)
+        return detected(data, rows, views_to_click(data) if checklist.refuses else ())
     except (DatasetError, NotIdentifiable, NotVisible, DidNotConverge) as error:
         if checklist.refuses:
             raise

@@ -43,8 +43,8 @@ from legcal.calibration.session_changes import (
     ALL_MOTORS,
     OF_MOTORS,
     OF_SCATTER,
-    Finding,
     SessionTests,
+    UnmodelledEffect,
 )
 from legcal.calibration.tuning import SCALE_BY_CHANCE
 from legcal.data.corners import Corners
@@ -485,7 +485,7 @@ class _Evidence:
                 doubts.append(Doubt(finding.kind, finding.what, finding.remedy, *effect))
         return [doubt for doubt in doubts if doubt.code not in OF_SCATTER] or doubts
 
-    def _effect_of(self, finding: Finding) -> tuple[float, float]:
+    def _effect_of(self, finding: UnmodelledEffect) -> tuple[float, float]:
         """Return the mean displacement [m] and rotation [rad] by a number that the fit lacks.
 
         Of an encoder whose zero changed on the worse side of the change.

@@ -53,7 +53,7 @@ from legcal.estimation.uncertainty import restricted_log_likelihood
 from legcal.files.schema import few
 from legcal.geometry.types import Array
 from legcal.machine.model import Machine
-from legcal.perception.body_edges import has_bodies, measure_body_edges
+from legcal.perception.body_edges import measure_body_edges
 from legcal.perception.diagnostics import is_visible, reject_images
 from legcal.perception.outline import used_as_before
 from legcal.perception.photographs import (
@@ -368,7 +368,7 @@ class _SearchNearFit:
         if like is not None:
             outlines = used_as_before(outlines, like)
         edges = near.edges
-        if like is None and has_bodies(photographs.machine):
+        if like is None and any(photographs.machine.bodies):
             stage = "Measuring edges of bodies near the fit"
             edges = measure_body_edges(photographs, placement, progress, stage)
             if (given := self.data.body_edges) is not None:

@@ -105,7 +105,13 @@ def evaluate(
     """
     given = (x if isinstance(x, str | Path | Machine) else x.machine for x in (model, reference))
     machine, truth = (x if isinstance(x, Machine) else load_mechanism(x) for x in given)
-    truth = _in_the_order_of(truth, machine)
+    if different := machine_difference(truth, machine):
+        raise ModelError(
+            f"The models could not be compared: found {truth.name} with {different} of "
+            f"{machine.name}, needed two models of one machine in the same frame; check the two "
+            "paths, and legcal.base_frame."
+        )
+    truth = truth.with_leg_order(machine.leg_names)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
     n_left_out = 0
@@ -152,16 +158,6 @@ def evaluate(
         n_left_out,
         unreached,
     )
-
-
-def _in_the_order_of(reference: Machine, model: Machine) -> Machine:
-    if different := machine_difference(reference, model):
-        raise ModelError(
-            f"The models could not be compared: found {reference.name} with {different} of "
-            f"{model.name}, needed two models of one machine in the same frame; check the two "
-            "paths, and legcal.base_frame."
-        )
-    return reference.with_leg_order(model.leg_names)
 
 
 def machine_difference(machine: Machine, other: Machine) -> str:

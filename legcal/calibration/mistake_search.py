@@ -136,7 +136,7 @@ def agreement_with_zeros(data: OrderedDataset, zeros: Sequence[Mapping[str, floa
     if not groups:
         return [0.0] * len(zeros)
     judge = _Judge(data, groups)
-    assumed = (replace(judge.given, q=data.turned(one).measurements.q) for one in zeros)
+    assumed = (replace(judge.given, q=data.with_zero_offsets(one).measurements.q) for one in zeros)
     return [_total(judge.all(one)) for one in assumed]
 
 

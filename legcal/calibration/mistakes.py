@@ -41,7 +41,6 @@ _TURNS_IN_WORDS = (
     ("images upside down", "turned upside down"),
 )
 _MOVE_ONE = "move one leg alone and compare the column that changes with the leg that moves"
-_OFFSET_REMOVED = "with the offset removed"
 _LETTERING = "look at lettering in an image"
 
 
@@ -322,28 +321,18 @@ def limited_to(data: OrderedDataset, given: Assumed, mistake: Mistake, rows: Int
     )
 
 
-def rows_of_views(data: OrderedDataset) -> list[IntArray]:
-    """Return the rows of each view in the order of the file."""
-    view, to_file = data.measurements.view, data.order.rows
-    return [
-        np.flatnonzero(view == v)[np.argsort(to_file[view == v], kind="stable")]
-        for v in range(len(data.measurements.views))
-    ]
-
-
 def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield readings shifted by a row, in all views or in one, and readings in order of text."""
-    of_view = rows_of_views(data)
+    whole, views = np.argsort(data.order.rows, kind="stable"), data.measurements.views
+    of_view = [whole[data.measurements.view[whole] == v] for v in range(len(views))]
     nonempty = [rows for rows in of_view if len(rows)]
-
     parts = [(nonempty, "")]
     if len(nonempty) > 1:
-        names = [f" of view {view.name}" for view in data.measurements.views]
+        names = [f" of view {view.name}" for view in views]
         parts += [([rows], name) for rows, name in zip(of_view, names, strict=True)]
     for shifted, name in parts:
         if all(len(rows) > 2 for rows in shifted):
             yield from (_shifted(given, shifted, k, name) for k in _LATE)
-    whole = np.argsort(data.order.rows, kind="stable")
     for tables in (nonempty, [whole])[: len(nonempty)]:
         yield from _text_order(tables, given)
 
@@ -504,49 +493,36 @@ def _zero_mistakes(encoders: _Encoders) -> Iterator[Mistake]:
     are_alike = len(encoders.angular) in (0, len(encoders.legs))  # of one unit
     for m in (*range(-_ZEROS, 0), *range(1, _ZEROS + 1)):
         if are_alike:
-            yield _zero_of_all(encoders, m)
+            yield _zero(encoders, None, m)
         for k in encoders.moving:
-            yield _zero_of_one(encoders, k, m)
+            yield _zero(encoders, k, m)
 
 
-def _zero_of_all(encoders: _Encoders, m: float) -> Mistake:
-    """Return a common zero offset of all encoders by -m steps."""
-    step, is_angle = float(encoders.zero_steps.mean()), bool(encoders.angular)
-    zeros = "the offsets" if encoders.move_legs_alone else "the zeros of motors"
+def _zero(encoders: _Encoders, k: int | None, m: float) -> Mistake:
+    """Return a zero offset of the k-th encoder, or a common one of all, by -m steps."""
+    which = encoders.indices if k is None else [k]
+    offset = -m * float(encoders.zero_steps[which].mean())
+    is_angle = which[0] in encoders.angular
+    amount = f"{np.degrees(offset):+.0f} deg" if is_angle else f"{1e3 * offset:+.0f} mm"
+    if k is None:
+        kind, appear = "zero of encoders", f"the readings of all {encoders.in_words} appear"
+        zero = "the offsets" if encoders.move_legs_alone else "the zeros of motors"
+        table = "the table of readings"
+    else:
+        name = encoders.names[k]
+        kind, appear = "zero of an encoder", f"column {name} appears"
+        zero = f"the zero of {name}" if encoders.legs[k].actuator else "the offset of the leg"
+        table = "the column in the table of readings"
     return Mistake(
-        "zero of encoders",
-        f"the readings of all {encoders.in_words} appear to have a zero offset of about "
-        f"{_offset_in_words(-m * step, is_angle=is_angle)}",
-        _OFFSET_REMOVED,
-        f"correct the table of readings, or {zeros} in the model",
-        encoders.reading(encoders.q + m * step, encoders.indices),
+        kind,
+        f"{appear} to have a zero offset of about {amount}",
+        "with the offset removed",
+        f"correct {table}, or {zero} in the model",
+        encoders.reading(encoders.q[:, which] - offset, which),
         is_small=True,
-        amount_of="zero of all encoders",
-        finer=lambda more: _zero_of_all(encoders, m + more),
+        amount_of=f"zero of {'all encoders' if k is None else f'encoder {k}'}",
+        finer=lambda more: _zero(encoders, k, m + more),
     )
-
-
-def _zero_of_one(encoders: _Encoders, k: int, m: float) -> Mistake:
-    """Return a zero offset of the k-th encoder by -m steps."""
-    step, name = float(encoders.zero_steps[k]), encoders.names[k]
-    zero = f"the zero of {name}" if encoders.legs[k].actuator else "the offset of the leg"
-    return Mistake(
-        "zero of an encoder",
-        f"column {name} appears to have a zero offset of about "
-        f"{_offset_in_words(-m * step, is_angle=k in encoders.angular)}",
-        _OFFSET_REMOVED,
-        f"correct the column in the table of readings, or {zero} in the model",
-        encoders.reading(encoders.q[:, [k]] + m * step, [k]),
-        is_small=True,
-        amount_of=f"zero of encoder {k}",
-        finer=lambda more: _zero_of_one(encoders, k, m + more),
-    )
-
-
-def _offset_in_words(offset: float, *, is_angle: bool) -> str:
-    """Return an offset [m or rad] in words."""
-    amount, unit = (np.degrees(offset), "deg") if is_angle else (1e3 * offset, "mm")
-    return f"{amount:+.0f} {unit}"
 
 
 def _image_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:

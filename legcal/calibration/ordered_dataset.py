@@ -163,10 +163,10 @@ class OrderedDataset:
         """Return T_Rb_Re of every pose by the readings and other legs, in R_b and R_e."""
         return start_from(legs, self.measurements, self.fitted_legs, (), self.T_Rb_Re, "").T_Rb_Re
 
-    def turned(self, zeros: Mapping[str, float]) -> OrderedDataset:
-        """Return the dataset with the readings of motors that stand further than they read.
+    def with_zero_offsets(self, zeros: Mapping[str, float]) -> OrderedDataset:
+        """Return the dataset with readings corrected by offsets of zeros.
 
-        *zeros* are by motor [m or rad]: with readings corrected, the nominal model holds.
+        *zeros* say by motor how much further it stands than it reads [m or rad].
         """
         further = np.array([zeros.get(leg.motor_label, 0.0) for leg in self.machine.legs])
         if not further.any():

@@ -293,7 +293,7 @@ def estimate_teeth(
     best: tuple[int, Estimate, dict[str, float], bool] | None = None
     for guess in _guesses(data, step):
         try:
-            near = estimate_parameters(data.turned(guess), file_rows, first)
+            near = estimate_parameters(data.with_zero_offsets(guess), file_rows, first)
         except (NotVisible, NotIdentifiable, DidNotConverge, DatasetError) as error:
             failure = failure or error
             continue
@@ -303,7 +303,7 @@ def estimate_teeth(
         for teeth in likely:
             turned = {m: teeth.get(m, 0.0) + guess.get(m, 0.0) for m in {**guess, **teeth}}
             turned = {m: angle for m, angle in turned.items() if angle}
-            fitted = data.turned(turned).at(data.rows_of(file_rows))
+            fitted = data.with_zero_offsets(turned).at(data.rows_of(file_rows))
             placement, board = rough_placement(fitted)
             cameras = near.solution.cameras_in_base(machine.T_base_Rb)
             placement = replace(placement, T_base_camera=cameras)
@@ -327,7 +327,7 @@ def estimate_teeth(
         raise failure
     _, found, turned, is_elsewhere = best
     if is_elsewhere and len(data.photographs.detect):
-        return estimate_parameters(data.turned(turned), file_rows, options), turned
+        return estimate_parameters(data.with_zero_offsets(turned), file_rows, options), turned
     return found, turned
 
 

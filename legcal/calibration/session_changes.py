@@ -91,8 +91,8 @@ OF_SCATTER: frozenset[Kind] = frozenset(("reading_noise", "autofocus", "vibratio
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
-    """A number that a fit lacks."""
+class UnmodelledEffect:
+    """An effect that a fit does not model, with the number that it lacks for that."""
 
     kind: Kind  # what changed, or how readings follow motors
     # the motor, the view or the joint; "" where it is all motors. Several motors have commas
@@ -256,7 +256,9 @@ class _Test(NamedTuple):
 class SessionTests:
     """Tests of a session."""
 
-    findings: tuple[Finding, ...] = ()  # the numbers that the fit lacks, the most certain first
+    findings: tuple[
+        UnmodelledEffect, ...
+    ] = ()  # the numbers that the fit lacks, the most certain first
     # the least changes of encoders that would show half of the time, by motor [m or rad]; motors of
     # which no change can be seen are not in it
     least_slips: Mapping[str, float] = field(default_factory=dict)
@@ -310,7 +312,7 @@ def _tests(
             sigma = math.sqrt(number.covariance[0, 0])
             slips.setdefault(number.test.of.subject, []).append(least * sigma)
     lacking, left = _forward_selection(scores, solved, len(tests))
-    noise, overstated = _scatter(hypotheses, left), _overstated(hypotheses, left)
+    noise, overstated = _excess_variance(hypotheses, left), _overstated(hypotheses, left)
     if lacking or noise:
         least = max((number.explains for number in lacking), default=0.0)
         by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
@@ -809,11 +811,11 @@ class _Fit:
                     least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 
-    def finding(self, number: _Solved, measurements: Measurements) -> Finding:
+    def finding(self, number: _Solved, measurements: Measurements) -> UnmodelledEffect:
         """Return a number that the fit lacks."""
         test, hypothesis = number.test, number.test.of
         holds = test.holds.astype(np.float64)[:, None]
-        return Finding(
+        return UnmodelledEffect(
             cast(Kind, hypothesis.kind),
             self._changed(number),
             *_size(number),
@@ -834,7 +836,9 @@ class _Fit:
         motors = np.unique(self.problem.readings.leg)[changed].tolist()
         return ", ".join(self.problem.legs.nominal[j].motor_label for j in motors)
 
-    def scattering(self, noise: _Scatter, hypotheses: Sequence[_Hypothesis]) -> Finding:
+    def scattering(
+        self, noise: _ExcessVariance, hypotheses: Sequence[_Hypothesis]
+    ) -> UnmodelledEffect:
         """Return how much readings or a camera scatter."""
         unit = "rad" if noise.kind == "vibration" else hypotheses[noise.group[0][0]].unit
         steps = [
@@ -850,7 +854,7 @@ class _Fit:
         # Standard deviation of the logarithm of the further variance
         spread = math.sqrt(2.0 / max(float(np.sum((more / (1.0 + more)) ** 2)), 1.0))
         sigma_of_ratio = 0.5 * spread * noise.further**2 / noise.ratio
-        return Finding(
+        return UnmodelledEffect(
             noise.kind,
             noise.subject,
             unit,
@@ -911,7 +915,7 @@ class _Scores:
         columns = np.concatenate([self.column[i][row] for i, row in group])
         return columns[columns >= 0], np.concatenate(sigma)[columns >= 0]
 
-    def with_noise(self, noise: _Scatter) -> _Scores:
+    def with_noise(self, noise: _ExcessVariance) -> _Scores:
         """Return the scores where numbers scatter as much as they were found to."""
         columns, sigma = self.of_single(noise.group, noise.sigma)
         scores = self.scores
@@ -990,7 +994,7 @@ def _encoders(hypotheses: Sequence[_Hypothesis]) -> dict[str, list[tuple[int, in
     return found
 
 
-def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | None:
+def _excess_variance(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _ExcessVariance | None:
     """Return what scatters from image to image: readings beyond what is stated, or a camera."""
     encoders = _encoders(hypotheses)
     single = sorted(one for alike in encoders.values() for one in alike)
@@ -1006,7 +1010,7 @@ def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | N
             groups.append(("autofocus", hypothesis.subject, [(i, 0)]))
         if hypothesis.kind == "camera":
             groups.append(("vibration", hypothesis.subject, [(i, row) for row in range(3)]))
-    tests = [_Scatter.of(*group, hypotheses, scores, len(groups)) for group in groups]
+    tests = [_ExcessVariance.of(*group, hypotheses, scores, len(groups)) for group in groups]
     if all(test.p_value > DOUBT_BY_CHANCE for test in tests):
         return None
     best = max(tests, key=lambda test: test.gain)
@@ -1014,8 +1018,8 @@ def _scatter(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> _Scatter | N
 
 
 @dataclass(frozen=True, eq=False)
-class _Scatter:
-    """How much readings of some motors, or a camera, scatter, by the squares of their scores.
+class _ExcessVariance:
+    """Variance of readings, or of a camera, beyond what is stated, by the squares of scores.
 
     With scores z of the errors in single images and their covariance K under the stated scatter,
     a further variance adds its multiple of K^2 to that of z; the likeliest one is taken. Blocks
@@ -1079,7 +1083,7 @@ class _Scatter:
         hypotheses: Sequence[_Hypothesis],
         scores: _Scores,
         n_tests: int = 1,
-    ) -> _Scatter:
+    ) -> _ExcessVariance:
         """Return the scatter of a group of numbers."""
         sigmas, stated = list[Array](), list[float]()
         for i, row in group:
@@ -1113,7 +1117,7 @@ def _overstated(hypotheses: Sequence[_Hypothesis], scores: _Scores) -> dict[str,
     for unit, group in _encoders(hypotheses).items():
         if not group:
             continue
-        one = _Scatter.of("reading_noise", unit, group, hypotheses, scores)
+        one = _ExcessVariance.of("reading_noise", unit, group, hypotheses, scores)
         own, squares = one.eigenvalues, one.squares
         less = np.square(_LESS) - 1.0  # of the variance
         loss = [_loss(v * np.minimum(own, 1.0), own, squares) for v in less]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
@@ -51,6 +51,7 @@ class Quantity:
     # or model (without a result)
     status: str = "model"
     defines: FrameMark | None = None  # the part of its frame that the joint defines
+    in_frame: float | None = None  # of a joint: the same coordinate in R_b or R_e
 
     @classmethod
     def of(
@@ -83,33 +84,37 @@ class Quantity:
         """The number of decimals that people are shown."""
         return DIGITS[self.unit]
 
+    @property
+    def remark(self) -> str:
+        """The status, of a joint with what it defines: ``origin of R_b``, ``defines R_b``."""
+        if self.in_frame is None or self.status not in ("frame", "estimated"):
+            return self.status
+        if self.status == "frame":
+            return f"defines {FRAMES[self.parameter.kind]}"
+        return "" if self.defines is None else f"{self.defines} of {FRAMES[self.parameter.kind]}"
+
 
 def parameters_of(result: Result) -> list[Quantity]:
     """Return the parameters of a result that tables have, joints and axes in R_b and R_e."""
-    return [
-        Quantity.of(
-            row.name, frame_of(row.name), row.unit, (row.value, row.nominal, row.sigma), row.status
-        )
-        for row in result.parameters
-        if row.is_shown
-    ]
-
-
-def frame_of(name: str) -> str:
-    """Return the frame of a parameter; "" if it has none."""
-    parameter = ParameterId.parse(name)
-    side = parameter.kind.removesuffix("_axis")
-    return FRAMES[side] if parameter.component and side in FRAMES else ""
+    quantities = []
+    for row in filter(lambda row: row.is_shown, result.parameters):
+        parameter, numbers = ParameterId.parse(row.name), (row.value, row.nominal, row.sigma)
+        frame = FRAMES.get(parameter.kind.removesuffix("_axis"), "") if parameter.component else ""
+        quantities.append(Quantity.of(row.name, frame, row.unit, numbers, row.status))
+    return quantities
 
 
 def joints_of(result: Result, *sides: Link) -> Iterator[Quantity]:
     """Yield the coordinates of the joints in the links of the model."""
+    in_frames = {"base": result.base_joints, "platform": result.platform_joints}
     for side, block in result.links.items():
+        in_frame = dict(zip(result.legs, in_frames[side], strict=True))
         for joint in block.joints if side in (sides or FRAMES) else ():
             for k, axis in enumerate("xyz"):
                 numbers = joint.xyz[k], joint.nominal[k], joint.sigma[k]
-                name = f"{joint.leg}.{side}.{axis}"
-                yield Quantity.of(name, block.link, "m", numbers, joint.status[k], joint.defines)
+                name, there = f"{joint.leg}.{side}.{axis}", 1e3 * in_frame[joint.leg][k]
+                q = Quantity.of(name, block.link, "m", numbers, joint.status[k], joint.defines)
+                yield replace(q, in_frame=there)
 
 
 def turns_of(result: Result) -> Iterator[Quantity]:
@@ -123,6 +128,25 @@ def turns_of(result: Result) -> Iterator[Quantity]:
                 yield Quantity.of(name, block.link, "rad", (turned.turn[k], 0.0, sigma), status)
 
 
+_COLUMNS: Mapping[str, Callable[[Quantity], Any]] = {
+    "parameter": lambda q: q.name,
+    "leg": lambda q: q.parameter.owner,
+    "joint": lambda q: q.parameter.kind.replace("_", " "),
+    "axis": lambda q: q.parameter.component,
+    "link": lambda q: q.frame,
+    "nominal": lambda q: q.nominal,
+    "calibrated": lambda q: q.value,
+    "change": lambda q: q.change,
+    "sigma": lambda q: q.sigma,
+    "unit": lambda q: q.unit,
+    **dict.fromkeys(("in_frame", "in R_b", "in R_e"), lambda q: q.in_frame),
+    "status": lambda q: q.remark,
+}
+_CALIBRATED = ("nominal", "calibrated", "change", "sigma")
+NUMBERS = {*_CALIBRATED, "in_frame", "in R_b", "in R_e"}
+_IN_LINK = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit")
+
+
 @dataclass(frozen=True)
 class ParameterTable:
     """The parameters of a calibration in mm, degrees and pixels; iterating yields rows as dicts.
@@ -130,62 +154,37 @@ class ParameterTable:
     ``pandas.DataFrame(table)`` makes a data frame of it.
     """
 
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]  # None where a parameter was not estimated
-    digits: tuple[int, ...]  # of the numbers of each row
+    columns: tuple[str, ...]  # keys of ``_COLUMNS``
+    quantities: tuple[Quantity, ...]
 
     @classmethod
     def of(cls, result: Result, *, joints: bool = True) -> ParameterTable:
         """Return the table of a result, joint centres in R_b and R_e or left out."""
-        quantities = [
-            q for q in parameters_of(result) if joints or not q.parameter.is_joint_coordinate
-        ]
-        rows = ((q.name, *_numbers(q), q.unit, q.status) for q in quantities)
-        columns = ("parameter", *_CALIBRATED, "unit", "status")
-        return cls(columns, tuple(rows), tuple(q.digits for q in quantities))
+        quantities = parameters_of(result)
+        some = (q for q in quantities if joints or not q.parameter.is_joint_coordinate)
+        return cls(("parameter", *_CALIBRATED, "unit", "status"), tuple(some))
 
     @classmethod
     def of_joints(cls, result: Result, *sides: Link) -> ParameterTable:
         """Return the joint centres in the links of the model, beside R_b and R_e."""
-        in_frame = {
-            f"{leg}.{side}.{axis}": 1e3 * x
-            for side, joints in (("base", result.base_joints), ("platform", result.platform_joints))
-            for leg, xyz in zip(result.legs, joints, strict=True)
-            for axis, x in zip("xyz", xyz, strict=True)
-        }
-        quantities = list(joints_of(result, *sides))
-        rows = tuple(
-            (
-                *_place(q),
-                *_numbers(q),
-                q.unit,
-                in_frame[q.name],
-                mark_in_words(q.parameter.kind, q.status, q.defines),
-            )
-            for q in quantities
-        )
-        columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "in_frame", "status")
-        return cls(columns, rows, tuple(q.digits for q in quantities))
+        return cls((*_IN_LINK, "in_frame", "status"), tuple(joints_of(result, *sides)))
 
     @classmethod
     def of_axes(cls, result: Result) -> ParameterTable:
         """Return the turns of the axes of joints from the nominal ones, about x, y, z of links."""
-        quantities = list(turns_of(result))
-        rows = tuple((*_place(q), *_numbers(q), q.unit, q.status) for q in quantities)
-        columns = ("leg", "joint", "axis", "link", *_CALIBRATED, "unit", "status")
-        return cls(columns, rows, tuple(q.digits for q in quantities))
+        return cls((*_IN_LINK, "status"), tuple(turns_of(result)))
+
+    @property
+    def rows(self) -> list[tuple[Any, ...]]:
+        """The values of all rows, None where a parameter was not estimated."""
+        return [tuple(_COLUMNS[name](q) for name in self.columns) for q in self.quantities]
 
     def without(self, *columns: str) -> ParameterTable:
         """Return the table without some columns."""
-        kept = [k for k, name in enumerate(self.columns) if name not in columns]
-        return ParameterTable(
-            tuple(self.columns[k] for k in kept),
-            tuple(tuple(row[k] for k in kept) for row in self.rows),
-            self.digits,
-        )
+        return replace(self, columns=tuple(c for c in self.columns if c not in columns))
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self.quantities)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return (self[k] for k in range(len(self)))
@@ -198,14 +197,14 @@ class ParameterTable:
 
     def __getitem__(self, row: int | slice) -> dict[str, Any] | ParameterTable:
         if isinstance(row, slice):
-            return replace(self, rows=self.rows[row], digits=self.digits[row])
+            return replace(self, quantities=self.quantities[row])
         return dict(zip(self.columns, self.rows[row], strict=True))
 
     def cells(self) -> list[tuple[str, ...]]:
         """Return the rows as texts, the status of estimated parameters left out."""
         return [
-            tuple(_cell(name, x, n) for name, x in zip(self.columns, row, strict=True))
-            for row, n in zip(self.rows, self.digits, strict=True)
+            tuple(_cell(name, x, q.digits) for name, x in zip(self.columns, row, strict=True))
+            for row, q in zip(self.rows, self.quantities, strict=True)
         ]
 
     def as_table(self, title: str = "") -> Table:
@@ -237,18 +236,6 @@ def aligned(columns: Sequence[str], rows: Sequence[Sequence[str]], numbers: Cont
     )
 
 
-def _numbers(q: Quantity) -> tuple[Any, ...]:
-    return q.nominal, q.value, q.change, q.sigma
-
-
-def _place(q: Quantity) -> tuple[str, ...]:
-    return q.parameter.owner, q.parameter.kind.replace("_", " "), q.parameter.component, q.frame
-
-
-_CALIBRATED = ("nominal", "calibrated", "change", "sigma")
-NUMBERS = {*_CALIBRATED, "in_frame", *(f"in {frame}" for frame in FRAMES.values())}
-
-
 def _cell(column: str, x: Any, digits: int) -> str:
     if column == "status":
         return "" if x == "estimated" else str(x)
@@ -257,15 +244,6 @@ def _cell(column: str, x: Any, digits: int) -> str:
     if column not in NUMBERS:
         return str(x)
     return f"{x:{'+' if column == 'change' else ''}{'' if column == 'sigma' else 'z'}.{digits}f}"
-
-
-def mark_in_words(side: str, status: str, defines: FrameMark | None) -> str:
-    """Return the remark on a coordinate that is not simply estimated: ``defines R_b``."""
-    if status == "frame":
-        return f"defines {FRAMES[side]}"
-    if status == "estimated":
-        return "" if defines is None else f"{defines} of {FRAMES[side]}"
-    return status
 
 
 def tables(result: Result) -> list[tuple[str, ParameterTable]]:

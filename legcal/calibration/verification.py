@@ -552,19 +552,13 @@ def _compare(
     movement = judge_movement(measured_difference, saved, parts, dof, changes, significance)
     fit = free if movement.moved else near
     J = pose_sensitivity(geometries(machine), parametrization, machine.frame_legs, *fit.poses)
-    at_platform = _moved_platform(J[:, :, columns], fit, prior)
-    return Check(dataset, earlier, solution, movement, at_platform)
-
-
-def _moved_platform(J: Array, fit: _Free, prior: _EarlierEstimate) -> MovedPlatform:
-    """Return the platform motion of a fit; J (k, 6, n) is its derivative by the parameters."""
-    values, covariance = fit.estimate()
+    J, (values, covariance) = J[:, :, columns], fit.estimate()
     # Priors shrink the estimate towards the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.sigma**2
     spread = G @ covariance + G @ prior.covariance @ G.T
-    dX_m, dE_rad = moved_by(J, (values - prior.old)[:, None]).rms
-    sigma_dX_m, sigma_dE_rad = expected_error(J, spread).rms
-    return MovedPlatform(dX_m=dX_m, dE_rad=dE_rad, sigma_dX_m=sigma_dX_m, sigma_dE_rad=sigma_dE_rad)
+    (dX, dE), sigma = moved_by(J, (values - prior.old)[:, None]).rms, expected_error(J, spread).rms
+    moved = MovedPlatform(dX_m=dX, dE_rad=dE, sigma_dX_m=sigma[0], sigma_dE_rad=sigma[1])
+    return Check(dataset, earlier, solution, movement, moved)
 
 
 def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:

@@ -223,7 +223,7 @@ def calibrate(
         beside=page_of if with_report else None,
         **arguments,
     )
-    page_of.say()
+    page_of.print_failure()
     show(
         as_json,
         lambda: calibration.document(found, output, command_line()),

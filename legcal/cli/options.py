@@ -123,7 +123,7 @@ def write_page(
 class PageOfResult:
     """Makes the page of a result in the folder of its other files, before that appears.
 
-    An error then loses the page only, and :meth:`say` prints it.
+    An error then loses the page only, and :meth:`print_failure` prints it.
     """
 
     make: Callable[[Any, Path], object]  # of the result, into the folder
@@ -140,7 +140,7 @@ class PageOfResult:
                 cause = " ".join(error.problems)
             self.failure = f"The result was written without {REPORT}: {cause}"
 
-    def say(self) -> None:
+    def print_failure(self) -> None:
         """Print the error on stderr, if there was one."""
         if self.failure and sys.stderr is not None:
             sys.stderr.write(f"legcal: {printable(self.failure)}\n")

@@ -171,7 +171,7 @@ def paper(
         progress=not quiet,
         beside=page,
     )
-    page.say()
+    page.print_failure()
     show(as_json, lambda: document, lambda: study_table(document))
     if output is not None and not as_json:
         print_table(f"\nDocument and figures: {output}")

@@ -557,12 +557,6 @@ LINEAR_UNITS = {
 _UNSEEN = "No radius of the legs is stated: give --leg-radius, without which legs are invisible."
 
 
-def length_unit(word: str) -> str | None:
-    """Return the unit of lengths that a word means, None for others."""
-    word = word.lower()
-    return word if word in LENGTH else LINEAR_UNITS.get(word)
-
-
 def linuxcnc_table(path: Path, text: str, given: Mapping[str, Any]) -> Table | None:
     """Return the table of a HAL file, or of an INI file with the lines of its HAL files."""
     if not re.search(r"^\s*#?\s*\[(KINS|TRAJ|JOINT_\d)\]|^\s*setp\s+genhex", text, re.MULTILINE):
@@ -833,8 +827,8 @@ def _length(path: Path, key: str, label: str, written: str) -> tuple[float, str 
     written = re.split(r"#|;|//", written)[0].strip().rstrip(",").strip("\"' \t")
     number, behind = split_quantity(written)
     within = re.search(r"[\[(]\s*([A-Za-z]+)\s*[\])]", label)
-    words = [word for word in (behind, within[1] if within else "") if word]
-    units = [length_unit(word) for word in words]
+    words = [word.lower() for word in (behind, within[1] if within else "") if word]
+    units = [word if word in LENGTH else LINEAR_UNITS.get(word) for word in words]
     if np.isnan(number) or None in units or len(set(units)) > 1:
         found = " ".join([*([within[0]] if within else []), written])
         raise ModelError(

@@ -585,7 +585,9 @@ def create_model(
         try:
             loaded = load_mechanism(temporary / names[0])
         except LegcalError as error:
-            raise error.told(lambda problem: _of_source(problem, temporary, machine)) from error
+            raise error.map_problems(
+                lambda problem: _of_source(problem, temporary, machine)
+            ) from error
         before(loaded, machine.notes)
     yaml_path, urdf_path = (output / name for name in names)
     return Created(load_mechanism(yaml_path), yaml_path, urdf_path, machine.notes)

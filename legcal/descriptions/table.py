@@ -947,7 +947,8 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
             for size, unit in zip(sizes, units, strict=False)
         ]
         lines = _scaled(lines, factors)
-    at_home = any(map(_is_at_home, [*header, *(text for _, cells in lines for text in cells[:2])]))
+    named = [*header, *(text for _, cells in lines for text in cells[:2])]
+    at_home = any("home" in concepts(text) and _place(text) is not None for text in named)
     lines = [(number, [_column(text, names) for text in header]), *lines[1:]]
     first = [cells[0] for _, cells in lines[1:]]
     if lines[0][1][0] == "rod" and first == [str(k) for k in range(1, len(first) + 1)]:
@@ -959,8 +960,8 @@ def _one_row_a_leg(lines: Lines, names: Sequence[str], path: Path) -> Lines:
     if any(coordinate is not None and coordinate[1] for coordinate in coordinates):
         lines = _from_one_row(lines, coordinates, sides, path)
     else:
-        named = zip(coordinates, lines[0][1], strict=True)
-        header = [f"{sides[x[0]]}_{x[2]}" if x and x[2] else text for x, text in named]
+        columns = zip(coordinates, lines[0][1], strict=True)
+        header = [f"{sides[x[0]]}_{x[2]}" if x and x[2] else text for x, text in columns]
         lines = [(number, header), *lines[1:]]
     stated = {"unit": of_lengths[0] if of_lengths else "", "platform_in": "base" if at_home else ""}
     return _of_legs(lines, stated)
@@ -1071,11 +1072,6 @@ def _place(text: str) -> tuple[str, str, str] | None:
     if not numbers and not axes:
         return None
     return sides.pop(), "".join(numbers), "".join(axes)
-
-
-def _is_at_home(text: str) -> bool:
-    """Return whether a heading or a name is that of a joint as it is at home."""
-    return "home" in concepts(text) and _place(text) is not None
 
 
 def _joint(name: str) -> tuple[str, str] | None:

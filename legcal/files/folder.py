@@ -253,7 +253,7 @@ def result_folder(
         try:
             yield new
         except LegcalError as error:
-            raise error.told(lambda problem: problem.moved(new, destination)) from error
+            raise error.map_problems(lambda problem: problem.moved(new, destination)) from error
         for path in sorted(new.rglob("*.yaml")):
             write_schemas(path)
         _check_places(new, destination, kind, replaceable)

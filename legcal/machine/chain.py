@@ -107,7 +107,7 @@ class ClosedChain:
         try:
             return cls(urdf.text, closures, normals, gains)
         except ModelError as error:
-            raise error.told(lambda problem: problem.in_file(urdf.path)) from error
+            raise error.map_problems(lambda problem: problem.in_file(urdf.path)) from error
 
     def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
         return ClosedChain, (self.text, self.closures, self.normals, self.gains)

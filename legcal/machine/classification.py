@@ -91,7 +91,7 @@ def classify_leg(
         else:
             slider, (n_lower, ends) = None, _rod(axes, leg, within)
     except OutOfClass as error:
-        raise error.told(lambda problem: problem.in_file(path)) from error
+        raise error.map_problems(lambda problem: problem.in_file(path)) from error
     return LegChain(tuple(steps), tuple(poses), n_lower, slider, *ends)
 
 

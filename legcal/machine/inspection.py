@@ -17,7 +17,6 @@ from legcal.machine.files import LegcalBlock, motor_entries
 from legcal.machine.home import home_reading_in_words, in_yaml, legs_outside
 from legcal.machine.leg import Cylinder, JointType, Leg, LegKind
 from legcal.machine.model import Machine, readings_at
-from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import ties_in_words
 from legcal.machine.topology import level_rotation
 
@@ -125,7 +124,6 @@ def machine_document(machine: Machine) -> dict[str, Any]:
     kinds = [leg.kind for leg in machine.legs]
     readings = readings_at(machine, machine.home).tolist()
     stated = motor_entries(machine.actuators)
-    bodies = bodies_of(machine.occluders, machine.n_legs)
     actuators = dict[str, InspectedActuator]()
     for a in machine.actuators:
         document = a.document() | stated.get(a.joint, {})
@@ -147,7 +145,7 @@ def machine_document(machine: Machine) -> dict[str, Any]:
         home=Pose.of(machine.home),
         reach=machine.reach if np.isfinite(machine.reach) else None,
         floor=machine.floor if np.isfinite(machine.floor) else None,
-        legs=[_leg(*one) for one in zip(machine.legs, readings, bodies, strict=True)],
+        legs=[_leg(*one) for one in zip(machine.legs, readings, machine.bodies, strict=True)],
         actuators=actuators or None,
         diagnostics=list(machine.diagnostics),
     ).document()
@@ -293,9 +291,7 @@ def _level_note(machine: Machine, q: Array) -> list[str]:
 
 def _unseen_notes(machine: Machine) -> list[str]:
     """Return notes on legs without visible cylinder or body."""
-    bodies = bodies_of(machine.occluders, machine.n_legs)
-    of_legs = zip(machine.legs, bodies, strict=True)
-    unseen = [leg.name for leg, around in of_legs if not leg.cylinders and not around]
+    unseen = [machine.leg_names[j] for j in machine.unseen_legs]
     if not unseen:
         return []
     if len(unseen) == 1:

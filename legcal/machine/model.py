@@ -33,7 +33,7 @@ from legcal.machine.rods import (
     reading_legs,
     readings_of_rods,
 )
-from legcal.machine.shapes import Occluder, reordered
+from legcal.machine.shapes import Occluder, bodies_of, reordered
 from legcal.machine.tolerance import NOT_STATED, Tolerance
 from legcal.machine.urdf import Urdf
 
@@ -97,6 +97,16 @@ class Machine:
     def leg_names(self) -> tuple[str, ...]:
         """Names of the legs."""
         return tuple(leg.name for leg in self.legs)
+
+    @cached_property
+    def bodies(self) -> list[list[Cylinder]]:
+        """Bodies with straight edges around the axis of each leg, as cylinders."""
+        return bodies_of(self.occluders, self.n_legs)
+
+    @property
+    def unseen_legs(self) -> tuple[int, ...]:
+        """Indices of the legs that no image can show: without a visible cylinder or body."""
+        return tuple(j for j, leg in enumerate(self.legs) if not (leg.cylinders or self.bodies[j]))
 
     @cached_property
     def motors(self) -> tuple[int, ...]:

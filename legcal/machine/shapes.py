@@ -114,7 +114,8 @@ def with_arms(
             for cylinder in shown
             if bodies.body_of[cylinder.link] == chain.bodies[0]
         ]
-        seen = [arm for arm in candidates if _from_axis(arm.ends, actuator).max() > within]
+        axis = actuator.axis, actuator.point
+        seen = [arm for arm in candidates if distance_to_line(arm.ends, *axis).max() > within]
         longest = max(seen, key=lambda arm: (arm.length, arm.radius), default=None)
         arms[actuator.joint] = replace(actuator, arm=longest)
     return tuple(
@@ -127,15 +128,10 @@ def with_arms(
 
 def _arm(cylinder: VisualCylinder, ends: Array, actuator: Actuator, leg: str, within: float) -> Arm:
     """Return a cylinder with ends (2, 3) as an arm, from the axis of its motor outwards."""
-    near, far = _from_axis(ends, actuator)
+    near, far = distance_to_line(ends, actuator.axis, actuator.point)
     first, last = ends if near <= far + within else ends[::-1]
     line = Line(0.5 * (first + last), (last - first) / cylinder.length)
     return Arm(line, cylinder.length, cylinder.radius, cylinder.link, leg)
-
-
-def _from_axis(points: Array, actuator: Actuator) -> Array:
-    """Return the distances (n,) of points (n, 3) from the axis of a motor [m]."""
-    return distance_to_line(points, actuator.axis, actuator.point)
 
 
 def at_visible_heights(

@@ -34,7 +34,6 @@ from legcal.geometry.lines import cross
 from legcal.geometry.tables import first_apart
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.machine.leg import Cylinder
-from legcal.machine.model import Machine
 from legcal.machine.shapes import Occluder, PlacedOccluders, bodies_of
 from legcal.perception.blocks import BlockLine, fit_lines
 from legcal.perception.photographs import Photographs
@@ -80,11 +79,6 @@ def measure_body_edges(
         tables.append(edges)
         report(stage, n + 1, len(rows))
     return join_outlines(tables)
-
-
-def has_bodies(machine: Machine) -> bool:
-    """Whether a leg has a body with straight edges."""
-    return any(bodies_of(machine.occluders, len(machine.legs)))
 
 
 def _of_image(search: Search, placement: Placement, row: int) -> Outlines:

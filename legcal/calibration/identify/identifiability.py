@@ -72,7 +72,6 @@ from legcal.machine.parameters import (
     sparse_basis,
     split_by_motion,
 )
-from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import by_step, independent, ties_in_words
 from legcal.paper.conditions import (
     Condition,
@@ -97,10 +96,6 @@ class Analysis:
     session: Session
     choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
     noise: PredictedNoise = DEFAULT_NOISE
-
-    def with_board(self, link: Link = "base") -> Analysis:
-        """Analyse the same images with a board on a link in all of them."""
-        return replace(self, session=self.session.with_board(link))
 
     @cached_property
     def contributions(self) -> Contributions:
@@ -196,7 +191,7 @@ def undetermined(
 ) -> Array:
     """Return an orthonormal basis (w, c) of the directions that rows (m, c) do not determine."""
     _, singular, basis = np.linalg.svd(compress(information))
-    return np.asarray(basis[singular <= _limit(session, sigma)])
+    return np.asarray(basis[singular * sigma * session.mean_length <= 1.0])
 
 
 def missing(session: Session, rows: Array) -> int:
@@ -235,10 +230,6 @@ def _direction(session: Session, row: Array, harmless: bool) -> WeakDirection:
         dE_rad,
         harmless,
     )
-
-
-def _limit(session: Session, sigma: float = _MAX_SIGMA) -> float:
-    return 1.0 / (sigma * session.mean_length)
 
 
 # The scale
@@ -543,7 +534,7 @@ def check_identifiable(
     # A rank does not depend on errors that edges share, and many images have many of these.
     analysis = replace(_analysis_of(dataset, choices), noise=WHITE)
     full = analysis.full
-    is_open = bool(analysis.session.actuators) and is_scale_open(analysis)
+    is_open = bool(analysis.session.machine.actuators) and is_scale_open(analysis)
     n_harmless = sum(direction.harmless for direction in full.weak)
     if is_open and n_open_with_radii(analysis) <= n_harmless:  # nothing else is open
         raise NotIdentifiable(refusal_of_scale(dataset, analysis))
@@ -598,7 +589,7 @@ def _report_on(
         platform_sigma=analysis.platform_sigma if full.complete else None,
         remedies=() if full.complete else find_remedies(analysis, replanned),
         notes=tuple(notes),
-        scale_is_open=bool(session.actuators) and is_scale_open(analysis),
+        scale_is_open=bool(machine.actuators) and is_scale_open(analysis),
         parts=analysis.parts or None,
         paper=PaperBlock(ok=not any(condition.fails for condition in conditions)),
     )
@@ -621,11 +612,9 @@ def _rough_notes(analysis: Analysis) -> list[str]:
 
 
 def _machine_notes(machine: Machine) -> list[str]:
-    bodies = bodies_of(machine.occluders, len(machine.legs))
-    hidden = [j for j, leg in enumerate(machine.legs) if not (leg.cylinders or bodies[j])]
     notes = []
-    if hidden:
-        which = legs_in_words(hidden, machine.leg_names)
+    if machine.unseen_legs:
+        which = legs_in_words(machine.unseen_legs, machine.leg_names)
         notes.append(
             f"The model has no <visual> cylinder along {which}: visible cylinders with a radius of "
             f"{100 * THIN:g} % of the mean leg length are assumed; add one to each."
@@ -643,10 +632,11 @@ def conditions_of(session: Session) -> tuple[Condition, ...]:
     leg.
     """
     image, leg = session.seen[session.view].nonzero()
+    spatial = session.machine.spatial
     counts = count_conditions(
         session.views,
         session.n_legs,
-        spatial=session.spatial,
+        spatial=spatial,
         revolute=[j for j, x in enumerate(session.legs) if x.base_joint is JointType.REVOLUTE],
         passive=[j for j, has in enumerate(session.with_length) if not has],
         board=bool(session.board.all()),
@@ -661,7 +651,7 @@ def conditions_of(session: Session) -> tuple[Condition, ...]:
     return (
         *counts,
         replace(directions, ok=not standing, legs=standing),
-        three_legs_at_once(session.views, geometries(session.machine), spatial=session.spatial),
+        three_legs_at_once(session.views, geometries(session.machine), spatial=spatial),
     )
 
 
@@ -727,14 +717,8 @@ def read_views(
 def _refusal(dataset: Dataset, report: Identifiability) -> str:
     """Describe why a dataset cannot be calibrated, and the remedies."""
     remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
-    bodies = bodies_of(dataset.machine.occluders, len(dataset.machine.legs))
-    unseen = [
-        leg.name
-        for leg, of_leg in zip(dataset.machine.legs, bodies, strict=True)
-        if not (leg.cylinders or of_leg)
-    ]
-    if unseen:
-        names = legs_in_words([dataset.machine.leg_names.index(n) for n in unseen], report.legs)
+    if unseen := dataset.machine.unseen_legs:
+        names = legs_in_words(unseen, report.legs)
         remedies.insert(0, f"add a <visual> cylinder along {names}: without it, no image shows it")
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (
@@ -843,12 +827,14 @@ def _further_cameras(analysis: Analysis) -> Iterator[_Candidate]:
 
 def _board(analysis: Analysis) -> Iterator[_Candidate]:
     """Yield a calibration board on the base, and one on the platform."""
-    if len(set(analysis.session.frame.tolist())) > 1:
-        text = "put a calibration board on the base, visible to every camera"
-        yield text, analysis.with_board(), ()
-    if not analysis.session.platform_board.any():
-        text = "put a calibration board on the platform, visible to every camera"
-        yield text, analysis.with_board("platform"), ()
+    session, links = analysis.session, list[Link]()
+    if len(set(session.frame.tolist())) > 1:
+        links.append("base")
+    if not session.platform_board.any():
+        links.append("platform")
+    for link in links:
+        text = f"put a calibration board on the {link}, visible to every camera"
+        yield text, replace(analysis, session=session.with_board(link)), ()
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[_Candidate]:
@@ -875,7 +861,7 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
     seen[0, list(legs)] = True
     A, B = (end.mean(axis=0) for end in session.ends)
     rng = np.random.default_rng(_SEED)
-    (further,) = default_cameras(A, B, [legs], session.spatial, rng)
+    (further,) = default_cameras(A, B, [legs], session.machine.spatial, rng)
     extended = replace(
         session,
         found=None,

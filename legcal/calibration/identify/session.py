@@ -38,7 +38,6 @@ from legcal.estimation.problem import Frames
 from legcal.geometry.lines import cross
 from legcal.geometry.motions import components, look_at
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.machine.actuator import Actuator
 from legcal.machine.closing import solve_poses
 from legcal.machine.configurations import random_poses
 from legcal.machine.equations import pose_sensitivity
@@ -56,16 +55,13 @@ from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
     geometries,
-    is_spatial,
     moved_legs,
     parametrization_of,
 )
 from legcal.machine.rods import (
     actuator_index,
-    actuators_of,
     ends_at_poses,
 )
-from legcal.machine.shapes import bodies_of
 from legcal.machine.ties import machine_ties, on_ties
 from legcal.perception.body_edges import predicted_edges
 from legcal.vision.board import Board, FixedBoard, facing_board
@@ -148,11 +144,9 @@ class Session:
     def fitted(self) -> FittedLegs:
         """The legs as the joint fit takes them; a leg without any visible part has a thin rod."""
         shortest, legs = self.length.min(axis=0).tolist(), list(self.legs)
-        bodies = bodies_of(self.machine.occluders, self.n_legs)
-        for j, leg in enumerate(self.legs):
-            if not leg.cylinders and not bodies[j]:
-                thin = Cylinder(leg.name, THIN * self.mean_length, "base", 0.0, shortest[j])
-                legs[j] = replace(leg, cylinders=(thin,))
+        for j in self.machine.unseen_legs:
+            thin = Cylinder(legs[j].name, THIN * self.mean_length, "base", 0.0, shortest[j])
+            legs[j] = replace(legs[j], cylinders=(thin,))
         radii = {(j, p): r for j, leg in enumerate(legs) for p, r in leg.radius_of_part.items()}
         m = self.machine
         return FittedLegs(m.leg_names, tuple(legs), m.frame_legs, radii, m.home_of_frames)
@@ -260,20 +254,10 @@ class Session:
         frame = np.where(self.board, first, np.arange(self.n_views))
         return np.asarray(np.unique(frame, return_inverse=True)[1])
 
-    @property
-    def spatial(self) -> bool:
-        """Whether the platform moves in space and not in a plane."""
-        return is_spatial(self.machine.frame_legs)
-
     @cached_property
     def views(self) -> tuple[tuple[int, ...], ...]:
         """The legs of each view."""
         return tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in self.seen)
-
-    @cached_property
-    def actuators(self) -> tuple[Actuator, ...]:
-        """What moves joints at A, each once."""
-        return actuators_of(self.legs)
 
     @cached_property
     def carried_by(self) -> IntArray:
@@ -290,7 +274,7 @@ class Session:
         """The legs on each actuator, and whether it turns."""
         return tuple(
             (tuple(np.flatnonzero(self.carried_by == a).tolist()), actuator.turns)
-            for a, actuator in enumerate(self.actuators)
+            for a, actuator in enumerate(self.machine.actuators)
         )
 
     @cached_property
@@ -427,12 +411,9 @@ def recorded_session(
         t_reached = np.concatenate([t, t_more[n_drawn:]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
-    bodies = bodies_of(machine.occluders, len(machine.legs))
-    is_visible = [
-        bool(leg.cylinders or of_leg) for leg, of_leg in zip(machine.legs, bodies, strict=True)
-    ]
     of_views = [[view.uses(leg.name) for leg in machine.legs] for view in views]
-    seen = np.array(of_views, dtype=np.bool_) & is_visible
+    seen = np.array(of_views, dtype=np.bool_)
+    seen[:, list(machine.unseen_legs)] = False
     A, B = ends_at_pose(legs, machine.home_of_frames)
     shown = [np.flatnonzero(row).tolist() for row in seen]
     placed = default_cameras(A, B, shown, machine.spatial, rng)

@@ -241,7 +241,7 @@ def tool_measurements(
     try:
         T = forward_kinematics_many(machine, poses.q)
     except (DidNotConverge, UsageError) as error:
-        raise error.told(lambda problem: _of_table(problem, name)) from error
+        raise error.map_problems(lambda problem: _of_table(problem, name)) from error
     matrices = np.array([pose.as_matrix() for pose in T])
     pairs = PosePairs(
         R=matrices[:, :3, :3],
