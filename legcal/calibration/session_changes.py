@@ -67,6 +67,7 @@ _LESS = np.geomspace(1e-3, 0.2, 24)  # of the stated standard deviation of readi
 _SURELY_LESS = 10.0  # of the logarithm of the likelihood
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
 MOST_REJECTED, FEW = 0.5, 0.1  # outlines of an image that is not left out; of images that are
+_SAME_SCATTER = 0.3  # of that of all images, by those in the fit: of less a few make the most
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
@@ -279,9 +280,14 @@ def session_tests(
     changes = any(finding.kind not in OF_SCATTER for finding in tests.findings)
     if changes or not 0.0 < left_out.mean() <= FEW:
         return tests
-    # A few wrong rows, or photographs of others, are no scatter if there is none without them
+    # A few wrong rows, or photographs of others, are no scatter if there is far less without them
     others = _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
-    return tests if {finding.kind for finding in others.findings} & OF_SCATTER else others
+    of_all, of_others = (
+        {one.kind: one.amount / one.stated for one in found.findings if one.kind in OF_SCATTER}
+        for found in (tests, others)
+    )
+    same = (of_others[kind] > _SAME_SCATTER * of_all[kind] for kind in of_all.keys() & of_others)
+    return tests if any(same) else others
 
 
 def _tests(
