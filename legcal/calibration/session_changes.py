@@ -319,8 +319,9 @@ def _tests(
     noise, overstated = _scatter(hypotheses, left), _overstated(hypotheses, left)
     if lacking or noise:
         least = max((number.explains for number in lacking), default=0.0)
-        by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
-        better = fit.better(least, by_scatter)
+        of_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
+        in_all = max((number.explains * number.scatter for number in lacking), default=of_scatter)
+        better = fit.better(least, in_all)
         if better is not None:
             noise, lacking = None, [better]
     if noise is not None:
@@ -800,18 +801,18 @@ class _Fit:
             stacked[name] = csc_array((value, (number, at)), shape=(shapes[name], c))
         return _Scores(Projected.of(self.normal, stacked), columns)
 
-    def better(self, least: float, by_scatter: float) -> _Solved | None:
+    def better(self, least: float, in_all: float) -> _Solved | None:
         """Return a joint that moved or an error once a turn that explains more than what was found.
 
-        In squares: *least* in units of the scatter that a number leaves behind, *by_scatter* in
-        those of the covariances of outlines.
+        In squares: *least* in units of the scatter that a number leaves behind, *in_all* in those
+        of the covariances of outlines. Wrong edges near a right cause leave scatter behind.
         """
         best, asked = None, 0
         for hypotheses in (*self.of_joints(), *self.of_screws()):
             tests = list(chain.from_iterable(map(self.course.tests, count(), hypotheses)))
             asked += len(tests)
             for solved in self.scores(hypotheses).solved(tests):
-                if solved.explains > least and solved.explains * solved.scatter > by_scatter:
+                if solved.explains > least and solved.explains * solved.scatter > in_all:
                     least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 
