@@ -204,10 +204,13 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
     effect = found.platform.effects[FITTED_CAMERA]
     assert (doubt.code, doubt.sigma_dX_m) == ("camera", effect.mean_displacement)
     assert model_error(found.doubts) == (effect.mean_displacement, effect.mean_rotation)
-    large = {FITTED_CAMERA: 1e4 * focal}
-    found = _judged(healthy, **changes | {"sensitivities": large})
-    assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
-    assert found.verdict.is_to_be_refused
+    by_half = 0.7 * found.platform.change.mean_displacement / effect.mean_displacement
+    for size in (by_half, 1e4):  # the cause of too small an improvement comes first
+        large = {"sensitivities": {FITTED_CAMERA: size * focal}}
+        found = _judged(healthy, **changes | large)
+        assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
+        assert found.doubts[0].is_grave == (size > by_half)
+        assert found.verdict.is_to_be_refused
 
 
 def test_a_platform_no_better_known_than_built_has_tolerances_as_its_next_step(

@@ -1,5 +1,6 @@
 """Readings in degrees, radians and pulses of servos, stated and taken for each other."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ from command_line import Outcome, run
 from csv_rows import read_rows
 from dataset_folder import SERVOS, dataset_of_readings
 from machines import ROOT, read_table
+from scaled import scaled_dataset
+from simulated import simulated
 from test_init import own_folder
 
 from legcal import LegcalError, load_dataset, load_mechanism
 from legcal.data.reading_units import sigmas_of
 from legcal.descriptions.new_model import create_model
-from legcal.errors import ModelError, UsageError
+from legcal.errors import DatasetError, ModelError, UsageError
 from legcal.machine.model_writer import write_model
 
 ANGLES = 0.5 * np.sin(np.arange(24.0).reshape(4, 6))  # [rad]
@@ -66,6 +69,15 @@ def servo_table(folder: Path, **changes: Any) -> Path:
     path = folder / "servos.yaml"
     path.write_text(yaml.safe_dump(table | {"name": "servos"}, sort_keys=False))
     return path
+
+
+def test_a_model_in_inches_is_named_by_readings_that_hardly_use_its_travel(tmp_path: Path) -> None:
+    session = simulated(tmp_path / "set", "hexapod", poses=12).folder
+    in_inches = scaled_dataset(session, tmp_path / "inches", 1.0 / 0.0254)
+    for name in ("dataset.yaml", "measurements.csv"):
+        shutil.copy(session / name, in_inches / name)
+    with pytest.raises(DatasetError, match=r"if its lengths are inches, needed a model in metres"):
+        load_dataset(in_inches, check_images=False)
 
 
 def test_a_model_keeps_the_pulses_of_its_servos(tmp_path: Path) -> None:

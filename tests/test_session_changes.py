@@ -225,6 +225,20 @@ def test_an_encoder_sigma_far_above_what_readings_scatter_is_noted(
         assert np.all(np.abs(np.log2(1e-3 * found / m.sigma_q)) < 1.0)
 
 
+def test_scatter_is_that_of_the_images_that_have_a_part_in_the_fit(
+    healthy: Dataset, start: Start
+) -> None:
+    little, n = 0.1 * TURN, healthy.measurements.n_rows
+    scattered = _with_each_rays(
+        lambda rng: Rotation.from_rotvec(little * rng.normal(size=3)).apply
+    )(healthy)
+    for row in (15, 20):  # as by a tripod that was pushed
+        scattered = with_rays(scattered, np.arange(n) == row, turned(25.0 * TURN))
+    finding = _findings(scattered, start)[0]
+    assert (finding.kind, finding.subject) == ("vibration", "c2")
+    assert abs(finding.amount - little) < 4.0 * finding.sigma < 2.0 * little
+
+
 def _exchanged(dataset: Dataset) -> Dataset:
     """Exchange two photographs of the first view."""
     outlines = dataset.observations

@@ -67,6 +67,7 @@ _LESS = np.geomspace(1e-3, 0.2, 24)  # of the stated standard deviation of readi
 _SURELY_LESS = 10.0  # of the logarithm of the likelihood
 _FURTHER = (-5.0, 30.0)  # logarithms of variances of readings over the stated one
 MOST_REJECTED, FEW = 0.5, 0.1  # outlines of an image that is not left out; of images that are
+_SAME_SCATTER = 0.3  # of that of all images, by those in the fit: of less a few make the most
 MOST_SCATTER = 2.0  # times the stated standard deviation of readings
 
 Kind = Literal[
@@ -281,9 +282,14 @@ def session_tests(
     changes = any(finding.kind not in OF_SCATTER for finding in tests.findings)
     if changes or not 0.0 < left_out.mean() <= FEW:
         return tests
-    # A few wrong rows, or photographs of others, are no scatter if there is none without them
+    # A few wrong rows, or photographs of others, are no scatter if there is far less without them
     others = _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
-    return tests if {finding.kind for finding in others.findings} & OF_SCATTER else others
+    of_all, of_others = (
+        {one.kind: one.amount / one.stated for one in found.findings if one.kind in OF_SCATTER}
+        for found in (tests, others)
+    )
+    same = (of_others[kind] > _SAME_SCATTER * of_all[kind] for kind in of_all.keys() & of_others)
+    return tests if any(same) else others
 
 
 def _tests(
@@ -315,8 +321,9 @@ def _tests(
     noise, overstated = _excess_variance(hypotheses, left), _overstated(hypotheses, left)
     if lacking or noise:
         least = max((number.explains for number in lacking), default=0.0)
-        by_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
-        better = fit.better(least, by_scatter)
+        of_scatter = 2.0 * noise.gain if noise is not None and not lacking else 0.0
+        in_all = max((number.explains * number.scatter for number in lacking), default=of_scatter)
+        better = fit.better(least, in_all)
         if better is not None:
             noise, lacking = None, [better]
     if noise is not None:
@@ -796,18 +803,18 @@ class _Fit:
             stacked[name] = csc_array((value, (number, at)), shape=(shapes[name], c))
         return _Scores(Projected.of(self.normal, stacked), columns)
 
-    def better(self, least: float, by_scatter: float) -> _Solved | None:
+    def better(self, least: float, in_all: float) -> _Solved | None:
         """Return a joint that moved or an error once a turn that explains more than what was found.
 
-        In squares: *least* in units of the scatter that a number leaves behind, *by_scatter* in
-        those of the covariances of outlines.
+        In squares: *least* in units of the scatter that a number leaves behind, *in_all* in those
+        of the covariances of outlines. Wrong edges near a right cause leave scatter behind.
         """
         best, asked = None, 0
         for hypotheses in (*self.of_joints(), *self.of_screws()):
             tests = list(chain.from_iterable(map(self.course.tests, count(), hypotheses)))
             asked += len(tests)
             for solved in self.scores(hypotheses).solved(tests):
-                if solved.explains > least and solved.explains * solved.scatter > by_scatter:
+                if solved.explains > least and solved.explains * solved.scatter > in_all:
                     least, best = solved.explains, solved
         return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
 

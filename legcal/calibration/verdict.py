@@ -120,13 +120,23 @@ def judge(
         what = "a predicted improvement below two sigma is no improvement"
         more = remedy or "take more images or better ones"
         doubts = (*doubts, Doubt("no_improvement", what, more, is_grave=True))
-    # Grave ones first, then those of known effects, the largest first
-    doubts = tuple(sorted(doubts, key=lambda one: (not one.is_grave, -(one.sigma_dX_m or 0.0))))
+    # Grave ones first, then those of known effects, the largest first; too small an improvement
+    # follows what may have caused it
+    doubts = tuple(
+        sorted(
+            doubts,
+            key=lambda one: (
+                one.code == "no_improvement",
+                not one.is_grave,
+                -(one.sigma_dX_m or 0.0),
+            ),
+        )
+    )
     sentence = f"Calibrated: {found}."
     if doubts:
         n_more = len(doubts) - 1
         beside = f" {n_more} more doubt{'s' * (n_more > 1)} beside that." if n_more else ""
-        heading = REFUSED if doubts[0].is_grave else "In doubt"
+        heading = REFUSED if any(doubt.is_grave for doubt in doubts) else "In doubt"
         sentence = f"{heading}: {found}. {doubts[0].sentence}{beside}"
     causes = {finding.what for finding in session.findings}
     if any(doubt.what in causes or doubt.code in ("scale", "mistake") for doubt in doubts):

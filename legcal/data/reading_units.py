@@ -469,7 +469,10 @@ def doubtful_units(
             key=lambda m: float(m.used(motors).mean()),
             default=None,
         )
-        if used >= HARDLY_MOVES or other is None or other.used(motors).mean() <= SURELY_MOVES:
+        if used >= HARDLY_MOVES:
+            continue
+        if other is None or other.used(motors).mean() <= SURELY_MOVES:
+            problems += _unit_of_model(path, q[:, some], motors)
             continue
         moved = 100.0 * float(other.used(motors).mean())
         problems.append(
@@ -484,3 +487,28 @@ def doubtful_units(
             )
         )
     return problems
+
+
+def _unit_of_model(path: Path, q: Array, motors: Sequence[Leg]) -> list[Problem]:
+    """Return the problem of a model in another unit, by whose travel motors hardly move, if so.
+
+    Readings (n_rows, n_motors) in metres use most of the travel where that is converted.
+    """
+    for unit in () if motors[0].reads_angle else USUAL_UNITS[False][1:]:
+        meant = Meaning((ReadingUnit(unit),), q / LENGTH[unit])
+        moved = float(meant.used(motors).mean())
+        if moved > SURELY_MOVES and in_travel(meant.q, motors).all():
+            width = np.ptp([leg.travel for leg in motors], axis=1)
+            return [
+                Problem(
+                    "the readings could not be used",
+                    f"that they use {100.0 * float(np.max(np.ptp(q, axis=0) / width)):.2g} % of "
+                    f"the travel of the model, and {100.0 * moved:.2g} % if its lengths are "
+                    f"{_WORDS[unit]}",
+                    "a model in metres",
+                    "convert all lengths of the model",
+                    str(path),
+                    columns=tuple(str(leg.prismatic) for leg in motors),
+                )
+            ]
+    return []

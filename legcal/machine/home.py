@@ -59,7 +59,7 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
             f"{machine.urdf.wording.home} could not be used",
             f"{problem} there",
             "a closed pose",
-            machine.urdf.wording.correct_home,
+            f"{machine.urdf.wording.correct_home}, or joints that are exchanged or misplaced",
             machine.yaml_path,
         )
     configuration = close_at(machine, projected, exact=False)

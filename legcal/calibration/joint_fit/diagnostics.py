@@ -79,11 +79,13 @@ def _contradiction(
     """Describe a stated value that the measurements contradict."""
     mean, sigma = stated
     what, remedy = ("prior", "") if sigma else ("fixed value", "give it a prior, ")
+    given = "stated or assumed" if sigma else "stated"  # of a twist without a choice
     in_words = f"{mean:.6g} +- {sigma:.2g} {unit}" if sigma else f"{mean:.6g} {unit}"
     return (
-        f"The {what} of {name} contradicts the measurements: stated {in_words}, measured about "
+        f"The {what} of {name} contradicts the measurements: {given} {in_words}, measured about "
         f"{measured:.4g} {unit}, {apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); "
-        f"correct it, {remedy}or free it (--set {name}=free)."
+        f"correct it, or readings and camera files that contradict it, {remedy}or free it "
+        f"(--set {name}=free)."
     )
 
 
