@@ -161,7 +161,7 @@ def _options() -> Iterable[Refusal]:
         "identify", "identify", [("dataset-view", "{in} --view leg1", ("--view",))], "plain"
     )
     drawn: Rows = [("radius", "--leg-radius 9", ("every leg has a cylinder", "hexapod.urdf"))]
-    yield from _cases("inspect", "inspect hexapod", drawn)
+    yield from _cases("inspect", "inspect {in}/models/hexapod.yaml", drawn, "model")
     checks: Rows = [
         ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
