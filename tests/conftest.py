@@ -104,7 +104,7 @@ def _models_are_read_once() -> Iterator[None]:
     def load_once(source: Source) -> Machine:
         if source.block is None or source.notes or source.poses is not None:
             return load(source)
-        stated = repr((source.closures, source.motors, source.block))
+        stated = repr((source.closures, source.motors, source.block, source.leg_radius))
         key = (source.path.name, source.urdf.path.name, stated, source.urdf.text)
         if key not in machines:
             machines[key] = load(source)

@@ -160,6 +160,8 @@ def _options() -> Iterable[Refusal]:
     yield from _cases(
         "identify", "identify", [("dataset-view", "{in} --view leg1", ("--view",))], "plain"
     )
+    drawn: Rows = [("radius", "--leg-radius 9", ("every leg has a cylinder", "hexapod.urdf"))]
+    yield from _cases("inspect", "inspect {in}/models/hexapod.yaml", drawn, "model")
     checks: Rows = [
         ("output", "--check {in}/result -o {in}/result", ("{in}/result", "another folder")),
         ("holdout", "--check {in}/result --holdout 0.2 --set '*.offset'", ("--set", "--holdout")),
@@ -937,7 +939,11 @@ def _new() -> Iterable[Refusal]:
         ("units", f"{head},unit\n{row},mm\n{row},m\n", "", ("m and mm",)),
         ("travel", f"{head},travel_low\n{row},0\n{row},0\n", "--unit mm", ("travel",)),
         ("radii", f"{head},radius,rod\n{row},9,8\n", "--unit mm", ("line 2", "radius, tube, rod")),
-    ]
+        ("rods", f"{head}\nRSS,1,2,3,4\nRSS,4,2,5,1\n", "--unit mm --leg-radius 2",
+         ("rods of type RSS", "no motors", "actuators", "servo-hexapod.yaml")),
+        ("program", '#include <Servo.h>\n#define HORN 20\nfloat base[6][2] = {{1, 2}};\n',
+         "--unit mm", ("source of a program", "--template", "servo-hexapod.yaml")),
+    ]  # fmt: skip
     tables: Rows = [(name, (words, text("m.csv", rows)), said) for name, rows, words, said in lines]
     yield from _cases("csv", "new {in}/m.csv -o {out}", tables)
     workbooks: Rows = [

@@ -12,6 +12,7 @@ from hexapod_example import HEXAPOD
 from photograph_files import exif, jpeg
 from simulated import files_of, small_camera
 
+import legcal
 from legcal import load_dataset
 from legcal.vision.board import board_document, board_of
 from legcal.vision.image_file import camera_of_photographs, read_facts
@@ -173,6 +174,30 @@ def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(tmp_pa
     assert {view for view, *_ in pairs(numbered)} == {"c1"}
 
 
+def test_views_of_unequal_size_are_words_in_the_names_too_as_a_plan_names_them(
+    tmp_path: Path,
+) -> None:
+    names = [f"c{v}_p{k:02d}.png" for v, *poses in ((1, 1, 2, 3), (2, 4, 5, 6, 7)) for k in poses]
+    table(own_folder(tmp_path, names), n=7)
+    assert init(tmp_path).code == 0
+    assert [view for view, *_ in pairs(tmp_path)] == ["c1"] * 3 + ["c2"] * 4
+
+
+@pytest.mark.parametrize("names", ["Turm {}", "Stepper {} (mm)", "tower-{}", "Axis {}"])
+def test_motors_are_named_by_what_follows_the_word_for_a_motor(names: str, tmp_path: Path) -> None:
+    printer = "M665 L288 R141 B130 H402 ; RepRapFirmware\nM666 X0 Y0 Z0\n"
+    (tmp_path / "config.g").write_text(printer)
+    legcal.new(tmp_path / "config.g", tmp_path)
+    own_folder(tmp_path, FLAT)
+    travelled = [[500.0, 450.0, 400.0], [450.0, 400.0, 500.0], [400.0, 500.0, 450.0]]
+    lines = [";".join(names.format(x) for x in "ZXY"), *(f"{z};{x};{y}" for x, y, z in travelled)]
+    (tmp_path / "own.csv").write_text("\n".join(lines))
+    made = legcal.init(
+        tmp_path / "photos", tmp_path / "own.csv", tmp_path, tmp_path / "dataset"
+    ).measurements
+    np.testing.assert_allclose(1e3 * made.q[:, ::2], travelled)
+
+
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
 def test_tables_are_read_as_spreadsheets_write_them(encoding: str, tmp_path: Path) -> None:
     names = [f"Länge {j} (mm)" for j in range(1, 7)]
@@ -192,6 +217,8 @@ def test_tables_are_read_as_spreadsheets_write_them(encoding: str, tmp_path: Pat
         ([f"Leg {j} (um)" for j in range(1, 7)], 1e3, 0.0, ()),
         ([str(j) for j in range(6)], 0.1, 0.0, ("--unit", "cm")),
         ([f"L{j} [in]" for j in range(1, 7)], 1.0 / 25.4, 0.0, ()),
+        ([f"Bein {j} (Zoll)" for j in range(1, 7)], 1.0 / 25.4, 0.0, ()),
+        ([f"leg{j}_Inches" for j in range(1, 7)], 1.0 / 25.4, 0.0, ()),
         ([f"L{j} [80 counts/mm]" for j in range(1, 7)], 80.0, 0.0, ()),
         (LEGS, 1e-3, 345.0, ("--lengths",)),
         ([f"Zylinder {j} (Länge) [mm]" for j in range(1, 7)], 1.0, 345.0, ()),
@@ -232,7 +259,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"add": 5000.0}, (), ("travel of the model", "-4 to 144 mm")),
     (FLAT, {"names": [f"{leg} [mm]" for leg in LEGS]}, ("--unit", "m"), ("m and mm", "headings")),
     (FLAT, {}, ("--unit", "inch"), ("'inch'", "um")),
-    (FLAT, {"names": [f"{leg}_inch" for leg in LEGS]}, (), ("'inch'", "mm, um, nm, cm, m, in, ft")),
+    (FLAT, {"names": [f"{leg}_feet" for leg in LEGS]}, (), ("'feet'", "mm, um, nm, cm, m, in, ft")),
     (FLAT, {}, ("--camera", "c7=x.yaml"), ("c7=x.yaml", "c1")),
     (FLAT, {}, ("--camera", "missing.yaml"), ("missing.yaml",)),
     (FLAT, {}, ("--camera", "c1=a.yaml", "--camera", "c1=b.yaml"), ("c1=a.yaml", "c1=b.yaml")),

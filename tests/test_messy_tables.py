@@ -379,7 +379,7 @@ REFUSED: list[tuple[str, Sequence[str], Sequence[str]]] = [
      ("--base-radius", "--family only")),
     (wide("bx,by,bz,px,py,pz"), ("--unit", "mm", *OPTIONS[:-2], "--height", "700"),
      ("'leg1', 'leg2'", "close at home", "380 to 500 mm")),
-    (wide("bx,by,bz,px,py,pz [Zoll]"), OPTIONS, ("Zoll", "mm, um, nm, cm, m, in, ft")),
+    (wide("bx,by,bz,px,py,pz [dm]"), OPTIONS, ("dm", "mm, um, nm, cm, m, in, ft")),
     (wide("bx,by,bz,qx,qy,qz"), ("--unit", "mm", *OPTIONS), ("'qx'", "'platform_x'")),
     (B_AND_P.replace("P3,-144.9,38.8,0\n", ""), OPTIONS, ("platform_x",)),
     (points(POINTS, "{}", "{}"), OPTIONS, ("'1'", "B1 and P1")),

@@ -312,6 +312,11 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
         refused(NotVisible, remedy, places=listed)
     telephoto = replace(sample_camera(), K=sample_camera().K * [[50.0], [50.0], [1.0]])
     refused(NotVisible, "wider view, or correct the focal length", camera=telephoto)
+    for share, error in ((0.3, NotVisible), (0.4, NotIdentifiable)):
+        K = sample_camera().K * [[share], [share], [1.0]]
+        coarse = replace(sample_camera(), width=int(1024 * share), height=int(768 * share), K=K)
+        named = "legs are [34].. px wide .* a --camera with more pixels"
+        refused(error, named, model="linear-delta", camera=coarse, setting=None)
     refused(UsageError, "found 1 place for 2", places=away, cameras=2)
     refused(NotVisible, "use another board", board="charuco:7x5:4mm:3mm:DICT_4X4_50",
             places=around(1.4))  # fmt: skip

@@ -68,6 +68,7 @@ Matched = tuple[Iterable[tuple[int, Photograph]], str, list[str]]
 
 _VIEW_FIRST = {"{view}_*": "_", "{view}-*": "-"}  # patterns of names, and the mark beside the view
 _VIEW_LAST = {"*_{view}": "_", "*-{view}": "-"}
+_LEAST_OF_VIEW = 3  # photographs, where views have more and fewer
 
 
 def _with_view(photograph: Photograph, pattern: str) -> Photograph:
@@ -96,20 +97,24 @@ def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograp
 
 
 def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
-    """Return a pattern that splits names in one folder into several views of equal size.
+    """Return a pattern that splits names in one folder into several views.
 
-    Patterns with words as views are preferred to numbers, and then patterns with few views.
+    Patterns with words as views are preferred to numbers, then views of equal size, which numbers
+    need, and few views.
     """
-    likely: list[tuple[bool, int, int, str]] = []
+    likely: list[tuple[bool, bool, int, int, str]] = []
     for k, pattern in enumerate((*_VIEW_FIRST, *_VIEW_LAST)):
         labels: dict[str, set[str]] = {}
         for photograph in photographs:
             named = _with_view(photograph, pattern)
             labels.setdefault(named.view, set()).add(named.label)
-        sizes = {len(of_view) for of_view in labels.values()}
-        if "" not in labels and 1 < len(labels) <= MAX_VIEWS and len(sizes) == 1 < max(sizes):
-            are_numbers = all(view.isdecimal() for view in labels)
-            likely.append((are_numbers, len(labels), k, pattern))
+        sizes = [len(of_view) for of_view in labels.values()]
+        differ, are_numbers = len(set(sizes)) > 1, all(view.isdecimal() for view in labels)
+        least = _LEAST_OF_VIEW if differ and not any(map(str.isdecimal, labels)) else 2
+        if "" in labels or not 1 < len(labels) <= MAX_VIEWS or min(sizes) < least:
+            continue
+        if not differ or least == _LEAST_OF_VIEW:
+            likely.append((are_numbers, differ, len(labels), k, pattern))
     return min(likely)[-1] if likely else None
 
 

@@ -58,7 +58,7 @@ _TIME = re.compile(rf"(?:{WORDS['time'].replace(' ', '|')}|t)({'|'.join(_SECONDS
 _NUMBERED = re.compile(r"([^\W\d]*?)0*(\d{1,3})([^\W\d]*)")
 # Units at the end of a heading without brackets that would else be part of a name
 _FOREIGN = {
-    *("inch", "inches", "zoll", "feet", "foot", "dm", "mil", "mils", "yd"),
+    *("feet", "foot", "dm", "mil", "mils", "yd"),
     *("counts", "steps", "ticks", "turns", "grad", "gon", "arcmin", "arcsec"),
 }
 
@@ -241,7 +241,7 @@ class ReadingsSheet:
         ]
         if len(fits) == 1:
             return dict(zip(fits[0], self._joints, strict=True))
-        missing = [leg.name for leg, joint in zip(self.motors, self._joints, strict=True)
+        missing = [leg.motor_label for leg, joint in zip(self.motors, self._joints, strict=True)
                    if joint not in joint_of_column.values()]  # fmt: skip
         columns = few([describe(header[i]) for i in free]) or "none"
         raise DatasetError(
@@ -349,9 +349,18 @@ class ReadingsSheet:
 
 
 def _names(key: str, word: str) -> bool:
-    """Return whether a heading names a leg or its motor by a word, alone or as in tower A."""
-    before = key.removesuffix(word)
-    return key == word or (before != key and concepts(before) in (("leg",), ("rail",)))
+    """Return whether a heading names a leg or its motor: alone, tower A of A, Turm X of tower_x."""
+    own = _own_name(key)
+    is_same = own != key and own == _own_name(word) and not own.isdecimal()  # numbers count others
+    return is_same or word in (key, own)
+
+
+def _own_name(word: str) -> str:
+    """Return a name without the word for a leg or a rail that it begins with."""
+    starts = (word[:end] for end in range(len(word) - 1, 0, -1))
+    return word.removeprefix(
+        next((one for one in starts if concepts(one) in (("leg",), ("rail",))), "")
+    )
 
 
 def _means(heading: str) -> str:

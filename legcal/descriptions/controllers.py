@@ -53,6 +53,9 @@ class Configuration:
     notes: list[str] = field(default_factory=list)
 
 
+_SOURCE = re.compile(r"^\s*#\s*(?:include\s*[<\"]|define\s+\w)", re.MULTILINE)  # C, Arduino
+
+
 def firmware_table(
     path: Path,
     text: str,
@@ -74,6 +77,12 @@ def firmware_table(
             unit = _unit(path, read.unit, unit if read.unit else unit or "mm")
             return _table_of_delta(path, read, unit, effector)
     hexapod = linuxcnc_table(path, text, given) or flypt_table(path, text, given, unit)
+    if hexapod is None and _SOURCE.search(text):
+        raise ModelError(
+            f"{path}: the machine could not be read: found the source of a program, needed a table "
+            "of its joints; write its numbers into one (legcal new --template -o . makes a table; "
+            "of servos with horns start from models/tables/servo-hexapod.yaml)."
+        )
     if hexapod is None:
         return None
     table, notes = hexapod

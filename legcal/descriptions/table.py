@@ -485,6 +485,16 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
     for name, entry in actuators.items():
         if (problem := entry.problem(file.unit)) is not None:
             problems.add(f"{_unused(f'actuators.{name}')}: {problem}")
+    of_rods = dict.fromkeys(type_ for type_ in file.leg_types if type_.actuator is not None)
+    if of_rods and not actuators:
+        problems.add(
+            f"rods of type {' and '.join(map(str, of_rods))} could not be used",
+            "no motors that they hang on",
+            "actuators with point and axis or direction of each motor, which a YAML table has, or "
+            "in a CSV a column 'rail' of upright rails",
+            "start from models/tables/servo-hexapod.yaml, orthoglide.yaml or 3-prs.yaml beside it",
+        )
+        return
     for leg, type_, motor in zip(names, file.leg_types, motors, strict=False):
         refused = _unused(f"leg '{leg}'")
         if motor is not None and motor not in actuators:
@@ -496,10 +506,7 @@ def _check_actuators(file: TableFile, problems: Problems) -> None:
             moves = ActuatorKind.REVOLUTE if actuators[motor].turns else ActuatorKind.PRISMATIC
         if moves is not type_.actuator:
             found = f"no motor that it hangs on and the type {type_}"
-            needed = (
-                "actuators and hangs_on (in a CSV a column 'rail') for types that begin with the "
-                "motor of a rod (PSS, RSS, PRS)"
-            )
+            needed = "hangs_on for types that begin with the motor of a rod (PSS, RSS, PRS)"
             if moves is not None:
                 slides = moves is ActuatorKind.PRISMATIC
                 how, types = ("slides", "P (PSS, PRS)") if slides else ("turns", "R (RSS)")

@@ -403,13 +403,14 @@ def _number_in(text: str) -> float:
 # Words of headings and of names of joints, as _folded writes them: English, German, French
 WORDS: dict[str, str] = {
     "base": "base bottom fixed ground lower basis boden bodenplatte grundplatte gestell sockel "
-    "unten fest socle embase bas fixe sol bati inferieur",
-    "platform": "platform plat top moving mobile upper effector plattform oben beweglich nacelle "
-    "plateforme plateau haut superieur",
+    "unten fest fuss socle embase bas fixe sol bati inferieur",
+    "platform": "platform plat top moving mobile upper effector plattform oben kopf beweglich "
+    "nacelle plateforme plateau haut superieur",
     "joint": "joint joints point points pt gelenk gelenke gelenkpunkt punkt kugelgelenk kardan "
     "ball balls kugel hinge pivot anchor articulation rotule liaison centre center mitte",
-    "leg": "leg legs strut struts cylinder cylinders actuator limb axis drive motor bein strebe "
-    "stab zylinder aktuator aktor antrieb achse spindel jambe verin axe actionneur moteur",
+    "leg": "leg legs strut struts cylinder cylinders actuator limb axis drive motor stepper bein "
+    "strebe stab zylinder aktuator aktor antrieb achse spindel jambe verin axe actionneur "
+    "moteur",
     "rail": "rail tower carriage column slide slider turm schiene saule schlitten wagen colonne "
     "chariot glissiere",
     "home": "home grundstellung ruhelage nullstellung referenzlage repos",
@@ -487,11 +488,20 @@ def _folded(text: str) -> str:
     return re.sub(r"(?<=[^\W\d_])-(?=[^\W\d_])", "", plain)
 
 
+# Other words for units; the letters before m are the sign of micro and the Greek mu
+_UNIT_WORDS = {
+    **dict.fromkeys(("µm", "μm"), "um"),
+    **dict.fromkeys(("millimeter", "millimetre", "millimeters", "millimetres"), "mm"),
+    **dict.fromkeys(("inch", "inches", "zoll"), "in"),
+}
+
+
 @cache
 def _heading_with(units: tuple[str, ...]) -> re.Pattern[str]:
     """Return the pattern of headings that end with one of some units."""
     large = [unit.upper() for unit in units if len(unit) > 1]
-    unit_pattern = "|".join([*map(re.escape, (*units, *large)), "µm", "μm"])
+    words = [f"(?i:{word})" for word, unit in _UNIT_WORDS.items() if unit in units]
+    unit_pattern = "|".join([*map(re.escape, (*units, *large)), *words])
     return re.compile(rf"(.*?)(?:\s*[\[(]\s*({unit_pattern})\s*[\])]|[\s_/]({unit_pattern}))?")
 
 
@@ -510,7 +520,7 @@ def split_heading(
         unit = "" if re.fullmatch(r"\w+( [^\W\d_]+)+", unit) else unit
     letters = "".join(letter for letter in _folded(name) if letter.isalnum())
     unit = unit.lower() if unit.lower() in units else unit
-    return letters, "um" if unit in ("µm", "μm") else unit
+    return letters, _UNIT_WORDS.get(unit.lower(), unit)
 
 
 def in_unit(cell: str, size: Decimal) -> str:

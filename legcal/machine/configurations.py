@@ -20,7 +20,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, ModelError
+from legcal.errors import DidNotConverge, ModelError, UsageError
 from legcal.geometry.lines import segment_distance
 from legcal.geometry.motions import motion_of
 from legcal.geometry.types import Array, BoolArray
@@ -113,6 +113,10 @@ def random_configurations(
     DidNotConverge
         If too few configurations are reached.
     """
+    if count < 0:
+        raise UsageError(
+            f"Configurations could not be drawn: found {count}, needed 0 or more; correct it."
+        )
     generator, configurations = np.random.default_rng(rng), list[Array]()
     if mechanism.is_determined:
         for q, _, _ in _sampled(mechanism, generator, lambda: count - len(configurations)):

@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import BadValue, DidNotConverge, ModelError, OutOfClass, Problems
+from legcal.errors import (
+    BadValue,
+    DidNotConverge,
+    ModelError,
+    OutOfClass,
+    Problems,
+    UsageError,
+)
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import closest, nearest
@@ -162,6 +169,11 @@ def _load(source: Source) -> Machine:
     drawn, round_parts = with_mesh_cylinders(
         source.urdf, bodies, machine.legs, machine.base, source.leg_radius
     )
+    if source.leg_radius is not None and drawn is source.urdf:
+        raise UsageError(
+            f"{source.path}: the leg radius (--leg-radius) could not be used: found that every leg "
+            f"has a cylinder in {urdf.path}, needed a leg without; correct the radius there."
+        )
     if round_parts or drawn is not source.urdf:
         source = replace(source, urdf=drawn, notes=(*source.notes, *round_parts))
         machine = _assemble(source, block)

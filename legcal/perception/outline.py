@@ -41,7 +41,14 @@ from legcal.perception.tuning import CONTRAST, EDGE_SCORE, INLIER_SHARE, RIVAL, 
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey
-from legcal.vision.visibility import Band, PredictedLeg, Segment, hidden_by, least_length
+from legcal.vision.visibility import (
+    MIN_WIDTH,
+    Band,
+    PredictedLeg,
+    Segment,
+    hidden_by,
+    least_length,
+)
 from legcal.workers import Run, in_turn
 
 BLOCK_LENGTH = 8.0  # along the part [px]
@@ -369,7 +376,6 @@ def _columns(n_blocks: int, half: int) -> IntArray:
 
 
 MARGIN = 4.0  # beside a leg in front, within which it hides others [px]
-MIN_WIDTH = 5.0  # least width of a part [px]
 MAX_GUIDED_WINDOW = 0.8  # widest window that still separates both outlines, as a part of the width
 MIN_KEPT = 0.25  # share of all unhidden blocks that must lie on the line of an outline
 MIN_CLEAR_KEPT = 0.5  # the same of an outline without its partner

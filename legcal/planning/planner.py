@@ -60,7 +60,7 @@ from legcal.planning.poses import (
 from legcal.planning.session import Plan, PlannedView, pose_labels
 from legcal.progress import Report, no_progress
 from legcal.vision.board import Board
-from legcal.vision.visibility import Bodies, Seen, visible_parts
+from legcal.vision.visibility import MIN_WIDTH, Bodies, Seen, visible_parts
 from legcal.workers import Run, in_turn
 
 MIN_POSES, POSES_EACH, MOST_POSES = 20, 6, 320  # candidates, by images
@@ -77,6 +77,9 @@ N_NEAR_PLACES = 8
 _MIN_ERROR_LIMIT = 0.0025
 _EXTRAPOLATED = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)  # multiples of the planned images
 _MOST_NEEDED = 100  # images, in the search for a sufficient number
+
+_FINER = "state a --camera with more pixels or a longer lens"
+_N_ASKED = 8  # places of which the width of legs is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +127,33 @@ class Task:
         """Place legs and arms at poses T_Rb_Re."""
         return _bodies(self.machine, self.legs, tuple(poses))
 
-    def seen(self, T: RigidTransform, poses: Sequence[RigidTransform], *, surely: bool) -> Seen:
+    def seen(
+        self,
+        T: RigidTransform,
+        poses: Sequence[RigidTransform],
+        *,
+        surely: bool,
+        least_width: float = MIN_WIDTH,
+    ) -> Seen:
         """Return the parts visible at poses T_Rb_Re; *surely*: for all tripods in tolerance."""
         bodies = self.bodies(poses)
         points = np.concatenate([bodies.A, bodies.B]).reshape(-1, 3)
         margin = self._margin(T, points) if surely else 0.0
-        return visible_parts(self.predictor.camera, T, bodies, margin)
+        camera = self.predictor.camera
+        return visible_parts(camera, T, bodies, margin, least_width=least_width)
+
+    def too_narrow(self, seen_from: Sequence[Candidates]) -> str:
+        """Say that the legs are too narrow in all pictures to be measured, "" if not."""
+        widths = list[float]()
+        for candidates in seen_from:
+            poses = platforms_in_base(self.machine, candidates.poses.poses)
+            T = candidates.place.T_base_camera
+            ends = self.seen(T, poses, surely=False, least_width=0.0).ends
+            if len(ends):
+                widths.append(float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1))))
+        most = max(widths, default=np.inf)
+        is_said = f"legs are {most:.1f} px wide in the picture, and {MIN_WIDTH:g} px are needed"
+        return is_said if most < MIN_WIDTH else ""
 
     def board_is_shown(
         self,
@@ -357,6 +381,9 @@ def _visible_places(
             "use a board with larger squares, or a smaller one that is whole in the image from "
             f"{names}"
         )
+    asked = blind[:: len(blind) // _N_ASKED + 1]
+    if narrow := task.too_narrow([Candidates(place, poses) for place in asked]):
+        remedy = f"{narrow}: {_FINER}"
     raise NotVisible(
         f"{task.machine.yaml_path}: no session could be planned: only {len(visible)} of "
         f"{len(places)} camera positions see legs{' and the board' * (task.board is not None)} "
@@ -465,10 +492,10 @@ class _Search:
         images = exchange(
             session, images, self.criterion, self.rng, least, progress=self.progress, stop=self.stop
         )
-        self._refuse_undetermined(session)
+        self._refuse_undetermined(session, current)
         return _selected_candidates(current, images), least, images.value
 
-    def _refuse_undetermined(self, session: Session) -> None:
+    def _refuse_undetermined(self, session: Session, current: Sequence[Candidates]) -> None:
         """Refuse a session that does not improve the model; state a sufficient number of images."""
         task, work, basis = self.task, self.work, self.basis
         limit = max(task.setting.length, _MIN_ERROR_LIMIT * task.machine.size)
@@ -499,11 +526,13 @@ class _Search:
             if more.value < limit
             else "plan more --cameras, or --board"
         )
-        needed = f"at least {n} images" if more.value < limit else "more positions"
+        needed = f"{f'at least {n} images' if more.value < limit else 'more positions'} are needed"
+        if narrow := task.too_narrow(current):
+            needed, remedy = narrow, _FINER
         raise NotIdentifiable(
             f"{task.machine.yaml_path}: no session could be planned: {task.n_images} "
             f"image{'s' * (task.n_images != 1)} from {places} would not improve on the nominal "
-            f"model; {needed} are needed; {remedy}."
+            f"model; {needed}; {remedy}."
         )
 
     def improve_positions(

@@ -31,6 +31,7 @@ from legcal.planning.places import (
     Place,
     Setting,
     default_setting,
+    parse_bounds,
 )
 from legcal.planning.planner import Candidates, Task, plan_session
 from legcal.planning.session import Plan
@@ -59,7 +60,7 @@ def plan(
     camera: str | Path | Camera | None = None,
     noise: PredictedNoise | str | Path = DEFAULT_NOISE,
     encoder_sigma: float | str | None = None,
-    bounds: Array | None = None,
+    bounds: Array | str | None = None,
     places: Sequence[Place] = (),
     given: str | Path | Dataset | None = None,
     board: str | Path | Board | None = None,
@@ -93,8 +94,8 @@ def plan(
         One standard deviation of a reading: a number [m, of motors that turn rad], or a text with
         its unit ('0.5deg'), which is that of the motors that slide, or turn. By default 2 um,
         0.1 mrad and 0.5 deg of hobby servos, or those of the dataset.
-    bounds : (3, 2) array, optional
-        Lowest and highest x, y, z of cameras in the base link [m].
+    bounds : (3, 2) array or str, optional
+        Lowest and highest x, y, z of cameras in the base link [m], or the text of ``--bounds``.
     places : sequence of Place
         Tripods with their names, to choose from in place of those around the machine.
     given : path or Dataset, optional
@@ -141,6 +142,8 @@ def plan(
     n_images, n_views = _counts(
         images, images_per_view, cameras, target, len(listed), hand_held=hand_held
     )
+    if bounds is not None:
+        bounds = parse_bounds(bounds) if isinstance(bounds, str) else np.asarray(bounds, float)
     _check(target, bounds, listed, board, hand_held, setting, seed, machine.size)
     shot = given if isinstance(given, Dataset | None) else load_dataset(given, check_images=False)
     if camera is None:
@@ -327,6 +330,11 @@ def _check(
         problems.append(
             f"{start} a target of {target:g} m, needed more than 0 and less than 1 m; correct "
             "--target."
+        )
+    if bounds is not None and np.shape(bounds) != (3, 2):
+        problems.append(
+            f"{start} bounds of shape {np.shape(bounds)}, needed (3, 2), the lowest and highest x, "
+            "y and z in the base link [m]; correct them."
         )
     if bounds is not None and places:
         problems.append(

@@ -35,6 +35,7 @@ END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cyl
 N_ALONG_LEG = 64  # points along a leg that are tested for visibility
 MIN_DEPTH_SHARE = 0.05  # minimum depth of points, in leg lengths: nearer points are cut off
 MIN_LENGTH = (30.0, 1.0)  # minimum length of a measured outline: [px], and in widths of the leg
+MIN_WIDTH = 5.0  # least width of a measured part [px]
 
 
 def least_length(width: float | Array) -> Array:
@@ -460,6 +461,7 @@ def visible_parts(
     stated: BoolArray | None = None,  # (n_legs,) the legs that the camera shows, if somebody says
     are_clear: Callable[[Array, Array, Array], BoolArray] | None = None,
     n_along: int = N_ALONG_PART,
+    least_width: float = 0.0,  # of parts [px]
 ) -> Seen:
     """Return the visible segments of legs and arms in images of one camera.
 
@@ -495,7 +497,8 @@ def visible_parts(
     ends = camera.project(axis[:, None] + steps_to_outlines(h, radius[part])[:, :, None])
     length_px = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1).mean(axis=1)
     width_px = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean(axis=1)
-    is_long = (length_px >= least_length(width_px)) | (stated is not None)
+    is_long = (length_px >= least_length(width_px)) & (width_px >= least_width)
+    is_long |= stated is not None
     parts = part[is_long]
     return Seen(
         image[is_long],

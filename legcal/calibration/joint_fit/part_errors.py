@@ -125,7 +125,7 @@ def predicted_sigmas(legs: FittedLegs, choices: Choices, C: Array) -> tuple[Part
 
 
 def sigmas_in_words(parts: Sequence[PartSigma]) -> list[str]:
-    """Return a sentence for each kind of parts."""
+    """Return a sentence for each kind of parts; of a group alone what it leaves."""
     sentences = []
     for kind in dict.fromkeys(one.kind for one in parts):
         some = [one for one in parts if one.kind == kind]
@@ -134,6 +134,11 @@ def sigmas_in_words(parts: Sequence[PartSigma]) -> list[str]:
         sentences.append(
             f"Expected of the {kind}, with tolerances as priors: {least:.2g} to {most:.2g} {unit} "
             f"(1 sigma), where parts like these are {scale * some[0].tolerance:.2g} {unit} off."
+        )
+    if len(sentences) == 1:
+        sentences.append(
+            f"The error of the platform is that of a model with all parameters (--only all): with "
+            f"--only {parts[0].kind} all other parts keep theirs."
         )
     return sentences
 

@@ -471,7 +471,7 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     views, images = problem.outlines.views, problem.images
     listed = few(
         [
-            f"{corner} in {views[view]}" + (f", {images[view, pose]}" if pose >= 0 else "")
+            f"corner {corner} in {views[view]}" + (f", {images[view, pose]}" if pose >= 0 else "")
             for view, pose, corner in sorted(rejected)
         ]
     )
