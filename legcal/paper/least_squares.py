@@ -36,7 +36,7 @@ _OPTIONS: dict[str, bool | int | float | str] = {
     "ipopt.sb": "yes",
     "ipopt.tol": 1e-8,
     "ipopt.acceptable_tol": 1e-6,  # in standard deviations: rounding prevents further progress
-    "ipopt.acceptable_iter": 8,
+    "ipopt.acceptable_iter": 2,
     "ipopt.max_iter": 300,
     "ipopt.mu_init": 1e-9,
     "ipopt.nlp_scaling_method": "none",
