@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copyreg
 import logging
+import math
 import os
 import pickle
 import re
@@ -26,7 +27,7 @@ from typing import Any, Protocol, SupportsIndex, TypeGuard, TypeVar, cast
 
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import OutOfResources, UsageError
+from legcal.errors import LegcalError, OutOfResources, UsageError
 from legcal.signals import held_back_signals, leave_interrupts_to_parent
 from legcal.version import __version__
 
@@ -92,11 +93,12 @@ def worker_pool(
 ) -> Iterator[Run]:
     """Give a function that runs tasks in processes or on a cluster; 1 means in this process.
 
-    Processes are started when they are first needed. On Linux they are forked, with all loaded
-    modules, unless this process has threads, which forks would lack; else they are spawned: a
-    program that uses them must be safe to import (``if __name__ == "__main__":``). Libraries have
-    one thread in each. When the block is left by an exception, processes end at once, in the middle
-    of their work.
+    Where results come in order this process is one of the workers, which spares starting another
+    one and copying its memory. Others are started when they are first needed. On Linux they are
+    forked, with all loaded modules, unless this process has threads, which forks would lack; else
+    they are spawned: a program that uses them must be safe to import (``if __name__ ==
+    "__main__":``). Libraries have one thread in each. When the block is left by an exception,
+    processes end at once, in the middle of their work.
 
     Results come in the order of the rows, which are all taken at once, or, unless *in_order*, as
     they are finished, and rows are taken as workers become free: memory does not grow with their
@@ -107,9 +109,11 @@ def worker_pool(
         return
     with _told_if_ended(failure), ExitStack() as stack:
         submit: _Submit
+        most = math.inf  # an executor or a cluster is handed all that there is
         if isinstance(workers, SupportsIndex):
-            started = cache(lambda: stack.enter_context(_processes(workers)))
-            submit, slots = lambda *call: started().submit(*call), int(workers)
+            n = int(workers) - 1 if in_order else int(workers)
+            started = cache(lambda: stack.enter_context(_processes(n)))
+            submit, slots, most = lambda *call: started().submit(*call), int(workers), _AHEAD * n
         elif isinstance(workers, str):
             client = _client(workers, failure)
             stack.callback(_close, client)
@@ -124,33 +128,49 @@ def worker_pool(
                 "processes, the address of a Dask scheduler, or an object with submit as executors "
                 "have it; give one."
             )
-        yield partial(_results, submit, slots, in_order)
+        if in_order:
+            yield partial(_in_order, submit, slots, most)
+        else:
+            yield partial(_as_finished, submit, slots)
 
 
 # Handing out
 
 
 _TASKS = 4  # for each worker: few enough to spare messages, enough to share the work
-_AHEAD = 2  # tasks handed out ahead for each worker if results come as they are finished
+_AHEAD = 2  # tasks handed out ahead for each process
 _lock = RLock()  # held while rows are worked on
 
 
-def _results(
-    submit: _Submit,
-    slots: int,
-    in_order: bool,
-    task: Callable[[S], T],
-    rows: Iterable[S],
+def _in_order(
+    submit: _Submit, slots: int, most: float, task: Callable[[S], T], rows: Iterable[S]
 ) -> Iterator[T]:
-    """Yield results; tasks that are no longer needed are cancelled with the executor."""
-    if in_order:
-        rows = list(rows)
-        size = max(1, len(rows) // (_TASKS * slots))
-        parts = (rows[k : k + size] for k in range(0, len(rows), size))
-        futures = deque(submit(_each, task, part) for part in parts)
-        while futures:
+    """Yield results in order; tasks that are no longer needed are cancelled with the executor.
+
+    When ``most`` tasks are handed out and the next result is not there, one is done here.
+    """
+    rows = list(rows)
+    size = max(1, len(rows) // (_TASKS * slots))
+    parts = deque(rows[k : k + size] for k in range(0, len(rows), size))
+    futures = deque[Future[list[T]]]()
+    while parts or futures:
+        while parts and sum(not future.done() for future in futures) < most:
+            futures.append(submit(_each, task, parts.popleft()))
+        if not parts or futures[0].done():
             yield from futures.popleft().result()
-        return
+            continue
+        here = Future[list[T]]()
+        futures.append(here)
+        try:
+            here.set_result(_each(task, parts.popleft()))
+        except LegcalError as error:  # in its turn: rows before may be refused, too
+            here.set_exception(error)
+
+
+def _as_finished(
+    submit: _Submit, slots: int, task: Callable[[S], T], rows: Iterable[S]
+) -> Iterator[T]:
+    """Yield results as they are finished; what is handed out may be cancelled with the executor."""
     remaining, running = iter(rows), set[Future[list[T]]]()
     while True:
         free = _AHEAD * slots - len(running)

@@ -1,5 +1,6 @@
 """Work for the processes of a pool, in a module that they import at once."""
 
+import os
 import pickle
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +17,24 @@ def row_zero_after_row_five(done: Path, row: int) -> int:
     if row == 5:
         done.touch()
     return row
+
+
+def process_of(_row: int) -> int:
+    """Return the number of the process that works on a row, for a moment."""
+    time.sleep(0.01)
+    return os.getpid()
+
+
+def refused(first: int, row: int) -> None:
+    """Refuse a row; the process with that number does it at once, others after a moment."""
+    time.sleep(0.0 if os.getpid() == first else 0.1)
+    raise DatasetError(f"row {row} could not be used.")
+
+
+def asleep_elsewhere(here: int, seconds: float) -> None:
+    """Sleep in any process but the one with that number."""
+    if os.getpid() != here:
+        time.sleep(seconds)
 
 
 def negative(row: int, refused: int = -1) -> int:

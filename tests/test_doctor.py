@@ -131,6 +131,17 @@ def test_what_was_tried_in_vain_is_said_only_where_legs_are_missing(
     assert NONE_EXPLAINS in [one.what for one in doctor(session.write()).findings]
 
 
+def test_a_black_photograph_is_no_reason_to_look_for_mistakes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("legcal.calibration.mistake_search.mistakes")
+    session = spoiled(tmp_path / "set", 3, ("c1", "c3"))
+    session.change("c1", 0, lambda picture: 0 * picture)
+    assert {one.check for one in doctor(session.write()).findings if one.severity != "note"} == {
+        "photographs"
+    }
+
+
 def test_a_photograph_in_the_hand_that_is_not_placed_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 from dataset_folder import folder
-from pool_work import row_zero_after_row_five
+from pool_work import asleep_elsewhere, process_of, refused, row_zero_after_row_five
 
-from legcal.errors import OutOfResources
+from legcal.errors import DatasetError, OutOfResources
 from legcal.files.folder import result_folder, write_atomically
 from legcal.signals import raise_if_stopped, stopped_by_signals
 from legcal.workers import Run, worker_pool
@@ -28,7 +28,7 @@ import multiprocessing, os, time
 from legcal.workers import worker_pool
 
 if __name__ == "__main__":
-    with worker_pool(2) as run:
+    with worker_pool(3) as run:
         list(run(abs, range(8)))
         print(*[child.pid for child in multiprocessing.active_children()], flush=True)
         time.sleep(60.0)
@@ -131,7 +131,7 @@ def test_libraries_have_one_thread_in_each_process_and_as_many_as_before_in_this
     two_processes: Run,
 ) -> None:
     found = list(two_processes(os.getenv, ["OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"]))
-    assert found == ["1", "1"]
+    assert found == ["1", "1"]  # of the other process, which the first tasks go to
     assert (os.getenv("OMP_NUM_THREADS"), os.getenv("OPENCV_FOR_THREADS_NUM")) == ("3", None)
 
 
@@ -159,11 +159,21 @@ def test_results_come_as_they_are_finished_and_a_process_that_is_ended_is_said(
     assert list(two_processes(work, range(6))) == list(range(6))
 
 
+def test_this_process_works_too_and_the_first_refusal_is_that_of_the_first_row(
+    two_processes: Run,
+) -> None:
+    numbers = set(two_processes(process_of, range(40)))
+    assert os.getpid() in numbers
+    assert len(numbers) == 2
+    with pytest.raises(DatasetError, match="row 0 "):
+        list(two_processes(partial(refused, os.getpid()), range(40)))
+
+
 @pytest.mark.system
 def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:
     def stop_after_the_first() -> None:
         with worker_pool(2) as run:
-            for _ in run(time.sleep, [0, 300, 300, 300]):
+            for _ in run(partial(asleep_elsewhere, os.getpid()), [0, 300, 300, 300]):
                 raise KeyboardInterrupt
 
     start = time.monotonic()

@@ -193,8 +193,9 @@ class _Judge:
 
     @property
     def agree_already(self) -> bool:
-        """Whether nearly all images agree as given."""
-        return self.own.images > _AGREE_ALREADY * len(self.own.row)
+        """Whether nearly all images with anything like a leg agree as given."""
+        n_showing = sum(len(self.search.edge_pairs[row]) > 0 for row in self.own.row.tolist())
+        return self.own.images > _AGREE_ALREADY * n_showing
 
     def is_in_hand(self, group: Group) -> bool:
         """Return whether the camera of a view moved between its photographs."""

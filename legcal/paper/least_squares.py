@@ -36,7 +36,6 @@ _OPTIONS: dict[str, bool | int | float | str] = {
     "ipopt.sb": "yes",
     "ipopt.tol": 1e-8,
     "ipopt.acceptable_tol": 1e-6,  # in standard deviations: rounding prevents further progress
-    "ipopt.acceptable_iter": 8,
     "ipopt.max_iter": 300,
     "ipopt.mu_init": 1e-9,
     "ipopt.nlp_scaling_method": "none",
@@ -164,7 +163,7 @@ def solve_least_squares(problem: LeastSquares, *, weighted: bool = False) -> Ipo
 def _solved(problem: LeastSquares, *, weighted: bool) -> IpoptSolution:
     """Return :func:`solve_least_squares`."""
     x, weights = problem.start, [term.unit_weights for term in problem.terms]
-    solver = _solver(problem)
+    solver = _solver(problem, weighted=weighted)
     for k in range(_REWEIGHTINGS if weighted else 1):
         if weighted:
             before = weights
@@ -279,7 +278,7 @@ def _side_by_side(values: Array) -> Array:
     return np.swapaxes(values, 0, 1).reshape(values.shape[1], -1)
 
 
-def _solver(problem: LeastSquares) -> ca.Function:
+def _solver(problem: LeastSquares, *, weighted: bool) -> ca.Function:
     """Return IPOPT for z, the unknowns x + scale z; its parameters are x, scale and weights."""
     n = len(problem.start)
     sizes = [term.n_rows**2 * len(term) * (term.covariance is not None) for term in problem.terms]
@@ -317,6 +316,8 @@ def _solver(problem: LeastSquares) -> ca.Function:
     gradient = scale * _summed(np.concatenate(places), n, slopes)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
     options = _OPTIONS | {
+        # Where weights change besides; printed criteria may converge slowly.
+        "ipopt.acceptable_iter": 2 if weighted else 8,
         "grad_f": ca.Function(
             "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]
         ),
