@@ -42,7 +42,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -225,7 +225,7 @@ def outcome(
     variant: str,
     overlays: Path | None = None,
     worst: int = 0,
-    only: str | None = None,
+    only: Literal["zeros", "lengths", "all"] | None = None,
 ) -> Outcome:
     """Calibrate a variant of a dataset, and compare it with the truth."""
     truth = folder.with_name(folder.name + "-truth")
