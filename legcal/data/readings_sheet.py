@@ -221,7 +221,9 @@ class ReadingsSheet:
             words = {split_heading(joint)[0], split_heading(leg.name)[0]}
             of_motor = {x for word in words for x in _own_names(word) if not x.isdecimal()}
             columns_of_leg = [i for i in free if words & {split[i][0], *own_names[i]}] or [
-                i for i in free if of_motor & own_names[i]  # Turm X of tower_x
+                i
+                for i in free
+                if of_motor & own_names[i]  # Turm X of tower_x
             ]
             if len(columns_of_leg) > 1:
                 raise DatasetError(
