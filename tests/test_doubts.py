@@ -219,8 +219,8 @@ def test_a_platform_no_better_known_than_built_has_tolerances_as_its_next_step(
     """As well as is stated, else as printed machines are; not of what has had them as priors."""
 
     def offered(calibration: Calibration) -> list[str]:
-        steps = next_steps(calibration, "out", "legcal calibrate set --fix q -o out")
-        return [one.what for one in steps if one.command.endswith("-o out-zeros --only zeros")]
+        steps = next_steps(calibration, "out", "legcal calibrate set --output=out")
+        return [one.what for one in steps if one.command.endswith(" out-zeros --only zeros")]
 
     kinematic, machine = healthy.solution.kinematic, healthy.dataset.machine
     assert healthy.platform is not None

@@ -1,5 +1,6 @@
 """What files of photographs say of how they were made, and what is said where it contradicts."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from legcal.errors import DatasetError, NotVisible, Place
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import (
+    BadImage,
     ImageFacts,
     decode_image,
+    image_size,
     inspect_image,
     read_facts,
 )
@@ -78,12 +81,18 @@ def test_facts_are_those_that_were_written(order: str) -> None:
 def test_damaged_files_never_raise_and_say_little() -> None:
     block = exif(**PHONE)
     contents = [jpeg(PICTURE, 90, block), png(PICTURE, block, Title="a"), block]
+    for content in contents:
+        for end in range(0, min(len(content), 900), 7):
+            assert read_facts(content[:end]).device in ("", "Acme", "Acme One")
     chance = np.random.default_rng(3)
     for k in range(500):
-        facts = read_facts(mutate(contents[k % 3], "jpg", chance))
+        content = mutate(contents[k % 3], "jpg", chance)
+        facts = read_facts(content)
         assert (facts.device + facts.lens + facts.software + "x").isprintable()
         for number in (facts.focal_length, facts.focus_distance, facts.digital_zoom):
             assert number is None or 0.0 < number <= 1e5
+        with suppress(BadImage):
+            image_size(content)
 
 
 # What is refused

@@ -316,7 +316,7 @@ def _solver(problem: LeastSquares, *, weighted: bool) -> ca.Function:
     gradient = scale * _summed(np.concatenate(places), n, slopes)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
     options = _OPTIONS | {
-        # Where weights change besides; printed criteria may converge slowly.
+        # Weighted problems are solved again in any case; printed criteria may converge slowly.
         "ipopt.acceptable_iter": 2 if weighted else 8,
         "grad_f": ca.Function(
             "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]

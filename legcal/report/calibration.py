@@ -117,7 +117,7 @@ def document(calibration: Calibration, output: Path, command: str) -> dict[str, 
 
 def _written_beside(command: str, suffix: str) -> str:
     """Return a command with another output folder, so that the result of the first stays."""
-    words = shlex.split(command)
+    words = shlex.split(command.replace(" --output=", " --output "))
     for k, word in enumerate(words[:-1]):
         if word in ("-o", "--output"):
             words[k + 1] = f"{words[k + 1].rstrip('/')}-{suffix}"
