@@ -1,5 +1,6 @@
 """``--only``: tolerances as priors, one group of parameters, horns on other teeth."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from edits import added, keyed
-from simulated import simulated
+from simulated import settings, simulated
 
 from legcal import (
     Calibration,
@@ -27,6 +28,7 @@ from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.errors import UsageError
 from legcal.machine.parameters import geometries, in_joint_frames, vector_of
 from legcal.machine.tolerance import TYPICAL
+from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Distribution
 
 TOOTH = 2.0 * np.pi / 25
@@ -58,6 +60,21 @@ def test_a_horn_on_another_tooth_is_named(found: Calibration) -> None:
     document = found.result.document()
     assert document["only"] == "zeros"
     assert [zero["teeth"] for zero in document["zeros"]] == [0, 0, 0, 1, 0, 0]
+
+
+def test_zeros_of_rails_are_told_relative_to_each_other(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    small = Spread(0.2e-3, Distribution.NORMAL)
+    errors = ParameterErrors(base_joints=small, platform_joints=small, lengths=small)
+    simulate("linear-delta", folder, settings(poses=3, views=3, errors=errors))
+    keyed("dataset.yaml", machine_kind="bought")(folder)
+    rails = calibrate(folder, only="zeros")
+    assert rails.group is not None
+    assert all(zero.sigma > 0.55 * zero.tolerance for zero in rails.group.zeros)
+    assert "relative to each other" in rails.group.sentence
+    apart = re.search(r"± ([0-9.]+) mm; their common part", rails.group.sentence)
+    assert apart is not None
+    assert float(apart[1]) < 0.6 * 1e3 * rails.group.zeros[0].sigma + 0.05
 
 
 def test_zeros_are_within_three_of_their_sigma(found: Calibration) -> None:

@@ -42,6 +42,7 @@ from legcal.machine.tolerance import Tolerance
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
 RARE = 10.0  # by which a horn on another tooth must raise twice the logarithm of a likelihood
+_UNSEEN = 0.98  # part of the variance by tolerances above which images tell nothing
 _SURE = 2.5  # standard deviations within which an offset is a whole number of teeth
 
 
@@ -54,10 +55,15 @@ class GroupEstimate:
     turned: Mapping[str, float]  # by motor: how far its horn is on another tooth [rad]
     errors: PartErrors
     value: Array  # (m,) posterior mean of these errors [m, rad], beside what is turned
-    sigma: Array  # (m,) their standard deviations
+    covariance: Array  # (m, m) of these
     held: Array  # (m,) what the written model has of them
     solution: Solution  # with the parameters that are written, and their uncertainty
     written: tuple[Leg, ...]  # in R_b and R_e of the nominal model, only the group having moved
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of the errors (m,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
 
     @property
     def zeros(self) -> list[MotorZero]:
@@ -107,8 +113,30 @@ class GroupEstimate:
             scale, unit = SHOWN_IN[others[0].unit]
             most = max(abs(z.value) for z in others)
             who = "the others are" if wrong else "all zeros are"
-            clauses.append(f"{who} within {scale * most:.1f} {unit}")
+            if wrong or (apart := self._zeros_apart()) is None:
+                clauses.append(f"{who} within {scale * most:.1f} {unit}")
+            else:
+                most, sigma = apart
+                clauses.append(
+                    f"zeros relative to each other are within {scale * most:.1f} ± "
+                    f"{scale * sigma:.1f} {unit}; their common part is not seen by images"
+                )
         return "; ".join(clauses)
+
+    def _zeros_apart(self) -> tuple[float, float] | None:
+        """Return the largest distance of a zero from the mean of all, and the largest sigma.
+
+        None if images see the mean: a common shift of all rails of a linear Delta moves the whole
+        machine along, and its mean stays as uncertain as its prior.
+        """
+        at = self.errors.of("zeros")
+        C, by_prior = self.covariance[np.ix_(at, at)], self.errors.sigma[at]
+        if len(at) < 2 or C.sum() < _UNSEEN * np.sum(by_prior**2):
+            return None
+        centred = np.eye(len(at)) - 1.0 / len(at)
+        apart = np.abs(centred @ [zero.value for zero in self.zeros])
+        sigma = np.sqrt(np.diagonal(centred @ C @ centred))
+        return float(apart.max()), float(sigma.max())
 
     @property
     def doubts(self) -> list[Doubt]:
@@ -210,9 +238,10 @@ def estimate_group(
     if group != "all":
         moved = _with_group(legs.nominal, near, value - left, turned, group)
     C = model.covariance(covariance, np.outer(value, value))
-    sigma = np.sqrt(np.diagonal(covariance))
     if group == "all" and not turned:
-        return GroupEstimate(group, machine, turned, near, value, sigma, value, solution, moved)
+        return GroupEstimate(
+            group, machine, turned, near, value, covariance, value, solution, moved
+        )
     by_fit, free = there.J @ K, np.any(there.J[:, chosen] != 0.0, axis=1)
     frame_legs = list(machine.frame_legs)
     T = frame_on_points(np.array([moved[j].A for j in frame_legs])).inv()
@@ -238,7 +267,9 @@ def estimate_group(
         ),
         sensitivities={what: by_fit @ one for what, one in solution.sensitivities.items()},
     )
-    return GroupEstimate(group, machine, turned, near, value, sigma, value - left, reported, moved)
+    return GroupEstimate(
+        group, machine, turned, near, value, covariance, value - left, reported, moved
+    )
 
 
 def _with_group(
