@@ -321,27 +321,13 @@ class _SearchNearFit:
         for _ in range(MAX_ROUNDS):
             near, before = self.fitted(near, {}), joints
             joints = self._joints(near)
-            away = self._seen_of(joints - before, before)
+            away = np.linalg.norm(joints - before, axis=-1)
             if (
                 not np.isfinite(away).any()
                 or np.nanpercentile(away, JOINT_PERCENTILE) <= MAX_JOINT_SHIFT_PX
             ):
                 break
         return near
-
-    def _seen_of(self, moved: Array, joints: Array) -> Array:
-        """Return how far joints (n, 2 n_legs, 2) moved as images of outlines show it [px].
-
-        Along a straight leg they see nothing, and joints that they hardly determine walk there.
-        Arms and bodies that joints carry move across theirs.
-        """
-        machine = self.data.machine
-        if any(machine.bodies) or any(leg.arm is not None for leg in machine.legs):
-            return np.asarray(np.linalg.norm(moved, axis=-1))
-        A, B = np.split(joints, 2, axis=1)
-        u = np.concatenate([B - A, B - A], axis=1)
-        across = moved[..., 0] * u[..., 1] - moved[..., 1] * u[..., 0]
-        return np.asarray(np.abs(across) / np.linalg.norm(u, axis=-1))
 
     def _joints(self, near: Estimate) -> Array:
         """Return the images of the joints of a fit, (n, 2 n_legs, 2) [px]; NaN behind a camera."""
