@@ -9,7 +9,7 @@ import pytest
 from command_line import run
 from edits import each_row
 from hexapod_example import Spoiled, spoiled
-from photograph_files import undecodable_png
+from photograph_files import exif, jpeg, undecodable_png
 from simulated import settings, simulated, small_camera
 
 from legcal import doctor, simulate
@@ -85,6 +85,22 @@ def test_readings_are_compared_with_their_travel(tmp_path: Path) -> None:
     constant, still = found_of(found, "readings", "warning")
     assert "found the same reading in all rows of leg5_prismatic" in constant.what
     assert "found leg3_prismatic in" in still.what
+
+
+def test_what_photographs_say_of_camera_and_compression_is_told(tmp_path: Path) -> None:
+    session = made(tmp_path)
+    usual, other = (exif(make="Acme", model="One", focal=focal) for focal in (4.25, 6.5))
+    for k, row in enumerate(session.rows):
+        picture = cv2.imread(str(session.path / row["image"]), cv2.IMREAD_GRAYSCALE)
+        row["image"] = str(Path(row["image"]).with_suffix(".jpg"))
+        content = jpeg(np.asarray(picture, dtype=np.uint8), 60, other if k == 3 else usual)
+        (session.path / row["image"]).write_bytes(content)
+    found = doctor(session.write())
+    (zoomed,) = found_of(found, "camera", "error")
+    assert "one focal length" in zoomed.what
+    assert session.rows[3]["image"] in zoomed.what
+    assert "JPEGs of quality 60" in found_of(found, "photographs", "note")[0].what
+    assert [one.jpeg_quality for one in found.views] == [60, 60, 60]
 
 
 def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(

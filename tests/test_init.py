@@ -157,8 +157,10 @@ def test_views_that_are_words_in_the_names_are_taken_and_numbers_proposed(tmp_pa
     assert outcome.code == 0
     taken = "Views left, right are taken from the names of the photographs, '*-{view}'"
     assert taken in outcome.said
-    table(tmp_path, {"view": ("a", "a", "b", "b")}, n=4)  # or a column says it
-    assert init(tmp_path, output="other").code == 0
+    table(tmp_path, {"view": ("a", "a", "b", "b"), "Remark": "abcd"}, n=4)  # or a column says it
+    outcome = init(tmp_path, output="other")
+    assert outcome.code == 0
+    assert "Column 'Remark' of" in outcome.said
     by_names, by_column = (
         {Path(row["image"]).name: row["view"] for row in read_rows(tmp_path / name)}
         for name in ("dataset/measurements.csv", "other/measurements.csv")
@@ -181,16 +183,23 @@ def test_views_of_unequal_size_are_words_in_the_names_too_as_a_plan_names_them(
     table(own_folder(tmp_path, names), n=7)
     assert init(tmp_path).code == 0
     assert [view for view, *_ in pairs(tmp_path)] == ["c1"] * 3 + ["c2"] * 4
+    for few in tmp_path.glob("photos/c1_p0[12].png"):  # one is no view
+        few.unlink()
+    table(tmp_path, n=5)
+    assert init(tmp_path, output="other").code == 0
+    assert {row["view"] for row in read_rows(tmp_path / "other/measurements.csv")} == {"c1"}
 
 
-@pytest.mark.parametrize("names", ["Turm {}", "Stepper {} (mm)", "tower-{}", "Axis {}"])
+@pytest.mark.parametrize("names", ["Turm {}", "Stepper {} (mm)", "tower-{};Drive {}", "Axis {}"])
 def test_motors_are_named_by_what_follows_the_word_for_a_motor(names: str, tmp_path: Path) -> None:
     printer = "M665 L288 R141 B130 H402 ; RepRapFirmware\nM666 X0 Y0 Z0\n"
     (tmp_path / "config.g").write_text(printer)
     legcal.new(tmp_path / "config.g", tmp_path)
     own_folder(tmp_path, FLAT)
     travelled = [[500.0, 450.0, 400.0], [450.0, 400.0, 500.0], [400.0, 500.0, 450.0]]
-    lines = [";".join(names.format(x) for x in "ZXY"), *(f"{z};{x};{y}" for x, y, z in travelled)]
+    beside = ";0" * names.count(";")  # of a heading that would do alone
+    lines = [";".join(names.format(x, x) for x in "ZXY")]
+    lines += [";".join(f"{q}{beside}" for q in (z, x, y)) for x, y, z in travelled]
     (tmp_path / "own.csv").write_text("\n".join(lines))
     made = legcal.init(
         tmp_path / "photos", tmp_path / "own.csv", tmp_path, tmp_path / "dataset"

@@ -29,6 +29,17 @@ from legcal.machine.picture import draw_machine
 from legcal.report.machine import inspect_table
 
 
+def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
+    expected = {  # n, n_d, r, n_ac, idle spins
+        "hexapod": (6, 3, 0, 6, 0),
+        "hexapod-strut": (7, 3, 0, 6, 1),
+        "3-rpr": (3, 2, 3, 3, 0),
+    }
+    for name, counts in expected.items():
+        document = machine_document(load_mechanism(name))
+        assert tuple(document[key] for key in ("n", "n_d", "r", "n_ac", "idle_spins")) == counts
+
+
 @pytest.mark.parametrize(
     ("legs", "found", "notes"),
     [

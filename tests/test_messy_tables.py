@@ -137,7 +137,7 @@ TABLES = {  # content, and the radii of tube and rod in it [mm]
         wide("LEG;BASE_X_MM;BASE_Y_MM;BASE_Z_MM;TOP_X_MM;TOP_Y_MM;TOP_Z_MM;;", "", "", leg="L{}"),
         ()),
     "unit in a remark": (
-        "# Hexapod, all in mm\n"
+        "# define the joints, all in mm\n"
         + wide("i;Ax;Ay;Az;Bx;By;Bz;Länge eingefahren;Länge ausgefahren", "380", "500", leg="{}"),
         ()),
     "axis first": (

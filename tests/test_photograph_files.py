@@ -9,6 +9,7 @@ import pytest
 import yaml
 from camera_sessions import PINHOLE, drawings
 from dataset_folder import SIZE, Folder, folder
+from fuzzing.mutations import mutate
 from photograph_files import exif, jpeg, png, tiff
 
 from legcal import calibrate, calibrate_camera, load_dataset
@@ -72,6 +73,17 @@ def test_facts_are_those_that_were_written(order: str) -> None:
     escape = read_facts(jpeg(PICTURE, 90, exif(order, model="\x1b[31m\u202ered" + "x" * 999)))
     assert len(escape.device) < 100
     assert escape.device.isprintable()
+
+
+def test_damaged_files_never_raise_and_say_little() -> None:
+    block = exif(**PHONE)
+    contents = [jpeg(PICTURE, 90, block), png(PICTURE, block, Title="a"), block]
+    chance = np.random.default_rng(3)
+    for k in range(500):
+        facts = read_facts(mutate(contents[k % 3], "jpg", chance))
+        assert (facts.device + facts.lens + facts.software + "x").isprintable()
+        for number in (facts.focal_length, facts.focus_distance, facts.digital_zoom):
+            assert number is None or 0.0 < number <= 1e5
 
 
 # What is refused

@@ -208,6 +208,7 @@ def test_arguments_of_other_types_are_named_and_what_works_is_not_refused(
         (lambda: public.calibrate(example, holdout="a"), "as holdout, needed a number or None;"),
         (lambda: public.new(family="delta", rod_length="0.2"), "as rod_length, needed a number"),
         (lambda: public.Follower("hexapod"), "found a str, needed a Machine"),
+        (lambda: public.random_configurations(machine, -1, 0), "found -1, needed 0 or more"),
         (lambda: made_with(board=3), "found 3 (int) as board of options, needed a text or a path"),
         (lambda: made_with(cameras=3), "as cameras of options, needed a text or a list;"),
         (lambda: shot_with(ambient="x"), "found 'x' (str) as ambient of appearance of settings"),

@@ -109,12 +109,11 @@ def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
             named = _with_view(photograph, pattern)
             labels.setdefault(named.view, set()).add(named.label)
         sizes = [len(of_view) for of_view in labels.values()]
-        differ, are_numbers = len(set(sizes)) > 1, all(view.isdecimal() for view in labels)
-        least = _LEAST_OF_VIEW if differ and not any(map(str.isdecimal, labels)) else 2
-        if "" in labels or not 1 < len(labels) <= MAX_VIEWS or min(sizes) < least:
+        if "" in labels or not 1 < len(labels) <= MAX_VIEWS:
             continue
-        if not differ or least == _LEAST_OF_VIEW:
-            likely.append((are_numbers, differ, len(labels), k, pattern))
+        differ, are_numbers = len(set(sizes)) > 1, [view.isdecimal() for view in labels]
+        if min(sizes) >= (_LEAST_OF_VIEW if differ else 2) and not (differ and any(are_numbers)):
+            likely.append((all(are_numbers), differ, len(labels), k, pattern))
     return min(likely)[-1] if likely else None
 
 

@@ -42,6 +42,7 @@ USUAL_UNITS = {False: ("m", "mm", "cm", "in"), True: ("rad", "deg", PULSES)}
 USUAL_PULSES = (400.0, 2700.0)  # [us] range of hobby servos
 # Fractions of the travel in use: in the stated unit, and in another that is certainly meant
 HARDLY_MOVES, SURELY_MOVES = 0.04, 0.5  # inches taken for mm use a 25th
+_LONG_TRAVEL = 1.0  # [m]: small motions are likely where the travel is shorter
 MIN_POSES = 5  # different poses: fewer are a check, perhaps close together
 
 
@@ -492,13 +493,14 @@ def doubtful_units(
 def _unit_of_model(path: Path, q: Array, motors: Sequence[Leg]) -> list[Problem]:
     """Return the problem of a model in another unit, by whose travel motors hardly move, if so.
 
-    Readings (n_rows, n_motors) in metres use most of the travel where that is converted.
+    Its travel is long, and readings (n_rows, n_motors) in metres use most of it once converted.
     """
-    for unit in () if motors[0].reads_angle else USUAL_UNITS[False][1:]:
+    width = np.ptp([leg.travel for leg in motors], axis=1)
+    is_long = not motors[0].reads_angle and width.min() > _LONG_TRAVEL
+    for unit in USUAL_UNITS[False][1:] if is_long else ():
         meant = Meaning((ReadingUnit(unit),), q / LENGTH[unit])
         moved = float(meant.used(motors).mean())
         if moved > SURELY_MOVES and in_travel(meant.q, motors).all():
-            width = np.ptp([leg.travel for leg in motors], axis=1)
             return [
                 Problem(
                     "the readings could not be used",

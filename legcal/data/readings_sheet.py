@@ -216,9 +216,15 @@ class ReadingsSheet:
     ) -> dict[int, str]:
         """Return the joint of each column of readings, by names or else by numbers."""
         joint_of_column: dict[int, str] = {}
+        own_names = {i: _own_names(split[i][0]) for i in free}
         for joint, leg in zip(self._joints, self.motors, strict=True):
             words = {split_heading(joint)[0], split_heading(leg.name)[0]}
-            columns_of_leg = [i for i in free if any(_names(split[i][0], word) for word in words)]
+            of_motor = {x for word in words for x in _own_names(word) if not x.isdecimal()}
+            columns_of_leg = [i for i in free if words & {split[i][0], *own_names[i]}] or [
+                i
+                for i in free
+                if of_motor & own_names[i]  # Turm X of tower_x
+            ]
             if len(columns_of_leg) > 1:
                 raise DatasetError(
                     f"{self.path}, header: the readings of leg '{leg.name}' could not be decided: "
@@ -348,19 +354,10 @@ class ReadingsSheet:
         )
 
 
-def _names(key: str, word: str) -> bool:
-    """Return whether a heading names a leg or its motor: alone, tower A of A, Turm X of tower_x."""
-    own = _own_name(key)
-    is_same = own != key and own == _own_name(word) and not own.isdecimal()  # numbers count others
-    return is_same or word in (key, own)
-
-
-def _own_name(word: str) -> str:
-    """Return a name without the word for a leg or a rail that it begins with."""
-    starts = (word[:end] for end in range(len(word) - 1, 0, -1))
-    return word.removeprefix(
-        next((one for one in starts if concepts(one) in (("leg",), ("rail",))), "")
-    )
+def _own_names(word: str) -> set[str]:
+    """Return what follows the word for a leg or a rail that a name begins with: A of tower A."""
+    starts = (word[:end] for end in range(1, len(word)))
+    return {word.removeprefix(one) for one in starts if concepts(one) in (("leg",), ("rail",))}
 
 
 def _means(heading: str) -> str:

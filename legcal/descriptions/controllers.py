@@ -53,7 +53,7 @@ class Configuration:
     notes: list[str] = field(default_factory=list)
 
 
-_SOURCE = re.compile(r"^\s*#\s*(?:include\s*[<\"]|define\s+\w)", re.MULTILINE)  # C, Arduino
+_SOURCE = re.compile(r"^\s*#(?:include\s*[<\"]|define\s+\w)", re.MULTILINE)  # C, Arduino
 
 
 def firmware_table(
