@@ -1,5 +1,6 @@
 """``--only``: tolerances as priors, one group of parameters, horns on other teeth."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from edits import added, keyed
-from simulated import simulated
+from simulated import settings, simulated
 
 from legcal import (
     Calibration,
@@ -18,12 +19,16 @@ from legcal import (
     load_dataset,
     load_mechanism,
 )
-from legcal.calibration.joint_fit.parameter_choices import Group
+from legcal.calibration.identify.identifiability import identifiability_of_dataset
+from legcal.calibration.joint_fit.parameter_choices import Group, choices_of
 from legcal.calibration.joint_fit.part_errors import part_errors, with_zeros
+from legcal.calibration.joint_fit.platform import WrittenGroup
+from legcal.calibration.joint_fit.predicted import read_noise
 from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.errors import UsageError
 from legcal.machine.parameters import geometries, in_joint_frames, vector_of
 from legcal.machine.tolerance import TYPICAL
+from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import Distribution
 
 TOOTH = 2.0 * np.pi / 25
@@ -55,6 +60,21 @@ def test_a_horn_on_another_tooth_is_named(found: Calibration) -> None:
     document = found.result.document()
     assert document["only"] == "zeros"
     assert [zero["teeth"] for zero in document["zeros"]] == [0, 0, 0, 1, 0, 0]
+
+
+def test_zeros_of_rails_are_told_relative_to_each_other(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    small = Spread(0.2e-3, Distribution.NORMAL)
+    errors = ParameterErrors(base_joints=small, platform_joints=small, lengths=small)
+    simulate("linear-delta", folder, settings(poses=3, views=3, errors=errors))
+    keyed("dataset.yaml", machine_kind="bought")(folder)
+    rails = calibrate(folder, only="zeros")
+    assert rails.group is not None
+    assert all(zero.sigma > 0.55 * zero.tolerance for zero in rails.group.zeros)
+    assert "relative to each other" in rails.group.sentence
+    apart = re.search(r"± ([0-9.]+) mm; their common part", rails.group.sentence)
+    assert apart is not None
+    assert float(apart[1]) < 0.6 * 1e3 * rails.group.zeros[0].sigma + 0.05
 
 
 def test_zeros_are_within_three_of_their_sigma(found: Calibration) -> None:
@@ -126,3 +146,42 @@ def test_identify_says_how_well_a_group_will_be_known(only: Group) -> None:
     assert [one.part for one in parts] == list(machine.leg_names)[:n]
     assert all(0.0 < one.sigma < one.tolerance for one in parts)
     assert sum("Expected of the zeros" in note for note in report.notes) == bool(n)
+
+
+def test_the_platform_error_is_predicted_as_it_is_stated(tmp_path: Path) -> None:
+    folder, small = tmp_path / "session", Spread(0.5e-3, Distribution.NORMAL)
+    errors = ParameterErrors(base_joints=small, platform_joints=small, lengths=small)
+    drawn: dict[str, Any] = {"errors": errors, "poses": 2, "sampling": "workspace", "seed": 0}
+    simulated(folder, "servo-hexapod", views=3, **drawn)
+    keyed("dataset.yaml", machine_kind="printed")(folder)
+    found = calibrate(folder, only="zeros", output=folder / "result")
+    choices, noise = choices_of(found.dataset, only="zeros"), read_noise(folder / "result")
+    sizes = []
+    for some in (choices, replace(choices, only="all")):
+        report = identifiability_of_dataset(found.dataset, some, noise)
+        assert report.platform_sigma is not None
+        sizes.append(report.platform_sigma.dX_m)
+    assert found.platform is not None
+    assert sizes[0] == pytest.approx(found.platform.sigma.rms[0], rel=0.25)
+    assert sizes[0] > 2.0 * sizes[1]
+
+
+def test_what_a_group_leaves_is_that_of_machines_with_these_tolerances() -> None:
+    machine = replace(load_mechanism("servo-hexapod"), tolerance=TYPICAL["machined"])
+    legs, rng = fitted_legs(machine), np.random.default_rng(1)
+    errors = part_errors(legs, machine.tolerance.completed(machine.size))
+    J, S, n = errors.J, np.diag(errors.sigma**2), 4000
+    rows = rng.normal(size=(12, len(J))) @ J  # of images that tell a few combinations
+    rows /= np.linalg.norm(rows * errors.sigma, axis=1)[:, None]
+    gain = S @ rows.T @ np.linalg.inv(rows @ S @ rows.T + 0.01 * np.eye(12))
+    posterior = S - gain @ rows @ S
+    true = rng.normal(size=(n, len(S))) * errors.sigma
+    value = (true @ rows.T + 0.1 * rng.normal(size=(n, 12))) @ gain.T
+    framed = in_joint_frames(legs.nominal, legs.frame_legs)
+    group = WrittenGroup.of(machine, framed, J, errors.of_group("zeros"))
+    held = value - value @ group.left.T
+    assert not held[:, ~errors.of_group("zeros")].any()
+    found = (true - held) @ J.T
+    predicted = np.diagonal(group.covariance(posterior, S - posterior))
+    some = predicted > 0.0
+    np.testing.assert_allclose((found**2).mean(axis=0)[some], predicted[some], rtol=0.15)

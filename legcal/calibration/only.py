@@ -2,20 +2,19 @@
 
 The joint fit has the tolerances as priors of all parameters
 (:mod:`legcal.calibration.joint_fit.part_errors`). What is reported is the posterior of
-the group, with all else marginalised. The written model keeps nominal values of all else; its group
-is moved further by what serves the platform best there: the least squares, over the workspace, of
-what the posterior means of all else do to it. The predicted error contains what that leaves.
+the group, with all else marginalised. The written model keeps nominal values of all else, and its
+predicted error contains what that leaves
+(:class:`legcal.calibration.joint_fit.platform.WrittenGroup`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.documents import Doubt, MotorZero
 from legcal.calibration.doubts import MOST_MOVED, TOLERANCE
@@ -26,25 +25,24 @@ from legcal.calibration.joint_fit.part_errors import (
     part_errors,
     with_zeros,
 )
-from legcal.calibration.joint_fit.platform import platform_by_parameters, workspace_poses
+from legcal.calibration.joint_fit.platform import WrittenGroup, platform_by_parts, workspace_poses
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import fitted_legs
 from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import frame_on_points
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     geometries,
     in_joint_frames,
-    parametrization_of,
     vector_of,
 )
 from legcal.machine.tolerance import Tolerance
 
 _KINDS: Mapping[Kind, str] = {"joints": "joints", "axes": "axes", "lengths": "rods"}
-_WELL = 1e-3  # of the largest singular value: motions of the platform by a group that count
 RARE = 10.0  # by which a horn on another tooth must raise twice the logarithm of a likelihood
+_UNSEEN = 0.98  # part of the variance by tolerances above which images tell nothing
 _SURE = 2.5  # standard deviations within which an offset is a whole number of teeth
 
 
@@ -57,10 +55,15 @@ class GroupEstimate:
     turned: Mapping[str, float]  # by motor: how far its horn is on another tooth [rad]
     errors: PartErrors
     value: Array  # (m,) posterior mean of these errors [m, rad], beside what is turned
-    sigma: Array  # (m,) their standard deviations
+    covariance: Array  # (m, m) of these
     held: Array  # (m,) what the written model has of them
     solution: Solution  # with the parameters that are written, and their uncertainty
     written: tuple[Leg, ...]  # in R_b and R_e of the nominal model, only the group having moved
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of the errors (m,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
 
     @property
     def zeros(self) -> list[MotorZero]:
@@ -110,8 +113,30 @@ class GroupEstimate:
             scale, unit = SHOWN_IN[others[0].unit]
             most = max(abs(z.value) for z in others)
             who = "the others are" if wrong else "all zeros are"
-            clauses.append(f"{who} within {scale * most:.1f} {unit}")
+            if wrong or (apart := self._zeros_apart()) is None:
+                clauses.append(f"{who} within {scale * most:.1f} {unit}")
+            else:
+                most, sigma = apart
+                clauses.append(
+                    f"zeros relative to each other are within {scale * most:.1f} ± "
+                    f"{scale * sigma:.1f} {unit}; their common part is not seen by images"
+                )
         return "; ".join(clauses)
+
+    def _zeros_apart(self) -> tuple[float, float] | None:
+        """Return the largest distance of a zero from the mean of all, and the largest sigma.
+
+        None if images see the mean: a common shift of all rails of a linear Delta moves the whole
+        machine along, and its mean stays as uncertain as its prior.
+        """
+        at = self.errors.of("zeros")
+        C, by_prior = self.covariance[np.ix_(at, at)], self.errors.sigma[at]
+        if len(at) < 2 or C.sum() < _UNSEEN * np.sum(by_prior**2):
+            return None
+        centred = np.eye(len(at)) - 1.0 / len(at)
+        apart = np.abs(centred @ [zero.value for zero in self.zeros])
+        sigma = np.sqrt(np.diagonal(centred @ C @ centred))
+        return float(apart.max()), float(sigma.max())
 
     @property
     def doubts(self) -> list[Doubt]:
@@ -149,7 +174,7 @@ def joint_error(machine: Machine, tolerance: Tolerance) -> float:
     if poses is None:
         return math.inf
     errors = part_errors(fitted, tolerance)
-    of_parts = _platform_by_parts(machine, legs, errors.J, poses) * errors.sigma
+    of_parts = platform_by_parts(machine, legs, errors.J, poses) * errors.sigma
     moved = float(np.sqrt(np.sum(of_parts**2, axis=1).mean()))
     return math.hypot(moved, tolerance.joints or 0.0) / machine.size
 
@@ -204,19 +229,19 @@ def estimate_group(
     x = vector_of(parametrization, solution.legs, legs.nominal)
     K = near.gain
     value, covariance = near.posterior(x, solution.kinematic.value_covariance)
-    chosen = np.array([group == "all" or kind == group for kind in near.kinds], dtype=np.bool_)
-    if group == "all":
-        moved, left = with_zeros(solution.legs, turned), np.zeros(len(value))
-    else:
-        marginal = _with_group(legs.nominal, near, value, turned, group)
-        framed = in_joint_frames(marginal, machine.frame_legs)
-        more = _serving_platform(machine, framed, there.J, np.where(chosen, 0.0, value), chosen)
-        moved = _with_group(legs.nominal, near, value + more, turned, group)
-        left = np.where(chosen, -more, value)
-    C = there.J @ (covariance + np.outer(left, left)) @ there.J.T
-    sigma = np.sqrt(np.diagonal(covariance))
+    chosen = near.of_group(group)
+    marginal = _with_group(legs.nominal, near, value, turned, group)
+    framed = in_joint_frames(marginal, machine.frame_legs)
+    model = WrittenGroup.of(machine, framed, there.J, chosen)
+    left = model.left @ value
+    moved = with_zeros(solution.legs, turned)
+    if group != "all":
+        moved = _with_group(legs.nominal, near, value - left, turned, group)
+    C = model.covariance(covariance, np.outer(value, value))
     if group == "all" and not turned:
-        return GroupEstimate(group, machine, turned, near, value, sigma, value, solution, moved)
+        return GroupEstimate(
+            group, machine, turned, near, value, covariance, value, solution, moved
+        )
     by_fit, free = there.J @ K, np.any(there.J[:, chosen] != 0.0, axis=1)
     frame_legs = list(machine.frame_legs)
     T = frame_on_points(np.array([moved[j].A for j in frame_legs])).inv()
@@ -242,34 +267,9 @@ def estimate_group(
         ),
         sensitivities={what: by_fit @ one for what, one in solution.sensitivities.items()},
     )
-    return GroupEstimate(group, machine, turned, near, value, sigma, value - left, reported, moved)
-
-
-def _serving_platform(
-    machine: Machine, legs: tuple[Leg, ...], J: Array, others: Array, chosen: BoolArray
-) -> Array:
-    """Return the errors (m,) of *chosen* parts that move the platform as those of *others* do.
-
-    By least squares over the workspace, rotations as they move the joints of the platform; zero
-    where readings do not determine its pose.
-    """
-    more = np.zeros(len(others))
-    poses = workspace_poses(machine, legs) if machine.is_determined else None
-    if poses is None:
-        return more
-    G = _platform_by_parts(machine, legs, J, poses)
-    more[chosen] = np.linalg.lstsq(G[:, chosen], G @ others, rcond=_WELL)[0]
-    return more
-
-
-def _platform_by_parts(
-    machine: Machine, legs: tuple[Leg, ...], J: Array, poses: Sequence[RigidTransform]
-) -> Array:
-    """Return motions of the platform (n, m) [m] by errors of parts; rotations as joints move."""
-    parametrization = parametrization_of(machine, twists=True)
-    G = platform_by_parameters(legs, parametrization, machine.frame_legs, poses) @ J
-    arm = 0.5 * float(np.linalg.norm(np.ptp(machine.B_platform, axis=0)))
-    return np.asarray((G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, J.shape[1]))
+    return GroupEstimate(
+        group, machine, turned, near, value, covariance, value - left, reported, moved
+    )
 
 
 def _with_group(

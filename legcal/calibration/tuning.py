@@ -44,7 +44,7 @@ LIMB_BIAS_PX = 0.02
 LIMB_SHARES = (0.5, 0.3)
 # Error of an edge of a body that it keeps in all images of a view, over that of a single one: with
 # less, three sessions of electric cylinders by another renderer end farther off than is stated.
-EDGE_SHARE = 1.5
+EDGE_SHARE = 1.0
 # Bias of an edge of a polished part at a place, where it reflects much the same in all poses [px]:
 # in photographs of chromed and polished rods with truth, means of an edge in a view scatter by it.
 POLISHED_BIAS_PX = 0.2

@@ -47,8 +47,8 @@ LEAST_MOVE, MAX_SIGMA = 0.1, 0.05  # of an image, to be corrected [px]
 SIGMAS = 10.0
 # Squares that two images share: their deviation [grey levels], and their correlation in both; the
 # share of squares below which the camera is somewhere else. At most 0.03 with a camera in the hand,
-# at least 0.25 on tripods, dark rooms and grainy photographs included
-SHOWS, ALIKE, LEAST_ALIKE = 3.0, 0.8, 0.1
+# at least 0.16 on tripods; and the share that shows anything, below which most are of the machine
+SHOWS, ALIKE, LEAST_ALIKE, LEAST_SHOWN = 3.0, 0.8, 0.1, 0.33
 
 
 def camera_moves(
@@ -115,7 +115,7 @@ def is_moved(load: Load, rows: Sequence[int]) -> bool:
     shown = np.minimum(spread[1:], spread[:-1]) > SHOWS
     alike = np.mean(flat[1:] * flat[:-1], axis=2) > ALIKE * spread[1:] * spread[:-1]
     n = np.count_nonzero(shown, axis=1)
-    told = n >= MIN_SQUARES
+    told = n >= max(MIN_SQUARES, LEAST_SHOWN * shown.shape[1])
     share = np.count_nonzero(shown & alike, axis=1)[told] / n[told]
     return bool(2 * len(share) > len(n) and np.median(share) < LEAST_ALIKE)
 

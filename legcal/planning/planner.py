@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.part_errors import predicted_sigmas, sigmas_in_words
-from legcal.calibration.joint_fit.platform import poses_at_readings
+from legcal.calibration.joint_fit.platform import poses_at_readings, written_covariance
 from legcal.calibration.joint_fit.predicted import (
     Contributions,
     Predictor,
@@ -623,6 +623,7 @@ class _Search:
             notes.append(f"Readings do not determine the pose: {machine.undetermined}.")
         parts = predicted_sigmas(predictor.legs, predictor.choices, covariance)
         notes += sigmas_in_words(parts)
+        covariance = written_covariance(machine, predictor.legs, predictor.choices, covariance)
         parametrization = predictor.legs.parametrization
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         return Plan(

@@ -114,7 +114,9 @@ def _growth(plan: Plan) -> list[tuple[str, str]]:
     for k, value in plan.growth.tolist():
         if k in (max(n // 3, 1), max(2 * n // 3, 1), n) or n < k <= 4 * n:
             ratio, words = value / plan.value, "{:.2f} relative to the plan"
-            if plan.error is not None:
+            if plan.only not in (None, "all"):
+                words += ", with all parameters"
+            elif plan.error is not None:
                 ratio, words = 1e3 * ratio * plan.error.mean_displacement, "{:.3f} mm"
             rows.append((f"{k:.0f}", words.format(ratio)))
     return rows

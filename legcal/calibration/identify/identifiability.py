@@ -39,6 +39,7 @@ from legcal.calibration.joint_fit.platform import (
     expected_error,
     moved_by,
     platform_by_parameters,
+    written_covariance,
 )
 from legcal.calibration.joint_fit.predicted import (
     DEFAULT_NOISE,
@@ -126,7 +127,7 @@ class Analysis:
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance of all parameters of the fit that a calibration would state."""
+        """The covariance of all parameters of the fit."""
         session = self.session
         found = session.contributions(self.choices, self.noise, known_length=session.mean_length)
         return fitted_covariance([found], session.fitted, session.reached, session.mean_length)
@@ -140,7 +141,8 @@ class Analysis:
         by_parameters = platform_by_parameters(
             fitted.nominal, fitted.parametrization, session.machine.frame_legs, session.reached
         )
-        return RmsMotion(*expected_error(by_parameters, self.covariance).rms)
+        C = written_covariance(session.machine, fitted, self.choices, self.covariance)
+        return RmsMotion(*expected_error(by_parameters, C).rms)
 
     @cached_property
     def parts(self) -> tuple[PartSigma, ...]:

@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.parameter_choices import Choices, Group
 from legcal.calibration.joint_fit.variables import FittedLegs
 from legcal.calibration.tuning import ARM_AXIS_SIGMA, ARM_POINT_SIGMA
 from legcal.estimation.problem import GaussianPrior
@@ -82,6 +82,10 @@ class PartErrors:
         K = self.gain
         return K @ (x - self.centre), np.diag(self.sigma**2) + K @ (C - self.covariance) @ K.T
 
+    def of_group(self, group: Group | None) -> BoolArray:
+        """Return a mask of the errors (m,) of a group of parts."""
+        return np.array([group == "all" or kind == group for kind in self.kinds], dtype=np.bool_)
+
     def of(self, kind: Kind) -> IntArray:
         """Return the indices of the errors of a kind."""
         return np.flatnonzero(np.equal(self.kinds, kind))
@@ -125,7 +129,7 @@ def predicted_sigmas(legs: FittedLegs, choices: Choices, C: Array) -> tuple[Part
 
 
 def sigmas_in_words(parts: Sequence[PartSigma]) -> list[str]:
-    """Return a sentence for each kind of parts; of a group alone what it leaves."""
+    """Return a sentence for each kind of parts."""
     sentences = []
     for kind in dict.fromkeys(one.kind for one in parts):
         some = [one for one in parts if one.kind == kind]
@@ -134,11 +138,6 @@ def sigmas_in_words(parts: Sequence[PartSigma]) -> list[str]:
         sentences.append(
             f"Expected of the {kind}, with tolerances as priors: {least:.2g} to {most:.2g} {unit} "
             f"(1 sigma), where parts like these are {scale * some[0].tolerance:.2g} {unit} off."
-        )
-    if len(sentences) == 1:
-        sentences.append(
-            f"The error of the platform is that of a model with all parameters (--only all): with "
-            f"--only {parts[0].kind} all other parts keep theirs."
         )
     return sentences
 

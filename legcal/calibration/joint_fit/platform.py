@@ -13,8 +13,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
+from legcal.calibration.joint_fit.parameter_choices import Choices
+from legcal.calibration.joint_fit.part_errors import part_errors
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.variables import platform_poses
+from legcal.calibration.joint_fit.variables import FittedLegs, platform_poses
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.estimation.problem import Frames
 from legcal.geometry.motions import motions_of
@@ -24,7 +26,12 @@ from legcal.machine.equations import pose_sensitivity
 from legcal.machine.kinematics import platforms_in_base, pose_differences
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine, readings_at_poses
-from legcal.machine.parameters import Parametrization, geometries
+from legcal.machine.parameters import (
+    Parametrization,
+    geometries,
+    in_joint_frames,
+    parametrization_of,
+)
 from legcal.machine.rods import length_errors
 
 
@@ -105,11 +112,75 @@ def moved_by(by_parameters: Array, changes: Array) -> PlatformError:
     return PlatformError(_root_of_sum(motion[:, 3:]), _root_of_sum(motion[:, :3]))
 
 
+def platform_by_parts(
+    machine: Machine, legs: tuple[Leg, ...], J: Array, poses: Sequence[RigidTransform]
+) -> Array:
+    """Return motions of the platform (n, m) [m] by errors of parts; rotations as joints move."""
+    parametrization = parametrization_of(machine, twists=True)
+    G = platform_by_parameters(legs, parametrization, machine.frame_legs, poses) @ J
+    arm = 0.5 * float(np.linalg.norm(np.ptp(machine.B_platform, axis=0)))
+    return np.asarray((G * np.repeat([arm, 1.0], 3)[:, None]).reshape(-1, J.shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenGroup:
+    """Parameters of a model in which only a group of parts is calibrated, by errors of parts.
+
+    All else keeps nominal values. The group moves beyond its posterior mean by what serves the
+    platform best there: the least squares, over the workspace, of what the posterior means of all
+    else do to it; rotations as they move the joints of the platform.
+    """
+
+    J: Array  # (p, m) derivatives of the parameters
+    left: Array  # (m, m) errors that the model keeps, by posterior means of the errors
+
+    @classmethod
+    def of(
+        cls, machine: Machine, legs: tuple[Leg, ...], J: Array, chosen: BoolArray
+    ) -> WrittenGroup:
+        """Return the model with *chosen* parts (m,) of legs in the frames of their joints.
+
+        They do not serve the platform where readings do not determine its pose.
+        """
+        left = np.diag(np.where(chosen, 0.0, 1.0))
+        poses = None
+        if machine.is_determined and not chosen.all():
+            poses = workspace_poses(machine, legs)
+        if poses is not None:
+            G = platform_by_parts(machine, legs, J, poses)
+            serving = np.linalg.lstsq(G[:, chosen], G[:, ~chosen], rcond=_WELL)[0]
+            left[np.ix_(chosen, ~chosen)] = -serving
+        return cls(J, left)
+
+    def covariance(self, posterior: Array, squares: Array) -> Array:
+        """Return the covariance (p, p) of the parameters.
+
+        By that of the errors after the fit, and the mean squares of their means (m, m).
+        """
+        return self.J @ (posterior + self.left @ squares @ self.left.T) @ self.J.T
+
+
+def written_covariance(machine: Machine, legs: FittedLegs, choices: Choices, C: Array) -> Array:
+    """Return the covariance (p, p) of the model that is written, C that of all parameters.
+
+    Means of errors after the fit are not known before it: their mean squares are what the fit
+    takes from the prior.
+    """
+    if choices.built is None or choices.only == "all":
+        return C
+    errors = part_errors(legs, choices.built)
+    framed = in_joint_frames(legs.nominal, legs.frame_legs)
+    written = WrittenGroup.of(machine, framed, errors.J, errors.of_group(choices.only))
+    posterior = errors.posterior(errors.centre, C)[1]
+    return written.covariance(posterior, np.diag(errors.sigma**2) - posterior)
+
+
 def _root_of_sum(squares: Array) -> Array:
     """Root of sums of squares, (n_poses,), clipped against negative rounding."""
     return np.asarray(np.sqrt(np.maximum(squares.sum(axis=1), 0.0)))
 
 
+_WELL = 1e-3  # of the largest singular value: motions of the platform by a group that count
 N_ACROSS, N_LEVELS = 7, 3  # points of the grid in x and y, and in z
 MIN_PLACES = 6  # smallest number of reachable points of a grid
 _FLAT = 1e-3  # extent of a planar workspace, relative to the largest extent
