@@ -349,7 +349,7 @@ def with_common_shift(search: Search, fits: Sequence[ViewFit]) -> tuple[Search, 
         search,
         A_base=search.A_base + shift[:, 0],
         B_base=search.B_base + shift[:, 1],
-        joint_error=float(np.sqrt(across.mean() / 2.0)) / search.size,
+        joint_error=min(float(np.sqrt(across.mean() / 2.0)) / search.size, search.joint_error),
         shift_whitening=whitener(of_legs),
     )
     return moved, shift
