@@ -157,11 +157,12 @@ class EarlierResult(Summarised):
     @property
     def verdict(self) -> Verdict:
         """Whether to use it, as it was written; the file does not hold its ``remedy``."""
-        sentence = self.document.verdict
+        sentence, written = self.document.verdict, self.document.doubts
         is_refused = sentence.startswith(REFUSED)
+        # Too small an improvement is always grave, and follows its causes; else the worst is first
+        grave = [k for k, doubt in enumerate(written) if doubt.code == "no_improvement"] or [0]
         doubts = [
-            replace(doubt, is_grave=is_refused and k == 0)  # the worst is the first
-            for k, doubt in enumerate(self.document.doubts)
+            replace(doubt, is_grave=is_refused and k in grave) for k, doubt in enumerate(written)
         ]
         return Verdict(tuple(doubts), sentence)
 

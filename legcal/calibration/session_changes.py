@@ -257,9 +257,8 @@ class _Test(NamedTuple):
 class SessionTests:
     """Tests of a session."""
 
-    findings: tuple[
-        UnmodelledEffect, ...
-    ] = ()  # the numbers that the fit lacks, the most certain first
+    # the numbers that the fit lacks, the most certain first
+    findings: tuple[UnmodelledEffect, ...] = ()
     # the least changes of encoders that would show half of the time, by motor [m or rad]; motors of
     # which no change can be seen are not in it
     least_slips: Mapping[str, float] = field(default_factory=dict)
@@ -285,10 +284,14 @@ def session_tests(
     # A few wrong rows, or photographs of others, are no scatter if there is far less without them
     others = _tests(_with_rejected(posterior, ~left_out), measurements, sequences)
     of_all, of_others = (
-        {one.kind: one.amount / one.stated for one in found.findings if one.kind in OF_SCATTER}
+        {
+            (one.kind, one.subject): one.amount / one.stated
+            for one in found.findings
+            if one.kind in OF_SCATTER
+        }
         for found in (tests, others)
     )
-    same = (of_others[kind] > _SAME_SCATTER * of_all[kind] for kind in of_all.keys() & of_others)
+    same = (of_others[one] > _SAME_SCATTER * of_all[one] for one in of_all.keys() & of_others)
     return tests if any(same) else others
 
 

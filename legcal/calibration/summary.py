@@ -198,7 +198,7 @@ class ParameterTable:
     def __getitem__(self, row: int | slice) -> dict[str, Any] | ParameterTable:
         if isinstance(row, slice):
             return replace(self, quantities=self.quantities[row])
-        return dict(zip(self.columns, self.rows[row], strict=True))
+        return {name: _COLUMNS[name](self.quantities[row]) for name in self.columns}
 
     def cells(self) -> list[tuple[str, ...]]:
         """Return the rows as texts, the status of estimated parameters left out."""

@@ -183,7 +183,10 @@ def _all_placed(
             return placed
         at = [(tasks[k].group, placed[k][0]) for k in new]
         fits |= dict(zip(new, run(partial(_fitted, search), at), strict=True))
-        shown, shift = with_common_shift(search, [fit for fit in fits.values() if fit is not None])
+        known = [fit for fit in fits.values() if fit is not None]
+        if not known:
+            return placed
+        shown, shift = with_common_shift(search, known)
         again = run(partial(_placed, shown), [_seen_by(shown, tasks[k]) for k in left])
         for k, (one, swapped) in zip(left, again, strict=True):
             if one.is_convincing and not swapped:
