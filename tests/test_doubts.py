@@ -35,6 +35,7 @@ from legcal.calibration.doubts import model_error
 from legcal.calibration.joint_fit.held_out import cross_validate
 from legcal.calibration.joint_fit.scale import ALL_READINGS
 from legcal.calibration.joint_fit.sensitivity import FITTED_CAMERA, WrongIntrinsic
+from legcal.calibration.result import REFUSED
 from legcal.calibration.session_changes import Kind
 from legcal.calibration.verdict import judge
 from legcal.machine.tolerance import TYPICAL, Tolerance
@@ -335,6 +336,10 @@ def test_exit_code_document_summary_and_page_agree(
     written = load_result(out).result
     read = load_result(out).verdict
     assert (read.sentence, read.doubts) == (calibration.verdict.sentence, calibration.doubts)
+    amber, red = Doubt("camera", "a", "b"), Doubt("no_improvement", "c", "d", is_grave=True)
+    changes = {"doubts": (amber, red), "verdict": REFUSED}
+    led = replace(load_result(out), document=written.model_copy(update=changes)).verdict
+    assert led.doubts == (amber, red)
     page: Any = html.document_fromstring((out / "report.html").read_text())
     light, first = (
         page.xpath("//section[@id='verdict']/@class")[0],
