@@ -172,21 +172,27 @@ def _all_placed(
     """Return the cameras of all groups, and whether their images are mirrored.
 
     What is left is placed by the joints as the groups that are placed show them: poses that look
-    alike from one image of a symmetric machine need other errors of its joints.
+    alike from one image of a symmetric machine need other errors of its joints. So is a group whose
+    fit contradicts those of the others.
     """
     placed = list(run(partial(_placed, search), tasks))
-    fits = dict[int, ViewFit | None]()
+    fits, seen = dict[int, ViewFit | None](), set[int]()
     while True:
         left = [k for k, (one, swapped) in enumerate(placed) if swapped or not one.is_convincing]
         new = [k for k in range(len(tasks)) if k not in left and k not in fits]
-        if not left or not new:
+        if not left or seen.issuperset(new):
             return placed
+        seen.update(new)
         at = [(tasks[k].group, placed[k][0]) for k in new]
         fits |= dict(zip(new, run(partial(_fitted, search), at), strict=True))
-        known = [fit for fit in fits.values() if fit is not None]
+        known = {k: fit for k, fit in fits.items() if fit is not None}
         if not known:
             return placed
-        shown, shift = with_common_shift(search, known)
+        shown, shift, agree = with_common_shift(search, list(known.values()))
+        for k in (k for k, is_one in zip(known, agree.tolist(), strict=True) if not is_one):
+            placed[k] = replace(placed[k][0], by_outlines=False), False
+            left.append(k)
+            del fits[k]
         again = run(partial(_placed, shown), [_seen_by(shown, tasks[k]) for k in left])
         for k, (one, swapped) in zip(left, again, strict=True):
             if one.is_convincing and not swapped:

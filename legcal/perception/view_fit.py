@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.special import chdtrc
 
 from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
@@ -59,6 +60,8 @@ ITERATIONS, FIXED_ITERATIONS = 8, 2  # of Gauss-Newton, and those before sigmas 
 OUTLINE_EVIDENCE, MAX_OUTLINES = 2.0, 4  # of an outline, half a square; of a leg in an image
 EVIDENCE_OF_IMAGE = 0.15  # of EVIDENCE, for each image: more of them agree more by chance
 WEAK = 0.7  # part of the least evidence without which a view that edge pairs placed is none
+MIN_AGREEMENT = 0.01  # probability, below which the joints of a group contradict those of others
+SHOWN = 1e-9  # of the best known combination of shifts, from which on a group shows another one
 SHIFT_COST = 0.25  # of a squared shift [standard deviations^-2]: half, as some are the pose's
 GOOD_FIT = 0.85  # part of the evidence that outlines can give at most
 CAUCHY_WIDTH = 2.0  # from which on a leg of an image counts less [standard deviations]
@@ -320,18 +323,21 @@ def _evidence(
     return float(of_legs - SHIFT_COST * np.sum(shifts**2))
 
 
-def with_common_shift(search: Search, fits: Sequence[ViewFit]) -> tuple[Search, Array]:
-    """Return the search with the joints where fits of several groups have them, and their shifts.
+def with_common_shift(search: Search, fits: Sequence[ViewFit]) -> tuple[Search, Array, BoolArray]:
+    """Return the search with the joints where fits of several groups have them.
 
-    All groups show one machine: what the outlines of each say besides its prior adds up, to shifts
-    (n_legs, 2, 3) of A and B [m]. Motions of all joints as one body are the cameras'.
+    Besides their shifts (n_legs, 2, 3) of A and B [m], and which fits these come from. All groups
+    show one machine: what the outlines of each say besides its prior adds up, but for those that
+    contradict the others. Motions of all joints as one body are the cameras'.
     """
     usual, n = search.joint_error * search.size, 6 * search.n_legs
-    N, b = np.eye(n) / usual**2, np.zeros(n)
-    for fit in fits:
-        inverse = np.linalg.inv(fit.covariance[6:, 6:])
-        N += inverse - np.eye(n) / fit.joint_sigma**2
-        b += inverse @ fit.shift.ravel()
+    prior = np.eye(n) / usual**2
+    inverse = np.linalg.inv([fit.covariance[6:, 6:] for fit in fits])
+    own_sigma = np.array([fit.joint_sigma for fit in fits])
+    weights = inverse - np.eye(n) / own_sigma[:, None, None] ** 2
+    told = np.stack([of @ fit.shift.ravel() for of, fit in zip(inverse, fits, strict=True)])
+    agree = _agreeing(prior, weights, told)
+    N, b = prior + weights[agree].sum(axis=0), told[agree].sum(axis=0)
     A, B = search.A_base.mean(axis=0), search.B_base.mean(axis=0)
     X = np.stack([A, B], axis=1).reshape(-1, 3)
     turns = -cross_matrices(X - X.mean(axis=0)).reshape(n, 3)
@@ -352,7 +358,29 @@ def with_common_shift(search: Search, fits: Sequence[ViewFit]) -> tuple[Search, 
         joint_error=min(float(np.sqrt(across.mean() / 2.0)) / search.size, search.joint_error),
         shift_whitening=whitener(of_legs),
     )
-    return moved, shift
+    return moved, shift, agree
+
+
+def _agreeing(prior: Array, weights: Array, told: Array) -> BoolArray:
+    """Return which of some sources agree with the others: the farthest goes while one does not.
+
+    From the inverse covariance (n, n) of a common prior, and the normal equations (m, n, n), (m, n)
+    of each source. Of two that disagree nobody knows which is wrong.
+    """
+    agree = np.ones(len(told), dtype=np.bool_)
+    while agree.sum() > 2:
+        p = np.ones(len(told))
+        for k in np.flatnonzero(agree).tolist():
+            others = np.linalg.inv(prior + weights[agree].sum(axis=0) - weights[k])
+            gap = told[k] - weights[k] @ others @ (told[agree].sum(axis=0) - told[k])
+            variance, axes = np.linalg.eigh(weights[k] + weights[k] @ others @ weights[k])
+            shown = variance > SHOWN * variance[-1]
+            square = np.sum((gap @ axes[:, shown]) ** 2 / variance[shown])
+            p[k] = chdtrc(shown.sum(), square)
+        if p.min() >= MIN_AGREEMENT:
+            break
+        agree[np.argmin(p)] = False
+    return agree
 
 
 def min_evidence(group: Group) -> float:
