@@ -21,7 +21,7 @@ from legcal.calibration.joint_fit.variables import Start, State, intrinsic_of
 from legcal.calibration.tuning import SCATTER_BY_CHANCE
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason
-from legcal.errors import Code, DidNotConverge, LegcalError, NotIdentifiable, Problem
+from legcal.errors import Code, DidNotConverge, NotIdentifiable, Problem
 from legcal.estimation.solver import information, inverse_on_range
 from legcal.estimation.uncertainty import marginal, named_information
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -61,12 +61,14 @@ def refuse_contradicted_priors(normal: FitNormal) -> None:
         return
     names = problem.choices.priors.keys()
     unit_of = dict(zip(problem.named, problem.units, strict=True))
-    problems = [
-        _contradiction(name, unit_of[name], (prior.mean, prior.sigma), estimate.mean, apart)
-        for name, prior, estimate, apart in _contradicted(normal, names)
-    ]
+    # A stated length stands beside the tolerance of its part: the narrower one is named.
+    found = sorted(_contradicted(normal, names), key=lambda one: -one[1].sigma)
+    problems = {
+        name: _contradiction(name, unit_of[name], (prior.mean, prior.sigma), estimate.mean, apart)
+        for name, prior, estimate, apart in found
+    }
     if problems:
-        raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems])
+        raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems.values()])
 
 
 def _contradiction(
@@ -454,21 +456,6 @@ def contradicted_radii(normal: FitNormal) -> list[str]:
         f"The measurements contradict radii of the model: {'; '.join(contradictions)}; limit "
         f"{RADIUS_SIGMAS:g} standard deviations; measure these parts and correct the model."
     ]
-
-
-def blaming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
-    """Prepend the stated values, if any, to a failure as its likely cause."""
-    stated = stated_parameters(problem)
-    if not stated:
-        return failure
-    return DidNotConverge(
-        [
-            f"The joint fit failed with the stated values of {_first_names(stated)}, which are the "
-            "likely cause if it converges without them; correct these values first, or leave them "
-            "out.",
-            *failure.facts,
-        ]
-    )
 
 
 def stated_parameters(problem: FitProblem) -> list[str]:

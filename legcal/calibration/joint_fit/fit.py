@@ -20,7 +20,6 @@ from legcal.calibration.joint_fit.determinacy import (
 )
 from legcal.calibration.joint_fit.diagnostics import (
     arms_of_other_widths,
-    blaming_stated_values,
     contradicted_boards,
     refuse_contradicted_priors,
     refuse_contradicted_values,
@@ -300,10 +299,10 @@ def _first_minimum(problem: FitProblem, start: Start, begin: State | None = None
         if are_free(problem, begin):
             return _first_minimum_with_free_poses(problem, begin)
         return _in_best_assembly_modes(problem, _first_minimum_from(problem, begin))
-    except DidNotConverge as failure:
+    except DidNotConverge:
         refuse_contradicted_values(problem, start, begin, with_priors=True)
         _refuse_undetermined(problem, begin)
-        raise blaming_stated_values(problem, failure) from None
+        raise
 
 
 def _in_best_assembly_modes(problem: FitProblem, first: Minimum[State]) -> Minimum[State]:
@@ -380,7 +379,7 @@ def _refine_minimum(
             refuse_undetermined_inliers(normal, held, fit.accepted)
             _refuse_other_radii(problem, fit.state)
             break
-        except (DidNotConverge, NotIdentifiable) as failure:
+        except (DidNotConverge, NotIdentifiable):
             if contradicted:
                 raise DidNotConverge(contradicted) from None
             within, at = held_at_nominal(problem, first.state, held)
@@ -391,8 +390,6 @@ def _refine_minimum(
                 refuse_contradicted_values(problem, start, at, with_priors=True)
                 _refuse_contradicted(problem, at)
                 _refuse_undetermined(problem, at)
-                if isinstance(failure, DidNotConverge):
-                    raise blaming_stated_values(problem, failure) from None
                 raise
             held = more
     if contradicted and contradicted_boards(normal):
