@@ -286,7 +286,8 @@ def test_few_images_at_the_edge_of_a_lens_choose_it_and_are_not_accused(
     residual_px = np.sqrt(np.mean(np.sum(fit.adjusted.residual**2, axis=1)))
     assert residual_px < chosen.validated_px < 1.5 * residual_px
     errors = projection_errors(truth, fit.adjusted.camera, fit.covariance)
-    assert np.quantile(errors, 0.9) < 3.0  # corners of the image may be far from any board
+    assert errors.max() < 3.0
+    assert np.mean(errors > 0.0) > 0.9  # corners of the image may be far from any board
     assert sigmas(fit)[:4].max() < 0.3
 
 
