@@ -65,7 +65,7 @@ MARGIN, MARGIN_ALONE = 3.0, 6.0  # of the evidence for a pose over the least, of
 # Of the evidence for a pose to that for any other one: where edge pairs are convincing by
 # themselves, of a single image, and from which on no margin is needed.
 RATIO_AGREED, RATIO_ALONE, RATIO_WITHOUT_RIVAL = 1.5, 2.5, 4.0
-KNOWN_JOINTS = 0.5 * JOINT_ERROR  # from which on a single image needs no greater ratio than others
+KNOWN_JOINTS = 0.5 * JOINT_ERROR  # from which on a single image needs no more than others
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 TWO_POSES = (
     "its camera could not be placed: two poses explain its images about equally well ({:.1f} and "
@@ -148,8 +148,8 @@ class _Task(NamedTuple):
 def _placed(search: Search, task: _Task) -> tuple[PoseCandidates, bool]:
     """Return the camera of a group, and whether its images are mirrored.
 
-    By pairs near its rough pose; else by pairs of all images, anywhere; else by all edges along
-    legs; decided by outlines where pairs are ambiguous.
+    By pairs near its rough pose; else by pairs of all images, anywhere, and by outlines where these
+    are ambiguous; else by all edges along legs, and by outlines.
     """
     group, pictures, best = task
     n_legs = search.n_legs
@@ -158,9 +158,10 @@ def _placed(search: Search, task: _Task) -> tuple[PoseCandidates, bool]:
         best = place_camera(every, n_legs)
         if group.hint is not None:
             best = _better(place_near(every, group.hint, n_legs), best)
+        best = _decided_by_outlines(search, group, pictures, best)
         if not best.is_convincing:
-            best = _by_edges(search, group, pictures, best.poses)
-    best = _decided_by_outlines(search, group, pictures, best)
+            by_edges = _by_edges(search, group, pictures, best.poses)
+            best = _decided_by_outlines(search, group, pictures, by_edges)
     if group.is_placed and group.hint is not None and not best.is_convincing:
         best = place_at(group.pictures(pictures, list(pictures)), group.hint, n_legs)
     return best, _is_mirrored(search, group, pictures, best)
@@ -343,10 +344,8 @@ def _is_decided(
         for i, trial in enumerate(trials)
         if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
-    alone = len(group.rows) == 1
-    margin, ratio = (MARGIN_ALONE if alone else MARGIN), EVIDENCE_RATIO
-    if alone and search.joint_error > KNOWN_JOINTS:
-        ratio = RATIO_ALONE
+    alone = len(group.rows) == 1 and search.joint_error > KNOWN_JOINTS
+    margin, ratio = (MARGIN_ALONE, RATIO_ALONE) if alone else (MARGIN, EVIDENCE_RATIO)
     fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False
