@@ -1,9 +1,7 @@
 """Planned sessions: what they hold, what they promise, and what is refused."""
 
 import json
-import os
 import re
-import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -33,7 +31,6 @@ from legcal.geometry.motions import look_at
 from legcal.machine.configurations import Configurations
 from legcal.planning import places as camera_places
 from legcal.planning import planner, request
-from legcal.planning.exchange import choose
 from legcal.planning.places import Place, Setting, default_setting, parse_bounds
 from legcal.planning.poses import candidate_poses as draw_poses
 from legcal.planning.request import difference
@@ -170,40 +167,15 @@ def test_the_command_writes_what_python_plans(
     assert len((session / "poses.csv").read_text().splitlines()) == 1 + 6
 
 
-@pytest.mark.system
-@pytest.mark.usefixtures("answered_signals", "drawn_once")
-def test_a_search_that_is_stopped_writes_its_best_and_says_so(
-    planned: Plan,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_machine_without_motors_is_planned_too(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-
-    def stopped(*found: Any, **more: Any) -> Any:
-        monkeypatch.setattr(planner, "choose", choose)
-        os.kill(os.getpid(), signal.SIGTERM)
-        return choose(*found, **more)
-
-    monkeypatch.setattr(planner, "choose", stopped)
-    monkeypatch.setattr("legcal.cli.sessions._previews", lambda _: {})
-    monkeypatch.setattr("legcal.report.plan.plan_files", lambda *_: {})
-    monkeypatch.setattr(request, "plan", partial(request.plan, setting=FEW))
-    monkeypatch.setattr("legcal.calibration.joint_fit.predicted.DEFAULT_NOISE", WHITE)
-    outcome = run(*WORDS, "--json", "-o", tmp_path / "session")
-    assert outcome.code == 130
-    assert outcome.document["error"]["kind"] == "Interrupted"
-    assert f"written to {tmp_path / 'session'}, with the best plan" in outcome.err
-    document = json.loads((tmp_path / "session" / "plan.json").read_text())
-    assert document["images"] == 6
-    assert planned.value < document["value"] < planned.growth[1, 1]
-    assert any("stopped" in note for note in document["notes"])
-
-
-def test_a_machine_without_motors_is_planned_too(tmp_path: Path) -> None:
     """The strut of constant length carries the scale."""
     simulate("hexapod-strut", tmp_path / "d", SimulationSettings(level=Level.OUTLINES, poses=2))
     model = tmp_path / "d/models/hexapod-strut.yaml"
     keyed(model.name, name_mot=[])(model.parent)
-    found = legcal.plan(model, images=18, noise=WHITE, stop=lambda: True, workers=1)
+    monkeypatch.setattr(planner, "ROUNDS", 0)
+    found = legcal.plan(model, images=18, noise=WHITE, setting=FEW)
     write_session(found, tmp_path / "session")
     dataset = load_dataset(tmp_path / "session", check_images=False)
     assert len(dataset.machine.motors) == 0

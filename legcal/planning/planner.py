@@ -8,7 +8,7 @@ and machine within their tolerances.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
@@ -245,7 +245,6 @@ def _bodies(machine: Machine, legs: tuple[Leg, ...], poses: tuple[RigidTransform
 def plan_session(
     task: Task,
     progress: Report = no_progress,
-    stop: Callable[[], bool] = lambda: False,
     run: Run = in_turn,
 ) -> Plan:
     """Plan a session.
@@ -272,7 +271,6 @@ def plan_session(
         criterion_of(work, legs, basis),
         rng,
         progress,
-        stop,
         run,
     )
     current, least, value = search.chosen(shown, poses)
@@ -280,8 +278,6 @@ def plan_session(
     middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
     expected = search.expected_covariance(current)
     for turn in range(ROUNDS):
-        if stop():
-            break
         step = 0.5**turn
         placed = search.improve_positions(current, step, middle)
         polished, reached = search.improve_poses(placed, step, least)
@@ -289,12 +285,7 @@ def plan_session(
         if search.value_of(polished_covariance) < search.value_of(expected):
             current, value, expected = polished, reached, polished_covariance
         progress("Polishing", turn + 1, ROUNDS)
-    was_stopped = stop()
-    plan = search.judged(current, value, expected)
-    if was_stopped:
-        note = "The search was stopped early: this is the best plan so far."
-        plan = replace(plan, notes=(note, *plan.notes))
-    return plan
+    return search.judged(current, value, expected)
 
 
 def _places(task: Task, poses: Configurations) -> list[Place]:
@@ -453,7 +444,6 @@ class _Search:
     criterion: Criterion
     rng: np.random.Generator
     progress: Report
-    stop: Callable[[], bool]
     run: Run
 
     def added(self, candidates: Sequence[Candidates]) -> list[Contributions]:
@@ -489,9 +479,7 @@ class _Search:
         images = choose(
             session, task.n_images, self.criterion, self.rng, least, progress=self.progress
         )
-        images = exchange(
-            session, images, self.criterion, self.rng, least, progress=self.progress, stop=self.stop
-        )
+        images = exchange(session, images, self.criterion, self.rng, least, progress=self.progress)
         self._refuse_undetermined(session, current)
         return _selected_candidates(current, images), least, images.value
 
@@ -543,8 +531,6 @@ class _Search:
         value = self.value(contributions)
         for v, candidates in enumerate(current):
             for _ in range(0 if candidates.place.fixed else N_NEAR_PLACES):
-                if self.stop():
-                    break
                 place = near(current[v].place, target, PLACE_STEP * step, self.rng)
                 trial = replace(candidates, place=place)
                 added = self.task.of(trial) if place.is_inside(self.task.bounds) else None
@@ -562,10 +548,8 @@ class _Search:
         task, spread = self.task, POSE_STEP * step
         widened = []
         for candidates in current:
-            poses = candidates.poses
-            if not self.stop():
-                legs = task.predictor.legs
-                poses = poses_near(task.machine, legs, task.setting, poses, spread, self.rng)
+            poses, legs = candidates.poses, task.predictor.legs
+            poses = poses_near(task.machine, legs, task.setting, poses, spread, self.rng)
             widened.append(self.task.showing(replace(candidates, poses=poses)))
         session = Session(self.added(widened), self.given)
         images = [
@@ -576,9 +560,7 @@ class _Search:
         for slot, image in images:
             session.changed(slot, image, 1.0)
         session.renewed()
-        exchanged = exchange(
-            session, Chosen(images), self.criterion, self.rng, least, stop=self.stop
-        )
+        exchanged = exchange(session, Chosen(images), self.criterion, self.rng, least)
         return _selected_candidates(widened, exchanged), exchanged.value
 
     def value_of(self, covariance: Array) -> float:

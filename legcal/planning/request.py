@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,7 +70,6 @@ def plan(
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress = False,
-    stop: Callable[[], bool] = lambda: False,
 ) -> Plan:
     """Plan poses and camera places of a session that determine a machine best.
 
@@ -116,8 +115,6 @@ def plan(
         another object with ``submit``, like an executor.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    stop : callable
-        Called between steps; once it returns true, the best plan so far is returned.
 
     Returns
     -------
@@ -175,9 +172,9 @@ def plan(
     pool = worker_pool(workers, "The session could not be planned")
     with shown_progress(progress) as report, pool as run:
         if target is None:
-            result = plan_session(task, report, stop, run)
+            result = plan_session(task, report, run)
         else:
-            result = _plan_for_target(task, target, report, stop, run)
+            result = _plan_for_target(task, target, report, run)
         return replace(result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(shot)))
 
 
@@ -195,9 +192,7 @@ def measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[st
     )
 
 
-def _plan_for_target(
-    task: Task, target: float, progress: Report, stop: Callable[[], bool], run: Run
-) -> Plan:
+def _plan_for_target(task: Task, target: float, progress: Report, run: Run) -> Plan:
     """Plan with the fewest images that reach a target [m].
 
     The growth of each plan predicts the number of images for the next one. An unreachable target is
@@ -205,7 +200,7 @@ def _plan_for_target(
     """
     n, least, best = max(_BEGIN, 2 * task.n_views), 0, None
     for _ in range(_ROUNDS):
-        candidate = plan_session(replace(task, n_images=n), progress, stop, run)
+        candidate = plan_session(replace(task, n_images=n), progress, run)
         if candidate.error is None:
             raise UsageError(
                 f"--target could not be used: {task.machine.undetermined}, so the error of the "
@@ -216,11 +211,6 @@ def _plan_for_target(
             best = candidate if best is None or candidate.n_images < best.n_images else best
         else:
             least = max(least, n)
-        if stop():
-            if best is not None:
-                return best
-            note = f"The expected error is {1e3 * error:.3f} mm, not {1e3 * target:g} mm."
-            return replace(candidate, notes=(*candidate.notes, note))
         n_needed = _images_for(candidate, error, target)
         if n_needed > MOST_IMAGES and best is None:
             break
