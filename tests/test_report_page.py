@@ -87,9 +87,8 @@ def test_points_of_the_charts_are_the_residuals_of_the_fit(example_run: Run, pag
     residuals = example_run.calibration.residuals
     offset = dict(zip(residuals.index.tolist(), residuals.offset.tolist(), strict=True))
     _, charts = _charts(page)
-    assert list(charts) == ["By view", "By leg", "By image", "Along the image", "Against contrast",
-                            "QQ plot"]  # fmt: skip
-    for points in list(charts.values())[:5]:
+    assert list(charts) == ["By view", "By leg", "By image"]
+    for points in charts.values():
         seen: dict[int, list[float]] = {}
         for _, y, number in points:
             seen.setdefault(number, []).append(y)

@@ -294,13 +294,11 @@ def scatter(
     y_label: str,
     *,
     words: Sequence[str] = (),
-    diagonal: bool = False,
     log: Literal["", "y", "xy"] = "",
 ) -> Canvas:
     """Draw points, whose numbers are for the script of the page, or lines through them.
 
-    *words* name the x of 0, 1, 2, ...; a *diagonal* is the line of equal x and y; the axes of *log*
-    are logarithmic.
+    *words* name the x of 0, 1, 2, ...; the axes of *log* are logarithmic.
     """
     labels = [points.label for points in groups if points.label]
     top, width, height = 8.0 + 16.0 * len(labels), 340.0, 290.0 + 16.0 * len(labels)
@@ -340,9 +338,6 @@ def scatter(
             at = min(u, width - 3.3 * len(word))  # so that the last one is not cut
             canvas.text(at, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
     canvas.segment((left, top), (left, bottom), GREY)
-    if diagonal:
-        ends = np.array([max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)])
-        canvas.path(on_paper(ends, ends), GREY, 1.0)
     for points in groups:
         colour, mark = (of[points.group % len(of)] for of in (_COLOURS, _MARKS))
         places = on_paper(points.x, points.y)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
-from scipy.special import ndtri
 
 from legcal.calibration.joint_fit.platform import PlatformMap, platform_map
 from legcal.calibration.result import Calibration
@@ -37,7 +36,6 @@ from legcal.pages.document import (
     Charts,
     Crop,
     Drawing,
-    Facts,
     Gallery,
     Items,
     Page,
@@ -349,27 +347,13 @@ def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence
 
 
 def identifiability_blocks(calibration: Calibration) -> list[Block]:
-    """Return counts, and the least certain directions."""
+    """Return the number of determined directions, and the least certain ones."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
-    n_held = len(calibration.solution.kinematic.held_basis)
-    counts = {
-        "Equations": f"{problem.n_equations}: "
-        + ", ".join(
-            f"{f.n * f.n_rows} of {f.name.replace('_', ' ')}" for f in problem.factors if f.n
-        ),
-        "Priors": str(len(problem.priors.mean)),
-        "Unknowns": f"{problem.n_unknowns}: "
-        + ", ".join(
-            f"{block.n_unknowns} of {block.name.replace('_', ' ')}"
-            for block in problem.variables
-            if block.n_unknowns
-        )
-        + f", and {problem.n_elements} platform poses",
-        "Kinematic parameters": f"{free - n_held} of {free} directions determined",
-        "Degrees of freedom": f"{result.residuals.dof}, chi2 {result.residuals.chi2:.1f}",
-    }
-    blocks: list[Block] = [Facts(counts)]
+    determined = free - len(calibration.solution.kinematic.held_basis)
+    blocks: list[Block] = [
+        Text([f"{determined} of {free} directions of the kinematic parameters are determined."])
+    ]
     weak = [
         (
             row.in_words,
@@ -527,8 +511,7 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
     measurements, legs = calibration.dataset.measurements, calibration.dataset.machine.leg_names
     keep = chosen_points(np.abs(residuals.offset).max(axis=1))
     index = residuals.index[keep]
-    offset, whitened = residuals.offset[keep], residuals.whitened[keep]
-    row, leg = outlines.row[index], outlines.leg[index]
+    offset, row, leg = residuals.offset[keep], outlines.row[index], outlines.leg[index]
     views, images = measurements.view_names, row_names(measurements)
     both_ends = np.repeat(np.arange(len(index)), 2)
     number, leg_of_end = index[both_ends], leg[both_ends]
@@ -538,25 +521,14 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
         ("By view", measurements.view[row][both_ends] + jitter, "view", views),
         ("By leg", leg_of_end + jitter, "leg", legs),
         ("By image", row[both_ends] + 1.0, "image, in the order of the table", ()),
-        ("Along the image", outlines.ends[index].reshape(-1, 2)[:, 0],
-         "place along the image, u [px]", ()),
-        ("Against contrast", outlines.contrast[index][both_ends], "contrast [grey levels]", ()),
     ):  # fmt: skip
-        if not (has_x := np.isfinite(x)).any():
-            continue
         groups = [
-            Points(x[chosen], offset.ravel()[chosen], number[chosen], j)
-            for j in np.unique(leg_of_end[has_x]).tolist()
-            if (chosen := has_x & (leg_of_end == j)).any()
+            Points(x[of_leg], offset.ravel()[of_leg], number[of_leg], j)
+            for j in np.unique(leg_of_end).tolist()
+            for of_leg in [leg_of_end == j]
         ]
         svg = scatter(f"Residuals: {title}", groups, label, _OFFSET, words=words)
         charts.append(Drawing(svg.markup(), title=title))
-    ranks = np.argsort(np.argsort(residuals.whitened, axis=None, kind="stable"))
-    normal = ndtri((ranks + 0.5) / len(ranks)).reshape(-1, 2)  # quantiles of a normal distribution
-    quantiles = Points(normal[keep].ravel(), whitened.ravel(), number)
-    svg = scatter("Residuals: QQ plot", [quantiles], "normal quantile", "residual / sigma",
-                  diagonal=True)  # fmt: skip
-    charts.append(Drawing(svg.markup(), title="QQ plot"))
     labels = {
         i: f"{printable(legs[j])} {printable(outlines.part[i])}, edge {edge}: "
         f"{a:+.3f} and {b:+.3f} px\n{printable(images[r])}"
