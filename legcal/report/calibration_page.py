@@ -22,7 +22,6 @@ from legcal.calibration.summary import (
 )
 from legcal.data.measurements import row_names
 from legcal.errors import LegcalError, printable
-from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, Image, IntArray
 from legcal.machine.files import RESULT_YAML
@@ -47,7 +46,7 @@ from legcal.pages.document import (
     page_html,
     time_of_page,
 )
-from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
+from legcal.pages.svg import Points, number_grid, scatter
 from legcal.perception.overlays import curve
 from legcal.report.calibration import next_steps, platform_table, verdict_of
 from legcal.report.render import record_section, table
@@ -78,8 +77,8 @@ def write_report(
     command : str
         The command of the calibration, for the record.
     truth : path, name or Machine, optional
-        The true model of a simulated or measured machine: the page then shows the errors of the
-        nominal and the calibrated model, as Fig. 4 of the paper.
+        The true model of a simulated or measured machine: the page then states the errors of the
+        nominal and the calibrated model.
     into : path, optional
         The folder with the files of the result while it is being written.
 
@@ -192,7 +191,6 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
 
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
-    sigma = {row.name: row.sigma for row in calibration.result.parameters}
     at_platform = (
         "The motors do not determine the pose of the platform: parameters are compared alone."
     )
@@ -207,37 +205,11 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
             f"{by_calibrated} calibrated model (means over {len(after.displacement)} poses of the "
             "workspace, eq 20)."
         )
-    origin = "The truth was given for this page alone: the result was computed without it."
-    blocks: list[Block] = [Text([at_platform, origin])]
-    for unit_of_chart in ("m", "rad"):
-        # Coordinates that the frame makes zero are not parameters.
-        indices = [
-            i
-            for i, name in enumerate(after.names)
-            if after.units[i] == unit_of_chart and name in sigma
-        ]
-        if not indices:
-            continue
-        scale, unit = SHOWN_IN[unit_of_chart]
-        before_errors, after_errors = (
-            (scale * np.abs(evaluation.values - evaluation.references))[indices].tolist()
-            for evaluation in (before, after)
-        )
-        names = [after.names[i] for i in indices]
-        chart = log_bars(
-            "Distance from the truth",
-            unit,
-            names,
-            Bars("nominal", before_errors),
-            Bars("calibrated", after_errors),
-            Bars("its sigma as predicted", [scale * (sigma[name] or 0.0) for name in names]),
-        )
-        caption = (
-            "As Fig. 4 of the paper, of this calibration alone: coordinates are those in R_b and "
-            "R_e."
-        )
-        blocks.append(Drawing(chart.markup(), caption))
-    return blocks
+    origin = (
+        "The truth was given for this page alone: the result was computed without it. legcal "
+        "evaluate compares every parameter."
+    )
+    return [Text([at_platform, origin])]
 
 
 # Parameters
