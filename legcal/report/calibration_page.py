@@ -251,17 +251,11 @@ def machine_scene(calibration: Calibration) -> Scene:
     chosen = np.unique(np.linspace(0, n - 1, min(MAX_POSES, n)).astype(int))
     T = [solution.T_Rb_Re[k] for k in chosen.tolist()]
     q, by_readings = measurements.q_of_poses[chosen], calibration.platform is not None
-    scene = MachineScene(
-        machine,
-        solution.legs,
-        geometries(machine),
-        result,
-        solution.kinematic.parametrization,
-    )
+    scene = MachineScene(machine, solution.legs, geometries(machine), result)
     calibrated = scene.placed(solution.legs, q, T, by_readings=by_readings)
     images, frame, views = row_names(measurements), machine.T_base_Rb, measurements.views
     used = [v for v, view in enumerate(views) if view.name in result.views][:MAX_CAMERAS]
-    content = scene.content(scene.modes(calibrated, q, T, by_readings=by_readings), T)
+    content = scene.compared(calibrated, q, T, by_readings=by_readings)
     content |= {
         "poses": [printable(images[row]) for row in measurements.first_rows[chosen].tolist()],
         "cameras": scene.cameras(
@@ -272,8 +266,7 @@ def machine_scene(calibration: Calibration) -> Scene:
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
         "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
-        "same readings, or grey the calibrated one and blue where a direction would move it; the "
-        "slider exaggerates the difference. Rings are ellipsoids of one "
+        "same readings; the slider exaggerates the difference. Rings are ellipsoids of one "
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
         f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
@@ -339,8 +332,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Block]:
     ]
     if weak:
         columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
-        note = "Select one under Show in the machine above to see it as a motion."
-        blocks.append(replace(table(*columns, rows=weak), note=note))
+        blocks.append(table(*columns, rows=weak))
     return blocks
 
 
