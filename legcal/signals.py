@@ -18,7 +18,6 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # SIGHUP does not exist on every syste
 _NUMBERS = [signal.Signals[name] for name in _NAMES if hasattr(signal, name)]
 _AGAIN = 0.01  # [s]
 _heard: list[int] = []  # signals that stopped the command
-_waiting: list[list[int]] = []  # signals that wait for the end of each block
 
 
 @contextmanager
@@ -62,49 +61,30 @@ def raise_if_stopped() -> None:
 
 
 @contextmanager
-def held_back_signals(*, first_alone: bool = False) -> Iterator[None]:
-    """Let signals that Python answers wait for the end of a block, or the first of them alone.
-
-    The block may look at :func:`is_waiting`.
-    """
+def held_back_signals() -> Iterator[None]:
+    """Let signals that Python answers wait for the end of a block."""
     if current_thread() is not main_thread():  # signals are handled in the main thread
         yield
         return
     waiting: list[int] = []
 
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
     def wait(number: int, _frame: FrameType | None) -> None:
         waiting.append(number)
-        if first_alone:
-            restore()
 
-    _waiting.append(waiting)
     before = {n: handler for n in _NUMBERS if callable(handler := signal.getsignal(n))}
     for number in before:
         signal.signal(number, wait)
     try:
         yield
     finally:
-        restore()
-        _waiting.pop()
+        for number, handler in before.items():
+            signal.signal(number, handler)
         if waiting and not _heard:
             signal.raise_signal(waiting[0])
 
 
-def is_waiting() -> bool:
-    """Return whether a signal waits for the end of a block."""
-    return any(_waiting)
-
-
 def leave_interrupts_to_parent() -> None:
-    """Let a process of a pool ignore Ctrl-C, which its parent handles; other signals end it.
-
-    It may have been forked in :func:`held_back_signals`, with signals still blocked.
-    """
-    _waiting.clear()
+    """Let a process of a pool ignore Ctrl-C, which its parent handles; other signals end it."""
     for number in _NUMBERS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)

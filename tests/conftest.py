@@ -115,8 +115,10 @@ def _models_are_read_once() -> Iterator[None]:
     draw = configurations.random_poses
     workspaces: dict[bytes, tuple[Any, Any]] = {}
 
-    def draw_once(machine: Machine, n: int, seed: int) -> tuple[Any, Any]:
+    def draw_once(machine: Machine, n: int, seed: Any) -> tuple[Any, Any]:
         """Return the sample of the workspace of a machine with these legs, the same every time."""
+        if not isinstance(seed, int):  # a generator, which goes on from draw to draw
+            return draw(machine, n, seed)
         key = pickle.dumps((machine.urdf.content, machine.legs, machine.home.as_matrix(), n, seed))
         if key not in workspaces:
             workspaces[key] = draw(machine, n, seed)

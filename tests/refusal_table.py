@@ -129,6 +129,7 @@ def _use() -> Iterable[Refusal]:
         ("empty-value", "simulate hexapod -o {out} --poses=", ("--poses",)),
         ("option", "doctor x --nonsense", ("--nonsense", "legcal doctor --help lists")),
         ("fix", "calibrate x --fix leg1.offset", ("--fix of", "--set NAME=VALUE")),
+        ("locate-urdf", "locate hexapod p.csv -o f --urdf d", ("--urdf of", "fixed joints")),
         ("no-workers", "detect x -o y --workers 0", ("found 0, needed 1 to 256 processes",)),
         ("two-datasets", "calibrate a b -o out", ("Expected one dataset", "docs/python.md")),
     ]

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import yaml
 from command_line import run
@@ -27,12 +26,10 @@ from located import (
     shipped,
     write_poses,
 )
-from machines import copied_model
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal import Location, ToolPoses, load_mechanism, locate
-from legcal.calibration.location.document import write_located_model
+from legcal import Location, ToolPoses, locate
 from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (
     PosePairs,
@@ -47,13 +44,11 @@ from legcal.errors import (
     DatasetError,
     DidNotConverge,
     LegcalError,
-    ModelError,
     NotIdentifiable,
     UsageError,
 )
 from legcal.geometry.motions import nearest_rotation, rotation_matrices
 from legcal.geometry.types import Array
-from legcal.machine.model import platform_pose
 
 KNOWN: dict[str, Any] = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
 
@@ -289,11 +284,10 @@ def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(tmp_p
     position[4] += 0.05
     write_poses(tmp_path / "poses.csv", hexapod, replace(hexapod.poses, position=position))
     words = ("locate", "hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml")
-    outcome = run(*words, "--urdf", tmp_path / "out", "--json")
+    outcome = run(*words, "--json")
     assert outcome.code == 0
     document = outcome.document
-    names = [Path(p).relative_to(tmp_path).as_posix() for p in document.pop("written")]
-    assert names == ["out/models/hexapod.yaml", "out/urdf/hexapod.urdf", "a.yaml"]
+    assert document.pop("written") == [str(tmp_path / "a.yaml")]
     assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == document
     outcome = run(*words, "--tool-position", "0,0,5mm")
     assert outcome.code == 0
@@ -302,74 +296,6 @@ def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(tmp_p
     assert outcome.code == 1
     assert "Doubtful" in outcome.out
     assert yaml.safe_load((tmp_path / "a.yaml").read_text())["status"] == "doubtful"
-
-
-def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(
-    found: Location, tmp_path: Path
-) -> None:
-    """Against Pinocchio; frames of an earlier location are replaced, all else stays."""
-    name = "tricept"
-    first, second = (replace(found, T_world_base=B, T_platform_tool=T) for B, T in (
-        (BASE * TOOL, TOOL.inv()), (BASE, TOOL)))  # fmt: skip
-    earlier, _ = write_located_model(shipped(name), first, tmp_path / "first")
-    for k, machine in enumerate((shipped(name), load_mechanism(earlier))):
-        model, urdf = write_located_model(machine, second, tmp_path / str(k))
-        old = shipped(name).urdf.content.decode().splitlines()
-        new = urdf.read_text().splitlines()
-        assert [line for line in new if line in old] == old
-        assert len(new) == len(old) + 4
-        written = load_mechanism(model)
-        np.testing.assert_allclose(written.A_base, shipped(name).A_base, atol=1e-14)
-        pin_model = pin.buildModelFromUrdf(str(urdf))
-        data = pin_model.createData()
-        pin.framesForwardKinematics(pin_model, data, written.home_configuration)
-        tip, world = (data.oMf[pin_model.getFrameId(link)] for link in ("tool", "world"))
-        T = RigidTransform.from_matrix((world.inverse() * tip).homogeneous)
-        expected = BASE * platform_pose(written, written.home_configuration) * TOOL
-        assert np.abs(motion_error(T, expected)).max() < 1e-12
-    with pytest.raises(UsageError, match="already there"):
-        write_located_model(shipped(name), found, tmp_path / "0")
-
-
-def _machine_with(folder: Path, extra: str) -> Path:
-    """Write the hexapod with more in its URDF."""
-    return copied_model(
-        folder, "hexapod", lambda text: text.replace("</robot>", f"{extra}</robot>")
-    )
-
-
-JOINT = '<joint name="{0}_j" type="fixed"><parent link="{1}"/><child link="{0}"/>{2}</joint>\n'
-
-
-def test_links_of_another_meaning_are_refused(found: Location, tmp_path: Path) -> None:
-    in_part = locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
-    for link in ("world", "tool"):
-        links = f'<link name="{link}"/>' + JOINT.format(link, "base", "")
-        with pytest.raises(UsageError, match=f"found a link '{link}' that is not"):
-            write_located_model(
-                load_mechanism(_machine_with(tmp_path / link, links)), found, tmp_path / "x"
-            )
-    with pytest.raises(ModelError, match="below the joint 'platform_free', which moves"):
-        write_located_model(replace(shipped("hexapod"), base="platform"), found, tmp_path / "x")
-    _, urdf = write_located_model(shipped("3-rpr"), in_part, tmp_path / "in part")
-    assert not in_part.has_tool_orientation
-    assert 'rpy="0.0 0.0 0.0"/></joint>\n</robot>' in urdf.read_text().replace("-0.0", "0.0")
-
-
-def test_the_world_goes_above_a_root_that_carries_the_base(found: Location, tmp_path: Path) -> None:
-    """And is placed through the table, in a file that has one already."""
-    origin = '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/>'
-    table = '<link name="table"/>' + JOINT.format("base", "table", origin)
-    model = _machine_with(tmp_path, table)
-    on_table = RigidTransform.from_components(
-        [0.1, 0.2, 0.3], Rotation.from_euler("xyz", [0.4, 0.5, 0.6])
-    )
-    for there in (replace(found, T_world_base=TOOL), found):
-        folder = tmp_path / str(there is found)
-        model, _ = write_located_model(load_mechanism(model), there, folder)
-    joint = load_mechanism(model).urdf.joints["world_table_frame"]
-    error = motion_error(joint.T_parent_origin * on_table, found.T_world_base)
-    assert np.abs(error).max() < 1e-14
 
 
 # The fit of both frames

@@ -126,20 +126,27 @@ def _refuse_empty(words: Sequence[str]) -> None:
             )
 
 
-_REPLACED = {
-    "--fix": "--set NAME, or --set NAME=VALUE",
-    "--free": "--set NAME=free",
-    "--prior": "--set NAME=VALUE±SIGMA",
+_GONE = {
+    "calibrate": {
+        "--fix": "write --set NAME, or --set NAME=VALUE",
+        "--free": "write --set NAME=free",
+        "--prior": "write --set NAME=VALUE±SIGMA",
+    },
+    "locate": {
+        "--urdf": "write T_world_base and T_platform_tool of the -o FILE into the URDF, as fixed "
+        "joints"
+    },
 }
 
 
-def _refuse_replaced(words: Sequence[str]) -> None:
-    """Refuse the earlier spellings of ``calibrate --set``."""
+def _refuse_gone(words: Sequence[str]) -> None:
+    """Refuse options that are gone, with what takes their place."""
+    gone = _GONE.get(words[0], {}) if words else {}
     options = dict.fromkeys(word.partition("=")[0] for word in words)
     problems = [
-        f"{option} of legcal calibrate is gone: write {_REPLACED[option]}."
+        f"{option} of legcal {words[0]} is gone: {gone[option]}."
         for option in options
-        if words[:1] == ["calibrate"] and option in _REPLACED
+        if option in gone
     ]
     if problems:
         raise UsageError(problems)
@@ -175,7 +182,7 @@ def run(*, as_json: bool) -> int:
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     try:
         _refuse_empty(sys.argv[1:])
-        _refuse_replaced(sys.argv[1:])
+        _refuse_gone(sys.argv[1:])
         code = commands(sys.argv[1:])(standalone_mode=False, prog_name="legcal")
     except typer.Abort as error:
         raise KeyboardInterrupt from error

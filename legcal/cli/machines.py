@@ -300,10 +300,6 @@ def locate(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="The YAML to write.")
     ],
-    urdf: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Write models/ and urdf/ with world and tool in them."),
-    ] = None,
     position_sigma: Annotated[
         str | None,
         typer.Option(
@@ -329,7 +325,6 @@ def locate(
     from legcal.calibration.location.document import (
         LOCATION_FILE,
         location_document,
-        write_located_model,
         write_location,
     )
     from legcal.calibration.location.tool_poses import read_tool_poses
@@ -352,12 +347,8 @@ def locate(
         angle_sigma=quantity(angle_sigma, ANGLE, "--angle-sigma"),
         tool_position=None if tool_position is None else _point(tool_position),
     )
-    written = []
-    if urdf is not None:
-        paths = write_located_model(machine, location, urdf)
-        written += [str(path) for path in paths]
     write_location(location, output)
-    written.append(str(output))
+    written = [str(output)]
     show(
         as_json,
         lambda: location_document(location) | {"written": written},

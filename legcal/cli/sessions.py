@@ -32,7 +32,7 @@ from legcal.cli.options import (
     serve,
     show,
 )
-from legcal.errors import UsageError, printable
+from legcal.errors import UsageError
 from legcal.vision.distortion import CameraProgram, DistortionModel
 
 if TYPE_CHECKING:
@@ -196,35 +196,29 @@ def plan(
     from legcal.planning.places import parse_bounds
     from legcal.planning.session import CAMERA, check_session, write_session
     from legcal.report.plan import plan_files, plan_table
-    from legcal.signals import held_back_signals, is_waiting
 
     check_session(output)
-    with held_back_signals(first_alone=True):  # Ctrl-C ends the search: the best so far is written
-        session = request.plan(
-            model,
-            images=images,
-            images_per_view=images_per_view,
-            cameras=cameras,
-            target=None if target is None else parse_quantity(target, LENGTH, "--target"),
-            camera=camera,
-            noise=DEFAULT_NOISE if noise is None else noise,
-            bounds=None if bounds is None else parse_bounds(bounds),
-            given=given,
-            board=board,
-            hand_held=hand_held,
-            only=only,
-            seed=seed,
-            workers=image_workers(cluster, workers),
-            progress=not quiet,
-            stop=is_waiting,
-        )
-        files = plan_files(session, _previews(session), command_line())
-        if camera is not None:  # with the covariance and the record of its calibration
-            files = {**files, CAMERA: camera.read_bytes()}
-        write_session(session, output, pictures=files)
-        if is_waiting() and sys.stderr is not None:
-            text = f"The session was written to {output}, with the best plan found before the stop."
-            sys.stderr.write(f"legcal: {printable(text)}\n")
+    session = request.plan(
+        model,
+        images=images,
+        images_per_view=images_per_view,
+        cameras=cameras,
+        target=None if target is None else parse_quantity(target, LENGTH, "--target"),
+        camera=camera,
+        noise=DEFAULT_NOISE if noise is None else noise,
+        bounds=None if bounds is None else parse_bounds(bounds),
+        given=given,
+        board=board,
+        hand_held=hand_held,
+        only=only,
+        seed=seed,
+        workers=image_workers(cluster, workers),
+        progress=not quiet,
+    )
+    files = plan_files(session, _previews(session), command_line())
+    if camera is not None:  # with the covariance and the record of its calibration
+        files = {**files, CAMERA: camera.read_bytes()}
+    write_session(session, output, pictures=files)
     show(as_json, session.document, lambda: plan_table(session, output))
 
 

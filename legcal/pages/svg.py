@@ -187,20 +187,13 @@ class Bars(NamedTuple):
     values: Sequence[float | None]
 
 
-def log_bars(
-    title: str,
-    unit: str,
-    names: Sequence[str],
-    before: Bars,
-    after: Bars,
-    marks: Bars | None = None,
-) -> Canvas:
-    """Draw values before and after on a logarithmic scale, and marks over those after.
+def log_bars(title: str, unit: str, names: Sequence[str], before: Bars, after: Bars) -> Canvas:
+    """Draw values before and after on a logarithmic scale.
 
     Values below a hundred-thousandth of the largest reach the left border.
     """
     left, width, step = 134.0, 400.0, 21.0
-    series = [before, after, *([marks] if marks else [])]
+    series = before, after
     shown = [x for bars in series for x in bars.values if x] or [1.0]
     high = np.ceil(np.log10(max(shown)))
     low = max(np.floor(np.log10(min(shown))), high - 5.0) - 0.3
@@ -212,9 +205,9 @@ def log_bars(
         return left + (width - left - 20.0) * float(np.clip(share, 0.0, 1.0))
 
     canvas.text(8.0, 16.0, canvas.title)
-    for k, (bars, colour) in enumerate(zip(series, (PALE, BLUE, INK), strict=False)):
+    for k, (bars, colour) in enumerate(zip(series, (PALE, BLUE), strict=True)):
         y = 23.0 + 16.0 * k
-        canvas.box(left + 10.0 * (k > 1), y, 2.0 if k > 1 else 22.0, 9.0, colour)
+        canvas.box(left, y, 22.0, 9.0, colour)
         canvas.text(left + 28.0, y + 9.0, bars.label, colour=DIM)
     for decade in np.arange(np.ceil(low), high + 1.0).tolist():
         x = place(10.0**decade)
@@ -228,8 +221,6 @@ def log_bars(
             if value := bars.values[k]:
                 tip = f"{name}, {bars.label}: {value:.3g} {unit}"
                 canvas.box(left, y + dy, place(value) - left, 7.0, colour, tip)
-        if marks and (value := marks.values[k]):
-            canvas.segment((place(value), y - 1.5), (place(value), y + 9.5), INK, 2.0)
     return canvas
 
 
@@ -294,13 +285,11 @@ def scatter(
     y_label: str,
     *,
     words: Sequence[str] = (),
-    diagonal: bool = False,
     log: Literal["", "y", "xy"] = "",
 ) -> Canvas:
     """Draw points, whose numbers are for the script of the page, or lines through them.
 
-    *words* name the x of 0, 1, 2, ...; a *diagonal* is the line of equal x and y; the axes of *log*
-    are logarithmic.
+    *words* name the x of 0, 1, 2, ...; the axes of *log* are logarithmic.
     """
     labels = [points.label for points in groups if points.label]
     top, width, height = 8.0 + 16.0 * len(labels), 340.0, 290.0 + 16.0 * len(labels)
@@ -340,9 +329,6 @@ def scatter(
             at = min(u, width - 3.3 * len(word))  # so that the last one is not cut
             canvas.text(at, bottom + 16.0, word, anchor="middle", size=11, colour=DIM)
     canvas.segment((left, top), (left, bottom), GREY)
-    if diagonal:
-        ends = np.array([max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)])
-        canvas.path(on_paper(ends, ends), GREY, 1.0)
     for points in groups:
         colour, mark = (of[points.group % len(of)] for of in (_COLOURS, _MARKS))
         places = on_paper(points.x, points.y)

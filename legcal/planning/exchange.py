@@ -152,15 +152,12 @@ def exchange(
     least: int,
     *,
     progress: Report = no_progress,
-    stop: Callable[[], bool] = lambda: False,
 ) -> Chosen:
     """Exchange single images while the criterion improves."""
     chosen.value = float(criterion(session.machine[None])[0])
     for turn in range(_MAX_PASSES):
         before = chosen.value
         for i, (slot, image) in enumerate(list(chosen.images)):
-            if stop():
-                break
             is_needed = sum(s == slot for s, _ in chosen.images) <= least
             open_slots = [slot] if is_needed else range(len(session.slots))
             session.changed(slot, image, -1.0)

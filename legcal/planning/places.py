@@ -80,8 +80,7 @@ class Place:
     """A place of a camera."""
 
     T_base_camera: RigidTransform
-    name: str = ""  # of a tripod that stands somewhere
-    fixed: bool = False  # not optimised
+    name: str = ""  # of the view, where it has been photographed from
 
     def is_inside(self, bounds: Array | None) -> bool:
         """Whether the camera is within bounds (3, 2) [m]."""
@@ -186,9 +185,7 @@ def _coordinate(text: str) -> float:
 
 
 def near(place: Place, target: Array, step: float, rng: np.random.Generator) -> Place:
-    """Draw a place nearby that looks at the machine; a fixed one stays."""
-    if place.fixed:
-        return place
+    """Draw a place nearby that looks at the machine."""
     position = place.T_base_camera.translation
     distance = np.linalg.norm(position - target)
     return Place(look_at(position + step * distance * rng.normal(size=3), target))

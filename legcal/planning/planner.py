@@ -8,7 +8,7 @@ and machine within their tolerances.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
@@ -99,7 +99,6 @@ class Task:
     n_views: int
     setting: Setting
     bounds: Array | None = None  # (3, 2) of cameras in the base link [m]
-    places: tuple[Place, ...] = ()  # in place of those around the machine
     given: tuple[Candidates, ...] = ()  # existing images
     given_name: str = ""
     board: Board | None = None
@@ -245,7 +244,6 @@ def _bodies(machine: Machine, legs: tuple[Leg, ...], poses: tuple[RigidTransform
 def plan_session(
     task: Task,
     progress: Report = no_progress,
-    stop: Callable[[], bool] = lambda: False,
     run: Run = in_turn,
 ) -> Plan:
     """Plan a session.
@@ -272,7 +270,6 @@ def plan_session(
         criterion_of(work, legs, basis),
         rng,
         progress,
-        stop,
         run,
     )
     current, least, value = search.chosen(shown, poses)
@@ -280,8 +277,6 @@ def plan_session(
     middle = 0.5 * (target.min(axis=0) + target.max(axis=0))
     expected = search.expected_covariance(current)
     for turn in range(ROUNDS):
-        if stop():
-            break
         step = 0.5**turn
         placed = search.improve_positions(current, step, middle)
         polished, reached = search.improve_poses(placed, step, least)
@@ -289,17 +284,10 @@ def plan_session(
         if search.value_of(polished_covariance) < search.value_of(expected):
             current, value, expected = polished, reached, polished_covariance
         progress("Polishing", turn + 1, ROUNDS)
-    was_stopped = stop()
-    plan = search.judged(current, value, expected)
-    if was_stopped:
-        note = "The search was stopped early: this is the best plan so far."
-        plan = replace(plan, notes=(note, *plan.notes))
-    return plan
+    return search.judged(current, value, expected)
 
 
 def _places(task: Task, poses: Configurations) -> list[Place]:
-    if task.places:
-        return list(task.places)
     points = _framed(task, poses)
     return places_around(task.machine, points, task.predictor.camera, task.setting, task.bounds)
 
@@ -320,21 +308,19 @@ def _with_laid_board(task: Task, poses: Configurations) -> Task:
     probes = np.linspace(0, len(poses.poses) - 1, min(N_BOARD_PROBES, len(poses.poses))).astype(int)
     in_Rb = platforms_in_base(task.machine, [poses.poses[i] for i in probes])
     places = [place.T_base_camera for place in _places(task, poses)]
-    if not task.places:  # cameras can move back until the board is in the picture
-        points = all_points(task.machine, poses.poses)
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        directions = np.array([T.translation - middle for T in places])
-        directions = np.unique(
-            (directions / np.linalg.norm(directions, axis=1)[:, None]).round(6), axis=0
-        )
-        directions *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
-        places = [look_at(middle + step, middle) for step in directions]
+    # Cameras can move back until the board is in the picture.
+    points = all_points(task.machine, poses.poses)
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    directions = np.array([T.translation - middle for T in places])
+    directions = np.unique(
+        (directions / np.linalg.norm(directions, axis=1)[:, None]).round(6), axis=0
+    )
+    directions *= FAR * float(np.linalg.norm(np.ptp(points, axis=0)))
+    places = [look_at(middle + step, middle) for step in directions]
     best, most = task, 0.0
     for laid in lying(task.board, task.machine):
         trial = replace(task, laid=laid)
-        is_shown = [
-            trial.board_is_shown(T, in_Rb, surely=False, is_read=bool(task.places)) for T in places
-        ]
+        is_shown = [trial.board_is_shown(T, in_Rb, surely=False, is_read=False) for T in places]
         share = np.mean(is_shown)
         if share > most:
             best, most = trial, float(share)
@@ -368,28 +354,22 @@ def _visible_places(
         else:
             visible.append((place, contributions))
         progress("Camera places", k + 1, len(places))
-    n_needed = 1 if task.hand_held else task.n_views
-    if visible and not (task.places and len(visible) < n_needed):
+    if visible:
         return visible
-    names = ", ".join(place.name for place in blind if place.name) or "the cameras"
     remedy = (
-        f"point {names} at the machine, from where no plate or other leg hides the legs, near "
-        "enough for 30 px of a leg and far enough for the tolerance"
+        "use a camera that shows 30 px of a leg from there, or correct what hides the legs in the "
+        "model"
     )
     if task.board is not None:
-        remedy = (
-            "use a board with larger squares, or a smaller one that is whole in the image from "
-            f"{names}"
-        )
+        remedy = "use a board with larger squares, or a smaller one that is whole in the image"
     asked = blind[:: len(blind) // _N_ASKED + 1]
     if narrow := task.too_narrow([Candidates(place, poses) for place in asked]):
         remedy = f"{narrow}: {_FINER}"
     raise NotVisible(
-        f"{task.machine.yaml_path}: no session could be planned: only {len(visible)} of "
-        f"{len(places)} camera positions see legs{' and the board' * (task.board is not None)} "
-        f"with the tripod tolerance of {1e2 * task.setting.shift:.2g} cm and "
-        f"{np.degrees(task.setting.turn):g} deg; {n_needed} {'are' if n_needed > 1 else 'is'} "
-        f"needed; {remedy}."
+        f"{task.machine.yaml_path}: no session could be planned: none of {len(places)} camera "
+        f"positions sees legs{' and the board' * (task.board is not None)} with the tripod "
+        f"tolerance of {1e2 * task.setting.shift:.2g} cm and {np.degrees(task.setting.turn):g} "
+        f"deg; {remedy}."
     )
 
 
@@ -453,7 +433,6 @@ class _Search:
     criterion: Criterion
     rng: np.random.Generator
     progress: Report
-    stop: Callable[[], bool]
     run: Run
 
     def added(self, candidates: Sequence[Candidates]) -> list[Contributions]:
@@ -489,9 +468,7 @@ class _Search:
         images = choose(
             session, task.n_images, self.criterion, self.rng, least, progress=self.progress
         )
-        images = exchange(
-            session, images, self.criterion, self.rng, least, progress=self.progress, stop=self.stop
-        )
+        images = exchange(session, images, self.criterion, self.rng, least, progress=self.progress)
         self._refuse_undetermined(session, current)
         return _selected_candidates(current, images), least, images.value
 
@@ -542,9 +519,7 @@ class _Search:
         current, contributions = list(current), self.added(current)
         value = self.value(contributions)
         for v, candidates in enumerate(current):
-            for _ in range(0 if candidates.place.fixed else N_NEAR_PLACES):
-                if self.stop():
-                    break
+            for _ in range(N_NEAR_PLACES):
                 place = near(current[v].place, target, PLACE_STEP * step, self.rng)
                 trial = replace(candidates, place=place)
                 added = self.task.of(trial) if place.is_inside(self.task.bounds) else None
@@ -562,10 +537,8 @@ class _Search:
         task, spread = self.task, POSE_STEP * step
         widened = []
         for candidates in current:
-            poses = candidates.poses
-            if not self.stop():
-                legs = task.predictor.legs
-                poses = poses_near(task.machine, legs, task.setting, poses, spread, self.rng)
+            poses, legs = candidates.poses, task.predictor.legs
+            poses = poses_near(task.machine, legs, task.setting, poses, spread, self.rng)
             widened.append(self.task.showing(replace(candidates, poses=poses)))
         session = Session(self.added(widened), self.given)
         images = [
@@ -576,9 +549,7 @@ class _Search:
         for slot, image in images:
             session.changed(slot, image, 1.0)
         session.renewed()
-        exchanged = exchange(
-            session, Chosen(images), self.criterion, self.rng, least, stop=self.stop
-        )
+        exchanged = exchange(session, Chosen(images), self.criterion, self.rng, least)
         return _selected_candidates(widened, exchanged), exchanged.value
 
     def value_of(self, covariance: Array) -> float:
@@ -662,7 +633,7 @@ class _Search:
 
 
 def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
-    """Name views after their places or by number; hand-held images after their pose."""
+    """Name views by number; hand-held images after their pose."""
     if task.hand_held:
         views = [
             replace(view, poses=view.poses.chosen([k]), via=(view.via[k],), seen=view.seen.only(k))
@@ -673,7 +644,7 @@ def _named(views: Sequence[PlannedView], task: Task) -> tuple[PlannedView, ...]:
         return tuple(replace(view, name=label) for view, label in zip(views, labels, strict=True))
     taken = {one.place.name for one in task.given}
     free = (f"c{k}" for k in range(1, 10**6) if f"c{k}" not in taken)
-    return tuple(view if view.name else replace(view, name=next(free)) for view in views)
+    return tuple(replace(view, name=next(free)) for view in views)
 
 
 def drawn_covariance(task: Task, current: Sequence[Candidates], rng: np.random.Generator) -> Array:

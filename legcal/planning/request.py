@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,7 +60,6 @@ def plan(
     noise: PredictedNoise | str | Path = DEFAULT_NOISE,
     encoder_sigma: float | str | None = None,
     bounds: Array | str | None = None,
-    places: Sequence[Place] = (),
     given: str | Path | Dataset | None = None,
     board: str | Path | Board | None = None,
     hand_held: bool = False,
@@ -70,7 +68,6 @@ def plan(
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress = False,
-    stop: Callable[[], bool] = lambda: False,
 ) -> Plan:
     """Plan poses and camera places of a session that determine a machine best.
 
@@ -96,8 +93,6 @@ def plan(
         0.1 mrad and 0.5 deg of hobby servos, or those of the dataset.
     bounds : (3, 2) array or str, optional
         Lowest and highest x, y, z of cameras in the base link [m], or the text of ``--bounds``.
-    places : sequence of Place
-        Tripods with their names, to choose from in place of those around the machine.
     given : path or Dataset, optional
         Existing images; the plan adds to them.
     board : str, path or Board, optional
@@ -116,8 +111,6 @@ def plan(
         another object with ``submit``, like an executor.
     progress : bool or callable
         True shows bars on stderr; a function is called as ``progress(stage, done, total)``.
-    stop : callable
-        Called between steps; once it returns true, the best plan so far is returned.
 
     Returns
     -------
@@ -138,13 +131,10 @@ def plan(
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     _check_visible(machine)
     setting = default_setting(machine) if setting is None else setting
-    listed = tuple(replace(place, fixed=True) for place in places)
-    n_images, n_views = _counts(
-        images, images_per_view, cameras, target, len(listed), hand_held=hand_held
-    )
+    n_images, n_views = _counts(images, images_per_view, cameras, target, hand_held=hand_held)
     if bounds is not None:
         bounds = parse_bounds(bounds) if isinstance(bounds, str) else np.asarray(bounds, float)
-    _check(target, bounds, listed, board, hand_held, setting, seed, machine.size)
+    _check(target, bounds, board, hand_held, setting, seed, machine.size)
     shot = given if isinstance(given, Dataset | None) else load_dataset(given, check_images=False)
     if camera is None:
         selected_camera = sample_camera() if shot is None else shot.measurements.views[0].camera
@@ -165,7 +155,6 @@ def plan(
         n_views,
         setting,
         bounds,
-        listed,
         () if shot is None else _given_candidates(machine, shot),
         "" if shot is None else str(shot.folder),
         laid,
@@ -175,9 +164,9 @@ def plan(
     pool = worker_pool(workers, "The session could not be planned")
     with shown_progress(progress) as report, pool as run:
         if target is None:
-            result = plan_session(task, report, stop, run)
+            result = plan_session(task, report, run)
         else:
-            result = _plan_for_target(task, target, report, stop, run)
+            result = _plan_for_target(task, target, report, run)
         return replace(result, notes=(*result.notes, *scale_notes, *_notes_on_missing_images(shot)))
 
 
@@ -195,9 +184,7 @@ def measured_length(machine: Machine, *, board: bool) -> tuple[Choices, tuple[st
     )
 
 
-def _plan_for_target(
-    task: Task, target: float, progress: Report, stop: Callable[[], bool], run: Run
-) -> Plan:
+def _plan_for_target(task: Task, target: float, progress: Report, run: Run) -> Plan:
     """Plan with the fewest images that reach a target [m].
 
     The growth of each plan predicts the number of images for the next one. An unreachable target is
@@ -205,7 +192,7 @@ def _plan_for_target(
     """
     n, least, best = max(_BEGIN, 2 * task.n_views), 0, None
     for _ in range(_ROUNDS):
-        candidate = plan_session(replace(task, n_images=n), progress, stop, run)
+        candidate = plan_session(replace(task, n_images=n), progress, run)
         if candidate.error is None:
             raise UsageError(
                 f"--target could not be used: {task.machine.undetermined}, so the error of the "
@@ -216,11 +203,6 @@ def _plan_for_target(
             best = candidate if best is None or candidate.n_images < best.n_images else best
         else:
             least = max(least, n)
-        if stop():
-            if best is not None:
-                return best
-            note = f"The expected error is {1e3 * error:.3f} mm, not {1e3 * target:g} mm."
-            return replace(candidate, notes=(*candidate.notes, note))
         n_needed = _images_for(candidate, error, target)
         if n_needed > MOST_IMAGES and best is None:
             break
@@ -260,7 +242,6 @@ def _counts(
     per_view: int | None,
     cameras: int | None,
     target: float | None,
-    n_places: int,
     *,
     hand_held: bool,
 ) -> tuple[int, int]:
@@ -272,13 +253,7 @@ def _counts(
             f"{' and '.join(given)} cannot be combined, each says how many photographs there are; "
             "leave out all but one."
         )
-    usual = min(3, n_places) if n_places else 3
-    n_views = _checked_number("--cameras", usual if cameras is None else cameras, MOST_VIEWS)
-    if n_places and n_views > n_places:
-        raise UsageError(
-            f"The plan could not be made: found {n_places} place{'s' * (n_places != 1)} for "
-            f"{n_views} cameras, needed one for each; add places or give fewer --cameras."
-        )
+    n_views = _checked_number("--cameras", 3 if cameras is None else cameras, MOST_VIEWS)
     if hand_held and cameras is not None and cameras > 1:
         raise UsageError(
             f"--hand-held and --cameras {cameras} cannot be combined: a hand-held camera has a new "
@@ -316,7 +291,6 @@ def _check_visible(machine: Machine) -> None:
 def _check(
     target: float | None,
     bounds: Array | None,
-    places: Sequence[Place],
     board: object,
     hand_held: bool,
     setting: Setting,
@@ -335,10 +309,6 @@ def _check(
         problems.append(
             f"{start} bounds of shape {np.shape(bounds)}, needed (3, 2), the lowest and highest x, "
             "y and z in the base link [m]; correct them."
-        )
-    if bounds is not None and places:
-        problems.append(
-            "--bounds and a list of camera positions cannot be combined; leave out --bounds."
         )
     if hand_held and board is None:
         problems.append(
@@ -424,7 +394,7 @@ def _given_candidates(machine: Machine, shot: Dataset) -> tuple[Candidates, ...]
         rows = np.flatnonzero(m.view == v)
         if view.T_base_camera is None or not len(rows):
             continue
-        place = Place(view.T_base_camera, view.name, fixed=True)
+        place = Place(view.T_base_camera, view.name)
         configurations = list(follow_each(machine, m.q[rows][:, list(machine.motors)]))
         views.append(Candidates(place, poses_at(machine, configurations)))
     return tuple(views)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
-from scipy.special import ndtri
 
 from legcal.calibration.joint_fit.platform import PlatformMap, platform_map
 from legcal.calibration.result import Calibration
@@ -23,7 +22,6 @@ from legcal.calibration.summary import (
 )
 from legcal.data.measurements import row_names
 from legcal.errors import LegcalError, printable
-from legcal.files.quantity import SHOWN_IN
 from legcal.geometry.motions import components
 from legcal.geometry.types import Array, Image, IntArray
 from legcal.machine.files import RESULT_YAML
@@ -37,7 +35,6 @@ from legcal.pages.document import (
     Charts,
     Crop,
     Drawing,
-    Facts,
     Gallery,
     Items,
     Page,
@@ -49,7 +46,7 @@ from legcal.pages.document import (
     page_html,
     time_of_page,
 )
-from legcal.pages.svg import Bars, Points, log_bars, number_grid, scatter
+from legcal.pages.svg import Points, number_grid, scatter
 from legcal.perception.overlays import curve
 from legcal.report.calibration import next_steps, platform_table, verdict_of
 from legcal.report.render import record_section, table
@@ -80,8 +77,8 @@ def write_report(
     command : str
         The command of the calibration, for the record.
     truth : path, name or Machine, optional
-        The true model of a simulated or measured machine: the page then shows the errors of the
-        nominal and the calibrated model, as Fig. 4 of the paper.
+        The true model of a simulated or measured machine: the page then states the errors of the
+        nominal and the calibrated model.
     into : path, optional
         The folder with the files of the result while it is being written.
 
@@ -194,7 +191,6 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
 
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
-    sigma = {row.name: row.sigma for row in calibration.result.parameters}
     at_platform = (
         "The motors do not determine the pose of the platform: parameters are compared alone."
     )
@@ -209,37 +205,11 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
             f"{by_calibrated} calibrated model (means over {len(after.displacement)} poses of the "
             "workspace, eq 20)."
         )
-    origin = "The truth was given for this page alone: the result was computed without it."
-    blocks: list[Block] = [Text([at_platform, origin])]
-    for unit_of_chart in ("m", "rad"):
-        # Coordinates that the frame makes zero are not parameters.
-        indices = [
-            i
-            for i, name in enumerate(after.names)
-            if after.units[i] == unit_of_chart and name in sigma
-        ]
-        if not indices:
-            continue
-        scale, unit = SHOWN_IN[unit_of_chart]
-        before_errors, after_errors = (
-            (scale * np.abs(evaluation.values - evaluation.references))[indices].tolist()
-            for evaluation in (before, after)
-        )
-        names = [after.names[i] for i in indices]
-        chart = log_bars(
-            "Distance from the truth",
-            unit,
-            names,
-            Bars("nominal", before_errors),
-            Bars("calibrated", after_errors),
-            Bars("its sigma as predicted", [scale * (sigma[name] or 0.0) for name in names]),
-        )
-        caption = (
-            "As Fig. 4 of the paper, of this calibration alone: coordinates are those in R_b and "
-            "R_e."
-        )
-        blocks.append(Drawing(chart.markup(), caption))
-    return blocks
+    origin = (
+        "The truth was given for this page alone: the result was computed without it. legcal "
+        "evaluate compares every parameter."
+    )
+    return [Text([at_platform, origin])]
 
 
 # Parameters
@@ -281,17 +251,11 @@ def machine_scene(calibration: Calibration) -> Scene:
     chosen = np.unique(np.linspace(0, n - 1, min(MAX_POSES, n)).astype(int))
     T = [solution.T_Rb_Re[k] for k in chosen.tolist()]
     q, by_readings = measurements.q_of_poses[chosen], calibration.platform is not None
-    scene = MachineScene(
-        machine,
-        solution.legs,
-        geometries(machine),
-        result,
-        solution.kinematic.parametrization,
-    )
+    scene = MachineScene(machine, solution.legs, geometries(machine), result)
     calibrated = scene.placed(solution.legs, q, T, by_readings=by_readings)
     images, frame, views = row_names(measurements), machine.T_base_Rb, measurements.views
     used = [v for v, view in enumerate(views) if view.name in result.views][:MAX_CAMERAS]
-    content = scene.content(scene.modes(calibrated, q, T, by_readings=by_readings), T)
+    content = scene.compared(calibrated, q, T, by_readings=by_readings)
     content |= {
         "poses": [printable(images[row]) for row in measurements.first_rows[chosen].tolist()],
         "cameras": scene.cameras(
@@ -302,8 +266,7 @@ def machine_scene(calibration: Calibration) -> Scene:
     left_out = f" {len(chosen)} of {n} poses are shown." if len(chosen) < n else ""
     caption = (
         "Drag to turn, scroll to zoom. Grey is the nominal model, blue the calibrated one at the "
-        "same readings, or grey the calibrated one and blue where a direction would move it; the "
-        "slider exaggerates the difference. Rings are ellipsoids of one "
+        "same readings; the slider exaggerates the difference. Rings are ellipsoids of one "
         "standard deviation at the joints: those that define R_b and R_e have flat ones or none."
         f"{' Brown are arms and carriages, at the readings.' * bool(machine.actuators)}{left_out}"
     )
@@ -349,27 +312,13 @@ def _outline_sections(calibration: Calibration) -> list[tuple[str, str, Sequence
 
 
 def identifiability_blocks(calibration: Calibration) -> list[Block]:
-    """Return counts, and the least certain directions."""
+    """Return the number of determined directions, and the least certain ones."""
     problem, result = calibration.solution.posterior.problem, calibration.result
     free = int(problem.free.sum())
-    n_held = len(calibration.solution.kinematic.held_basis)
-    counts = {
-        "Equations": f"{problem.n_equations}: "
-        + ", ".join(
-            f"{f.n * f.n_rows} of {f.name.replace('_', ' ')}" for f in problem.factors if f.n
-        ),
-        "Priors": str(len(problem.priors.mean)),
-        "Unknowns": f"{problem.n_unknowns}: "
-        + ", ".join(
-            f"{block.n_unknowns} of {block.name.replace('_', ' ')}"
-            for block in problem.variables
-            if block.n_unknowns
-        )
-        + f", and {problem.n_elements} platform poses",
-        "Kinematic parameters": f"{free - n_held} of {free} directions determined",
-        "Degrees of freedom": f"{result.residuals.dof}, chi2 {result.residuals.chi2:.1f}",
-    }
-    blocks: list[Block] = [Facts(counts)]
+    determined = free - len(calibration.solution.kinematic.held_basis)
+    blocks: list[Block] = [
+        Text([f"{determined} of {free} directions of the kinematic parameters are determined."])
+    ]
     weak = [
         (
             row.in_words,
@@ -383,8 +332,7 @@ def identifiability_blocks(calibration: Calibration) -> list[Block]:
     ]
     if weak:
         columns = ("least certain combination", ">1 sigma [mm]", "as a unit vector")
-        note = "Select one under Show in the machine above to see it as a motion."
-        blocks.append(replace(table(*columns, rows=weak), note=note))
+        blocks.append(table(*columns, rows=weak))
     return blocks
 
 
@@ -527,8 +475,7 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
     measurements, legs = calibration.dataset.measurements, calibration.dataset.machine.leg_names
     keep = chosen_points(np.abs(residuals.offset).max(axis=1))
     index = residuals.index[keep]
-    offset, whitened = residuals.offset[keep], residuals.whitened[keep]
-    row, leg = outlines.row[index], outlines.leg[index]
+    offset, row, leg = residuals.offset[keep], outlines.row[index], outlines.leg[index]
     views, images = measurements.view_names, row_names(measurements)
     both_ends = np.repeat(np.arange(len(index)), 2)
     number, leg_of_end = index[both_ends], leg[both_ends]
@@ -538,25 +485,14 @@ def residual_charts(calibration: Calibration, links: dict[int, str]) -> Charts:
         ("By view", measurements.view[row][both_ends] + jitter, "view", views),
         ("By leg", leg_of_end + jitter, "leg", legs),
         ("By image", row[both_ends] + 1.0, "image, in the order of the table", ()),
-        ("Along the image", outlines.ends[index].reshape(-1, 2)[:, 0],
-         "place along the image, u [px]", ()),
-        ("Against contrast", outlines.contrast[index][both_ends], "contrast [grey levels]", ()),
     ):  # fmt: skip
-        if not (has_x := np.isfinite(x)).any():
-            continue
         groups = [
-            Points(x[chosen], offset.ravel()[chosen], number[chosen], j)
-            for j in np.unique(leg_of_end[has_x]).tolist()
-            if (chosen := has_x & (leg_of_end == j)).any()
+            Points(x[of_leg], offset.ravel()[of_leg], number[of_leg], j)
+            for j in np.unique(leg_of_end).tolist()
+            for of_leg in [leg_of_end == j]
         ]
         svg = scatter(f"Residuals: {title}", groups, label, _OFFSET, words=words)
         charts.append(Drawing(svg.markup(), title=title))
-    ranks = np.argsort(np.argsort(residuals.whitened, axis=None, kind="stable"))
-    normal = ndtri((ranks + 0.5) / len(ranks)).reshape(-1, 2)  # quantiles of a normal distribution
-    quantiles = Points(normal[keep].ravel(), whitened.ravel(), number)
-    svg = scatter("Residuals: QQ plot", [quantiles], "normal quantile", "residual / sigma",
-                  diagonal=True)  # fmt: skip
-    charts.append(Drawing(svg.markup(), title="QQ plot"))
     labels = {
         i: f"{printable(legs[j])} {printable(outlines.part[i])}, edge {edge}: "
         f"{a:+.3f} and {b:+.3f} px\n{printable(images[r])}"

@@ -1,4 +1,4 @@
-"""A machine beside another model of it, ellipsoids at its joints, pyramids of cameras.
+"""A machine beside its nominal model, ellipsoids at its joints, pyramids of cameras.
 
 Points and lengths are in the base link [m]; ``scene.js`` of :mod:`legcal.pages` draws them on the
 canvas of a page: a report, or that of :mod:`legcal.viewer`.
@@ -17,7 +17,6 @@ from legcal.geometry.motions import components, product
 from legcal.geometry.types import Array
 from legcal.machine.leg import Leg
 from legcal.machine.model import Machine
-from legcal.machine.parameters import Parametrization, moved_legs, parametrization_of
 from legcal.machine.picture import around, corners_of_base, motor_lines
 from legcal.machine.rods import ends_in_base, first_rods
 
@@ -29,7 +28,6 @@ FACTORS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000
 _SHOWN = 0.12  # default displayed size of the largest change, relative to the machine
 _RING = 0.06  # size of the median ellipsoid, relative to the machine
 _DEPTH = 0.25  # depth of the pyramid of a camera, relative to the machine
-_HELD = 0.0025  # length of a step along a held direction, in leg lengths
 
 
 class PlacedModel(NamedTuple):
@@ -43,10 +41,10 @@ class PlacedModel(NamedTuple):
 
 
 class MachineScene:
-    """A machine with the models that it is compared with.
+    """A machine with the nominal model that it is compared with.
 
     *legs* are shown, in R_b and R_e of the machine, beside *nominal* ones; the *result* of a
-    calibration is the source of directions and ellipsoids.
+    calibration is the source of ellipsoids.
     """
 
     def __init__(
@@ -55,7 +53,6 @@ class MachineScene:
         legs: Sequence[Leg],
         nominal: Sequence[Leg] | None,
         result: Result | None,
-        parameters: Parametrization | None = None,  # of the calibration, else of the machine
     ) -> None:
         self.machine, self.legs, self.nominal = machine, legs, nominal
         A, B = machine.A_base, machine.home.apply(machine.B_platform)
@@ -63,9 +60,6 @@ class MachineScene:
         anchors = motor_lines(machine.legs, A[None]).anchors
         # Joints, or motors of the base, in order around base and platform, the first twice
         self.rims = {"base": around(corners_of_base(A, anchors)), "platform": around(B)}
-        self._parameters = parameters or parametrization_of(machine, twists=True)
-        length = float(np.mean(np.linalg.norm(B - A, axis=1)))
-        self.directions = [] if result is None else _steps(result, self._parameters, length)
         self.ellipsoids = {} if result is None else _ellipsoids(result)
 
     def placed(
@@ -92,59 +86,41 @@ class MachineScene:
         lines = motor_lines(legs, (A - frame.translation) @ turn)
         return PlacedModel(A, B, *(points @ turn.T + frame.translation for points in lines))
 
-    def alone(self, shown: PlacedModel) -> list[dict[str, Any]]:
-        """Return the machine beside no other model: it stands for both."""
-        return [self._mode(self.machine.name, ("", "machine"), shown, shown)]
-
-    def modes(
+    def compared(
         self,
         shown: PlacedModel,
         q: Array,
         near: Sequence[RigidTransform],
         *,
         by_readings: bool,
-    ) -> list[dict[str, Any]]:
-        """Return the machine, *shown* at readings, beside the models of the same readings.
+    ) -> dict[str, Any]:
+        """Return the content of ``scene.js`` at poses T_Rb_Re *near*: beside the nominal model.
 
-        These are the nominal model, and the legs after a step along each of the directions.
+        The machine is *shown* at readings q (k, n), and the nominal model at the same; their
+        difference is exaggerated. Without a nominal model the machine is alone.
         """
         if self.nominal is None:
-            return self.alone(shown)
+            return self.alone(shown, near)
         nominal = self.placed(self.nominal, q, near, by_readings=by_readings)
-        modes = [self._mode("change by the calibration", ("nominal", "calibrated"), nominal, shown)]
-        for words, step in self.directions:
-            legs = moved_legs(self.legs, self._parameters.place, step)
-            moved = self.placed(legs, q, near, by_readings=by_readings)
-            legend = "calibrated", "moved along the direction"
-            modes.append(self._mode(words, legend, shown, moved))
-        return modes
-
-    def _mode(
-        self, name: str, legend: tuple[str, str], before: PlacedModel, after: PlacedModel
-    ) -> dict[str, Any]:
-        """Return two models that are shown together, and the first index of ``FACTORS``."""
         moved = max(
-            float(np.abs(after.A - before.A).max()), float(np.abs(after.B - before.B).max())
+            float(np.abs(shown.A - nominal.A).max()), float(np.abs(shown.B - nominal.B).max())
         )
         wanted = _SHOWN * self.size / max(moved, 1e-12)
         step = max(k for k, factor in enumerate(FACTORS) if factor <= max(wanted, 1.0))
-        return {
-            "name": printable(name),
-            "legend": legend,
-            "step": step if legend[0] else 0,
-            "models": [_model(before), _model(after)],
-        }
+        content = self._content((nominal, shown), near)
+        return content | {"legend": ("nominal", "calibrated"), "factors": FACTORS, "step": step}
 
-    def content(
-        self, modes: Sequence[dict[str, Any]], near: Sequence[RigidTransform]
+    def alone(self, shown: PlacedModel, near: Sequence[RigidTransform]) -> dict[str, Any]:
+        """Return the content of ``scene.js`` without another model: the machine stands for both."""
+        content = self._content((shown, shown), near)
+        return content | {"legend": ("", "machine"), "factors": (1,), "step": 0}
+
+    def _content(
+        self, models: tuple[PlacedModel, PlacedModel], near: Sequence[RigidTransform]
     ) -> dict[str, Any]:
-        """Return the content of ``scene.js`` at poses T_Rb_Re: the modes that can be chosen.
-
-        Their difference is exaggerated, unless the machine is alone.
-        """
+        """Return all of the content but what exaggerates, at poses T_Rb_Re."""
         factor = _enlargement(self.ellipsoids, _RING * self.size)
         to_link = self.machine.T_platform_Re.inv()
-        factors = FACTORS if modes[0]["legend"][0] else (1,)
         turns = [
             product(self.machine.T_base_Rb, T, to_link).rotation.as_matrix().round(6) for T in near
         ]
@@ -152,8 +128,7 @@ class MachineScene:
         return {
             "unit": "m",
             "flat": not self.machine.spatial,
-            "factors": factors,
-            "modes": modes,
+            "models": [_model(model) for model in models],
             "names": [printable(name) for name in self.machine.leg_names],
             "rims": self.rims,
             "rings": {
@@ -170,30 +145,6 @@ class MachineScene:
             {"name": printable(name), "points": pyramid(camera, T, depth).round(4).tolist()}
             for name, camera, T in views
         ]
-
-
-def _steps(result: Result, parameters: Parametrization, length: float) -> list[tuple[str, Array]]:
-    """Return steps of the parameters (p,) along weak and held directions, with words.
-
-    Weak steps are one standard deviation long, held ones a small fraction of the leg *length* [m],
-    which also weights rotations.
-    """
-    names = list(parameters.names)
-    steps = []
-    for weak in result.weakest:
-        step = np.zeros(len(names))
-        for name, component in zip(weak.parameters, weak.components, strict=True):
-            if name in names:
-                i = names.index(name)
-                per = length if parameters.units[i] == "rad" else 1.0
-                step[i] = weak.sigma_m * component / per
-        if np.any(step):
-            steps.append((f"1 sigma along: {weak.in_words}", step))
-    order = [result.kinematic.names.index(name) for name in names]
-    for words, row in zip(result.held, result.kinematic.held, strict=False):
-        step = _HELD * length * np.array(row)[order]
-        steps.append((f"{1e3 * _HELD * length:.2g} mm along a held direction: {words}", step))
-    return steps
 
 
 def _ellipsoids(result: Result) -> dict[str, Array]:

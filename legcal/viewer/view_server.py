@@ -317,17 +317,17 @@ class ViewServer(PageServer):
         near = [platform_in_base(machine, self.motion.posture.T)]
         here = scene.placed(scene.legs, q, near, by_readings=False)
         try:
-            modes = scene.modes(here, q, near, by_readings=machine.is_determined)
+            content = scene.compared(here, q, near, by_readings=machine.is_determined)
         except LegcalError as error:
             problems += error.problems
-            modes = scene.alone(here)
+            content = scene.alone(here, near)
         ends = dict.fromkeys(
             machine.legs[j].motor_label for j in np.flatnonzero(self.motion.at_end).tolist()
         )
         if ends:
             problems.append(f"At the end of the travel: {', '.join(ends)}.")
         return {
-            "scene": scene.content(modes, near),
+            "scene": content,
             "values": {
                 name: round(slider.size * slider.value(), 2)
                 for name, slider in self._controls.items()
@@ -343,9 +343,8 @@ class ViewServer(PageServer):
         caption = "Drag to turn, scroll to zoom."
         if self.scene.nominal is not None:
             caption += (
-                " Grey is the nominal model, blue the calibrated one at the same readings, or grey "
-                "the calibrated one and blue where a direction would move it. Rings are ellipsoids "
-                "of one standard deviation at the joints."
+                " Grey is the nominal model, blue the calibrated one at the same readings. Rings "
+                "are ellipsoids of one standard deviation at the joints."
             )
         shown = Scene(_SCENE, {**state["scene"], "cameras": cameras}, 560, caption)
         controls = [slider.document(name) for name, slider in self._controls.items()]

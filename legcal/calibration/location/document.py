@@ -1,13 +1,8 @@
-"""A location, its undetermined parts in words, the location file, and its frames in the URDF.
-
-In the URDF a ``world`` link above the root carries the machine, and a ``tool`` link is a child of
-the platform, on fixed joints; all else stays. If the links exist, as after an earlier location,
-only their origins are changed.
-"""
+"""A location, its undetermined parts in words, and the location file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,15 +12,10 @@ from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.errors import ModelError, UsageError
 from legcal.files.folder import OutputFile, with_schema
 from legcal.files.motions import MotionEntry, motion_to_xyz_quat
 from legcal.files.schema import FileSchema, Number, Version
-from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.model import Machine
-from legcal.machine.model_writer import write_model
-from legcal.machine.urdf import Urdf, UrdfPatch
 
 LocatedFrame = Literal["base", "tool"]
 PoseComponent = Literal["position", "orientation"]
@@ -42,7 +32,6 @@ _Vector = Annotated[
     tuple[Number, Number, Number], BeforeValidator(lambda v: tuple(v) if type(v) is list else v)
 ]
 _Size = Annotated[Number, Field(ge=0.0)]
-_WORLD, _TOOL = "world", "tool"  # names of the links
 
 
 class RowResidual(FileSchema):
@@ -299,103 +288,3 @@ def write_location(location: Location, file: str | Path) -> None:
         width=120,
     )
     LOCATION_FILE.write(Path(file), with_schema("location", text))
-
-
-# World and tool in the URDF
-
-
-def write_located_model(
-    machine: Machine,  # the machine that was located
-    location: Location,
-    folder: Path,  # parent of ``models`` and ``urdf``; existing files are not replaced
-) -> tuple[Path, Path]:
-    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` with the located frames in the URDF.
-
-    Returns tuple of Path: The YAML and the URDF.
-
-    Raises UsageError if files of these names are there, or the links have another meaning in the
-    URDF; ModelError if the URDF does not let a link carry the machine.
-    """
-    content = _with_frames(machine, location)
-    return write_model(replace(machine, urdf=replace(machine.urdf, content=content)), folder)
-
-
-def _with_frames(machine: Machine, location: Location) -> bytes:
-    urdf = machine.urdf
-    T_root_base = _from_root(urdf, machine.base)
-    patch = UrdfPatch(urdf.content)
-
-    def place(joint: str, T: RigidTransform) -> None:
-        patch.set_origin(joint, np.asarray(T.translation), roll_pitch_yaw(T.rotation.as_matrix()))
-
-    if _WORLD in urdf.links:
-        joint = _joint_of_world(machine)
-        T_child_base = urdf.joints[joint].T_parent_origin.inv() * T_root_base
-        place(joint, location.T_world_base * T_child_base.inv())
-    else:
-        T_world_root = location.T_world_base * T_root_base.inv()
-        patch.add_frame(
-            _WORLD, urdf.root, _WORLD, _unused_joint(urdf, _WORLD, urdf.root), T_world_root
-        )
-    if _TOOL in urdf.links:
-        place(_joint_of_tool(machine), location.T_platform_tool)
-    else:
-        joint = _unused_joint(urdf, machine.platform, _TOOL)
-        patch.add_frame(machine.platform, _TOOL, _TOOL, joint, location.T_platform_tool)
-    return patch.content()
-
-
-def _from_root(urdf: Urdf, base: str) -> RigidTransform:
-    """Return T_root_base; refuse a moving joint between them."""
-    T = RigidTransform.identity()
-    for joint in urdf.joints_above(base):
-        if joint.moves:
-            raise ModelError(
-                f"{urdf.path}: the world could not be written: found the base '{base}' below the "
-                f"joint '{joint.name}', which moves, needed fixed joints between it and the root "
-                f"'{urdf.root}'; hang the platform from the base."
-            )
-        T = joint.T_parent_origin * T
-    return T
-
-
-def _joint_of_world(machine: Machine) -> str:
-    """Return the fixed joint below a world link that carries the whole machine."""
-    urdf = machine.urdf
-    below = urdf.below.get(_WORLD, [])
-    if urdf.root == _WORLD != machine.base and len(below) == 1 and not below[0].moves:
-        return below[0].name
-    raise UsageError(
-        f"{urdf.path}: the world could not be written: found a link '{_WORLD}' that is not a "
-        "root with the machine on one fixed joint below it, needed such a link or none of that "
-        "name; rename it."
-    )
-
-
-def _joint_of_tool(machine: Machine) -> str:
-    """Return the fixed joint between the platform and a tool link without children."""
-    urdf = machine.urdf
-    joint = next((joint for joint in urdf.joints.values() if joint.child == _TOOL), None)
-    frames = {name for c in machine.chain.closures for name in c.frames}
-    carries = any(other.parent == _TOOL for other in urdf.joints.values())
-    if (
-        joint is not None
-        and not joint.moves
-        and joint.parent == machine.platform
-        and not carries
-        and frames.isdisjoint((_TOOL, joint.name))
-    ):
-        return joint.name
-    raise UsageError(
-        f"{urdf.path}: the tool could not be written: found a link '{_TOOL}' that is not at the "
-        f"end of a fixed joint on the platform '{machine.platform}', needed such a link or none of "
-        "that name; rename it."
-    )
-
-
-def _unused_joint(urdf: Urdf, parent: str, child: str) -> str:
-    """Return a free name of a fixed joint between two links."""
-    joint = f"{parent}_{child}_frame"
-    while joint in urdf.links or joint in urdf.joints:
-        joint += "_"
-    return joint

@@ -1,6 +1,6 @@
 "use strict";
-// A machine in space on a canvas. The content of a scene has its `unit`, whether it is `flat`, and `modes` to choose from:
-// `models` of joints A and B, anchors, standing and moving lines, by pose: the difference between both is exaggerated by
+// A machine in space on a canvas. The content of a scene has its `unit`, whether it is `flat`, and two `models`
+// of joints A and B, anchors, standing and moving lines, by pose: the difference between both is exaggerated by
 // one of the `factors`. Base and platform are lines around joints (`rims`), uncertainties half axes at joints (`rings`,
 // those of the platform turned as it is), `cameras` an eye and the corners of its picture.
 (() => {
@@ -18,14 +18,14 @@
   };
 
   // What is drawn: layers of lines, words, and points with a tip.
-  const machine = ({ rims, rings, cameras, names }, mode, pose, factor) => {
+  const machine = ({ models, legend, rims, rings, cameras, names }, pose, factor) => {
     const at = (poses) => poses[pose] ?? poses[0];
     const between = (a, b) => (typeof a === "number" ? a + factor * (b - a) : a.map((x, k) => between(x, b[k])));
-    const [before, after] = mode.models.map((m) => ({ ...m, A: at(m.A), B: at(m.B), moving: at(m.moving) }));
+    const [before, after] = models.map((m) => ({ ...m, A: at(m.A), B: at(m.B), moving: at(m.moving) }));
     const shown = Object.fromEntries(Object.keys(before).map((key) => [key, between(before[key], after[key])]));
     const around = (points, rim) => rim.map((j) => points[j]);
     const layers = [before, shown].flatMap((model, k) => [
-      { name: mode.legend[k], colour: [GREY, BLUE][k], width: [2, 4][k], lines: model.A.map((a, j) => [a, model.B[j]]) },
+      { name: legend[k], colour: [GREY, BLUE][k], width: [2, 4][k], lines: model.A.map((a, j) => [a, model.B[j]]) },
       { colour: [GREY, BLUE][k], width: [1.3, 2][k], lines: [
         around(model.anchors.length > 2 ? model.anchors : model.A, rims.base), around(model.B, rims.platform),
         ...model.standing] },
@@ -47,7 +47,7 @@
   const show = (canvas, content) => {
     const form = document.querySelector(`form[data-for="${canvas.id}"]`), { elements } = form;
     const paper = canvas.getContext("2d");
-    const solid = content.modes[0].models.flatMap((m) => [...m.A.flat(), ...m.B.flat(), ...m.standing.flat()]);
+    const solid = content.models.flatMap((m) => [...m.A.flat(), ...m.B.flat(), ...m.standing.flat()]);
     const [[x0, x1], [y0, y1], [z0, z1]] = [0, 1, 2].map((k) => span(solid, k)), reach = 0.3 * Math.max(x1 - x0, y1 - y0);
     const xs = ticks(x0 - reach, x1 + reach), ys = ticks(y0 - reach, y1 + reach); // of the floor
     const corners = [xs[0], xs.at(-1)].flatMap((x) => [ys[0], ys.at(-1)].map((y) => [x, y]));
@@ -153,17 +153,13 @@
     };
 
     const update = () => {
-      const mode = content.modes[Number(elements.mode.value)];
-      const pose = Number(elements.pose?.value ?? 0), factor = content.factors[Number(elements.factor.value)];
+      const pose = Number(elements.pose?.value ?? 0), factor = content.factors[Number(elements.factor.value)] ?? 1;
       elements.factor_text.value = `${factor} times`;
       if (elements.pose) elements.pose_text.value = content.poses[pose];
-      drawn = machine(content, mode, pose, factor);
+      drawn = machine(content, pose, factor);
       canvas.layers = drawn.layers;
       draw();
     };
-    elements.mode.addEventListener("input", () => {
-      elements.factor.value = content.modes[Number(elements.mode.value)].step;
-    });
     form.addEventListener("input", update);
     form.addEventListener("submit", (event) => event.preventDefault());
 

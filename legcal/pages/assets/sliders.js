@@ -15,7 +15,7 @@
     let waiting = null, isBusy = false, dragged = null, photographs = "";
 
     const show = ({ scene, values, problems, photographs: shown }) => {
-      if (scene.modes) canvas.show(scene);
+      if (scene.models) canvas.show(scene);
       for (const [name, value] of Object.entries(values)) {
         const slider = form.elements[name];
         if (slider !== dragged || !waiting) slider.value = value;
