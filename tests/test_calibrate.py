@@ -294,7 +294,7 @@ def test_a_result_is_replaced_by_one_of_the_same_dataset_alone(
         shutil.copytree(planar[0].parent / name, place / name)
     shutil.copytree(place / "set", tmp_path / "other")
     before = (place / "result" / "result.json").read_bytes()
-    with pytest.raises(UsageError, match=r"result of another dataset \(.*moved/set\).* remove that"):
+    with pytest.raises(UsageError, match=r"of another dataset \(.*moved/set\).* remove that"):
         calibrate(tmp_path / "other", output=place / "result")
     assert (place / "result" / "result.json").read_bytes() == before
     again = calibrate(place / "set", output=place / "result", leave_out="c1")
