@@ -180,6 +180,12 @@ def test_views_of_unequal_size_are_words_in_the_names_too_as_a_plan_names_them(
     tmp_path: Path,
 ) -> None:
     names = [f"c{v}_p{k:02d}.png" for v, *poses in ((1, 1, 2, 3), (2, 4, 5, 6, 7)) for k in poses]
+    for form in ("{} {:03d}.png", "{} ({}).png", "{}{:03d}.png", "{1} {0}.png"):
+        folder = tmp_path / form
+        folder.mkdir()
+        table(own_folder(folder, [form.format("ab"[k > 3], k) for k in range(1, 8)]), n=7)
+        assert init(folder).code == 0
+        assert [view for view, *_ in pairs(folder)] == ["a"] * 3 + ["b"] * 4
     table(own_folder(tmp_path, names), n=7)
     assert init(tmp_path).code == 0
     assert [view for view, *_ in pairs(tmp_path)] == ["c1"] * 3 + ["c2"] * 4
