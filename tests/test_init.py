@@ -112,6 +112,8 @@ MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
     # clocks an hour apart
     (FLAT, {"Time": tuple(f"2026-11-23T11:0{i}:03" for i in (1, 0, 2))}, 3,
      [("IMG_10.JPG", 0), ("IMG_2.JPG", 1), ("IMG_11.JPG", 2)]),
+    (FLAT, {"Zeit": tuple(f"3.11.2026 11:0{i}" for i in (1, 0, 2))}, 3,
+     [("IMG_10.JPG", 0), ("IMG_2.JPG", 1), ("IMG_11.JPG", 2)]),
     (FLAT, {"time": ("1795428126000", "1795428005000", "1795428065000")}, 3,
      [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
     (FLAT, {"Elapsed time [s]": ("121.5", "0", "60")}, 3,
