@@ -267,6 +267,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"names": LEGS[:5]}, (), ("leg6", "'leg5'")),
     (FLAT, {"names": ["1.5"] * 6}, (), ("numbers in the first line", "leg1")),
     (FLAT, {"names": ["a", "b", "c", "d", "e", "f"]}, (), ("'a'", "L1, q1, 1")),
+    (FLAT, {"names": ["X [mm]", "Y [mm]", "Z [mm]", "A", "B", "C"]}, (), ("where the tool",)),
     (FLAT, {"names": [*LEGS[:5], "leg5 mm"]}, (), ("'leg5'", "'leg5 mm'")),
     (FLAT, {"add": 345.0}, ("--unit", "m"), ("lengths of legs in mm", "add --lengths")),
     (FLAT, {}, ("--lengths",), ("readings in mm", "leave out --lengths")),
