@@ -21,7 +21,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from itertools import islice
 from multiprocessing import connection, get_context
-from threading import RLock, Thread
+from threading import Event, RLock, Thread
+from time import monotonic
 from types import MappingProxyType
 from typing import Any, Protocol, SupportsIndex, TypeGuard, TypeVar, cast
 
@@ -280,6 +281,7 @@ def _told_if_ended(failure: str) -> Iterator[None]:
 
 
 CONNECTING = 10.0  # [s] maximum time until a scheduler answers and has a worker
+ALONE = 60.0  # [s] without any worker, after which work is given up
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+/?")
 
 
@@ -349,37 +351,53 @@ def _close(client: Any) -> None:
 def _cluster(client: Any, failure: str) -> Iterator[tuple[_Submit, int]]:
     """Give a function that submits calls to the workers of a client, and their number.
 
-    Dask repeats the work of a dead worker on another one.
+    Dask repeats the work of a dead worker on another one. Where none is left, it would wait for
+    ever: work that has had no worker for ``ALONE`` seconds is cancelled.
     """
     from distributed import TimeoutError as NoWorker
     from distributed.comm.core import CommClosedError
     from distributed.scheduler import KilledWorker
 
-    address = client.scheduler.address
+    address, ended, lost = client.scheduler.address, Event(), Event()
+
+    def watch(executor: Any) -> None:
+        seen = monotonic()
+        while not ended.wait(ALONE / 6.0):
+            with suppress(OSError, RuntimeError):  # from a scheduler that is gone
+                seen = monotonic() if client.nthreads() else seen
+            if monotonic() - seen > ALONE:
+                lost.set()
+                executor.shutdown(wait=False)
+                return
+
     try:
         client.wait_for_workers(1, timeout=CONNECTING)
         _compare_versions(client.run(_version, on_error="return"), failure)
         executor = client.get_executor(pure=False)
 
         def submit(*call: Any) -> Future[Any]:
+            if lost.is_set():
+                raise CancelledError
             return cast("Future[Any]", executor.submit(_called, pickle.dumps(call)))
 
+        Thread(target=watch, args=(executor,), daemon=True).start()
         try:
             yield submit, len(client.nthreads())
         finally:
+            ended.set()
             executor.shutdown(wait=False)
-    except NoWorker as error:
-        raise OutOfResources(
-            f"{failure}: found no worker at the scheduler {address}, needed one; start some (dask "
-            f"worker {address} --nthreads 1) and the same command again."
-        ) from error
     except KilledWorker as error:
         raise OutOfResources(
             f"{failure}: found that several workers of {address} were ended from outside at the "
             "same piece of work, needed one that finishes it; see that they have enough memory "
             "and start the same command again."
         ) from error
-    except (CancelledError, CommClosedError) as error:
+    except (NoWorker, CancelledError, CommClosedError) as error:
+        if isinstance(error, NoWorker) or lost.is_set():
+            raise OutOfResources(
+                f"{failure}: found no worker at the scheduler {address}, needed one; start some "
+                f"(dask worker {address} --nthreads 1) and the same command again."
+            ) from error
         raise OutOfResources(
             f"{failure}: found that the scheduler {address} does not answer any more, needed it to "
             "the end; start it and the same command again."

@@ -109,7 +109,7 @@ def drawings(
 ) -> list[Path]:
     """Write pictures of a chessboard or circles, drawn without a scene; return their paths.
 
-    Quick for a camera without distortion.
+    Circles are on a bright sheet on a dark table. Quick for a camera without distortion.
     """
     rng = np.random.default_rng(4)
     n = 3  # samples of a pixel, each way
@@ -125,7 +125,9 @@ def drawings(
         direction = rays @ T.rotation.as_matrix().T.astype(np.float32)
         hit = T.translation - direction * (T.translation[2] / (rays @ normal))[..., None]
         if board.has_circles:
-            black = KDTree(board.points[:, :2]).query(hit[..., :2])[0] < 0.5 * board.marker
+            xy, margin = board.points[:, :2], board.marker
+            on_sheet = (hit[..., :2] > xy.min(0) - margin) & (hit[..., :2] < xy.max(0) + margin)
+            black = (KDTree(xy).query(hit[..., :2])[0] < 0.5 * margin) | ~on_sheet.all(-1)
         else:
             i, j = (np.floor(hit[..., a] / board.side).astype(np.intp) for a in (0, 1))
             on_board = (i >= -1) & (i < board.columns - 1) & (j >= -1) & (j < board.rows - 1)

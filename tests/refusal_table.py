@@ -186,6 +186,8 @@ def _options() -> Iterable[Refusal]:
         ("hand-held", "--hand-held", ("--board",)),
     ]
     yield from _cases("simulate", "simulate hexapod -o {out}", simulate)
+    zeros: Rows = [("zeros", "--error offsets=1mm", ("'linear-delta'", "base-joints also"))]
+    yield from _cases("simulate", "simulate linear-delta -o {out}", zeros)
 
     locate: Rows = [
         ("tool-position", "-o {out} --tool-position 1,2", ("--tool-position",)),

@@ -24,6 +24,7 @@ from toy_studies import Draws
 
 from legcal import workers
 from legcal.errors import DatasetError, OutOfResources, UsageError
+from legcal.progress import no_progress
 from legcal.simulation.paper import run_study
 from legcal.workers import Workers, worker_pool
 
@@ -221,8 +222,14 @@ def test_no_answer_and_no_worker_are_said_in_one_sentence(
             run_study(Draws(), 3, workers=address)
     # Clients that failed before do not keep another one from its scheduler.
     monkeypatch.setattr(workers, "CONNECTING", 5.0)
-    with (
-        local_cluster(tmp_path / "cluster", 0) as local,
-        pytest.raises(OutOfResources, match="found no worker at the scheduler"),
-    ):
-        run_study(Draws(), 3, workers=local.address)
+    monkeypatch.setattr(workers, "ALONE", 1.0)
+    with local_cluster(tmp_path / "cluster", 0) as local:
+
+        def kill(stage: str, done: int, total: int) -> None:
+            local.workers[0].kill()
+
+        for reports in (no_progress, kill):  # none from the beginning; none any more
+            with pytest.raises(OutOfResources, match=r"found no worker at the scheduler .* start"):
+                run_study(Draws(seconds=0.05), 400, workers=local.address, progress=reports)
+            if not local.workers:
+                local.add()

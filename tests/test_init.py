@@ -112,6 +112,8 @@ MATCHED: list[tuple[Sequence[str], Columns, int, list[tuple[str, int]]]] = [
     # clocks an hour apart
     (FLAT, {"Time": tuple(f"2026-11-23T11:0{i}:03" for i in (1, 0, 2))}, 3,
      [("IMG_10.JPG", 0), ("IMG_2.JPG", 1), ("IMG_11.JPG", 2)]),
+    (FLAT, {"Zeit": tuple(f"3.11.2026 11:0{i}" for i in (1, 0, 2))}, 3,
+     [("IMG_10.JPG", 0), ("IMG_2.JPG", 1), ("IMG_11.JPG", 2)]),
     (FLAT, {"time": ("1795428126000", "1795428005000", "1795428065000")}, 3,
      [("IMG_11.JPG", 0), ("IMG_2.JPG", 1), ("IMG_10.JPG", 2)]),
     (FLAT, {"Elapsed time [s]": ("121.5", "0", "60")}, 3,
@@ -180,6 +182,12 @@ def test_views_of_unequal_size_are_words_in_the_names_too_as_a_plan_names_them(
     tmp_path: Path,
 ) -> None:
     names = [f"c{v}_p{k:02d}.png" for v, *poses in ((1, 1, 2, 3), (2, 4, 5, 6, 7)) for k in poses]
+    for form in ("{} {:03d}.png", "{} ({}).png", "{}{:03d}.png", "{1} {0}.png"):
+        folder = tmp_path / form
+        folder.mkdir()
+        table(own_folder(folder, [form.format("ab"[k > 3], k) for k in range(1, 8)]), n=7)
+        assert init(folder).code == 0
+        assert [view for view, *_ in pairs(folder)] == ["a"] * 3 + ["b"] * 4
     table(own_folder(tmp_path, names), n=7)
     assert init(tmp_path).code == 0
     assert [view for view, *_ in pairs(tmp_path)] == ["c1"] * 3 + ["c2"] * 4
@@ -259,6 +267,7 @@ REFUSED: list[tuple[Sequence[str], dict[str, Any], Sequence[str], Sequence[str]]
     (FLAT, {"names": LEGS[:5]}, (), ("leg6", "'leg5'")),
     (FLAT, {"names": ["1.5"] * 6}, (), ("numbers in the first line", "leg1")),
     (FLAT, {"names": ["a", "b", "c", "d", "e", "f"]}, (), ("'a'", "L1, q1, 1")),
+    (FLAT, {"names": ["X [mm]", "Y [mm]", "Z [mm]", "A", "B", "C"]}, (), ("where the tool",)),
     (FLAT, {"names": [*LEGS[:5], "leg5 mm"]}, (), ("'leg5'", "'leg5 mm'")),
     (FLAT, {"add": 345.0}, ("--unit", "m"), ("lengths of legs in mm", "add --lengths")),
     (FLAT, {}, ("--lengths",), ("readings in mm", "leave out --lengths")),

@@ -19,13 +19,14 @@ from command_line import run as run_command
 from csv_rows import read_rows, write_rows
 from hexapod_example import HEXAPOD, copy_of_the_example
 
+import legcal
 from legcal.data.dataset import load_dataset
 from legcal.errors import OutOfResources, UsageError
 from legcal.files import folder
 from legcal.files.folder import write_atomically
 from legcal.geometry.types import Array
 from legcal.planning import shooting
-from legcal.planning.shooting import GuidedSession
+from legcal.planning.shooting import Asked, GuidedSession
 from legcal.recordings import frames as recordings
 from legcal.recordings.frames import LiveCamera, WatchedFolder
 from legcal.viewer import shooting as dialogues
@@ -80,6 +81,13 @@ def heard(dialogue: Dialogue, text: str) -> str:
     pytest.fail(f"'{text}' was not said, but {dialogue.lines}")
 
 
+def asked(session: GuidedSession) -> Asked:
+    """Return the photograph that a session asks for."""
+    found = session.next()
+    assert found is not None
+    return found
+
+
 def photograph(name: str) -> bytes:
     """Return a photograph of the example."""
     return (HEXAPOD / "images" / f"{name}.jpg").read_bytes()
@@ -127,6 +135,26 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
     loaded = load_dataset(session)  # with the photographs checked
     assert loaded.measurements.image == ("images/c1_k01.jpg", "images/c1_k02.jpg")
     assert len(list(watched.iterdir())) == 9  # copied, not moved
+
+
+def test_the_second_photograph_of_a_machine_that_is_off_by_millimetres_is_taken(
+    tmp_path: Path,
+) -> None:
+    off, folder, taken = legcal.Spread(4e-3), tmp_path / "session", tmp_path / "taken"
+    errors = legcal.ParameterErrors(base_joints=off, platform_joints=off)
+    settings = legcal.SimulationSettings(poses=2, views=1, seed=3, errors=errors)
+    legcal.simulate("linear-delta", folder, settings)
+    shutil.move(folder / "images", taken)
+    session = GuidedSession(folder)
+    first, second = sorted(taken.iterdir())
+    wrong = tmp_path / "wrong.png"
+    cv2.imwrite(str(wrong), np.asarray(cv2.imread(str(second)))[:, ::-1])
+    session.accept(asked(session), first, session.check(asked(session), first))
+    assert "at another pose" in " ".join(session.check(asked(session), wrong).problems)
+    found = session.check(asked(session), second)
+    assert found.problems == ()
+    assert found.legs is not None
+    assert found.legs.sum() >= 0.6 * found.n_visible > 2.0
 
 
 def test_a_photograph_that_finds_no_room_is_kept_by_word_once_there_is_some(

@@ -38,6 +38,8 @@ from legcal.simulation.dataset import TRUTH_NAME, SimulatedDataset
 from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.settings import Distribution, Level, requested
 from legcal.vision.board import parse_board
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import camera_info
 
 FEW = settings(poses=1, views=1)
 
@@ -286,6 +288,16 @@ def test_cameras_that_show_nothing_are_refused_and_nothing_is_written(
     with pytest.raises(refused, match=named):
         simulate("hexapod", tmp_path / "set", settings(views=[view]))
     assert files_of(tmp_path) == {}
+
+
+def test_a_fisheye_that_sees_everything_before_it_stands_where_legs_are_long(
+    tmp_path: Path,
+) -> None:
+    K = np.array([[480.0, 0.0, 600.0], [0.0, 480.0, 450.0], [0.0, 0.0, 1.0]])
+    lens = tmp_path / "fisheye.yaml"  # its corners look 90 deg aside
+    lens.write_text(camera_info(Camera(K, 1200, 900, np.zeros(4), model="equidistant"), "fisheye"))
+    made = simulate("hexapod", tmp_path / "set", settings(poses=2, camera=lens))
+    assert made.seen.all()
 
 
 # Boards

@@ -30,6 +30,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 
 _NUMBER = re.compile(r"\d+")
 _EXIF_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")
+_DAY_FIRST = re.compile(r"(\d\d?)\.(\d\d?)\.(\d{4}),? ", re.ASCII)  # with dots, never the month
 _OF_DAY = re.compile(r"\d\d?:|(\d{4}|\d{6})$", re.ASCII)  # other numbers are no times of a day
 _DATE_DIGITS = 8  # of 20261123
 _SEED = 20020721
@@ -78,10 +79,13 @@ def _times(measurements: Measurements, taken_at: Mapping[str, str]) -> Array | N
 def seconds_in(text: str, day: float | None = None) -> float | None:
     """Return the time in a text [s] by the clock on the wall, None if there is none.
 
-    It is written as ISO 8601, as EXIF does, as the time of a *day* [s] alone, or as a Unix time.
-    Of numbers, those of eight digits are dates if they can be.
+    It is written as ISO 8601, as EXIF does, as spreadsheets do (31.12.2026 10:15), as the time of a
+    *day* [s] alone, or as a Unix time. Of numbers, those of eight digits are dates if they can be.
     """
     text = _EXIF_DATE.sub(r"\1-\2-\3", text.strip(), count=1)
+    if date_first := _DAY_FIRST.match(text):
+        day_of_month, month, year = date_first.groups()
+        text = f"{year}-{month:0>2}-{day_of_month:0>2} {text[date_first.end() :].strip()}"
     of_day = _seconds_of_day(text)
     if day is not None and of_day is not None:
         return day // DAY * DAY + of_day

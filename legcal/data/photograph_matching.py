@@ -66,19 +66,25 @@ class Photograph:
 Matched = tuple[Iterable[tuple[int, Photograph]], str, list[str]]
 
 
-_VIEW_FIRST = {"{view}_*": "_", "{view}-*": "-"}  # patterns of names, and the mark beside the view
-_VIEW_LAST = {"*_{view}": "_", "*-{view}": "-"}
+_PATTERNS = {  # of names, the likelier first
+    "{view}_*": r"(?P<view>[^_]*)_(?P<label>.*)",
+    "{view}-*": r"(?P<view>[^-]*)-(?P<label>.*)",
+    "*_{view}": r"(?P<label>.*)_(?P<view>[^_]*)",
+    "*-{view}": r"(?P<label>.*)-(?P<view>[^-]*)",
+    "{view} *": r"(?P<view>[^ ]*) (?P<label>.*)",
+    "* {view}": r"(?P<label>.*) (?P<view>[^ ]*)",
+    "{view}*": r"(?P<view>[^\W\d_]+)(?P<label>\d+)",  # left012
+}
 _LEAST_OF_VIEW = 3  # photographs, where views have more and fewer
 
 
 def _with_view(photograph: Photograph, pattern: str) -> Photograph:
     """Return a photograph with the view in its name, "" if it has another form."""
     stem = PurePosixPath(photograph.name).stem
-    if pattern in _VIEW_FIRST:
-        view, mark, label = stem.partition(_VIEW_FIRST[pattern])
-    else:
-        label, mark, view = stem.rpartition(_VIEW_LAST[pattern])
-    return replace(photograph, view=view if mark else "", label=label.strip(_SEPARATORS))
+    view, label = "", stem
+    if found := re.fullmatch(_PATTERNS[pattern], stem):
+        view, label = found["view"], found["label"]
+    return replace(photograph, view=view, label=label.strip(_SEPARATORS))
 
 
 def with_likely_views(photographs: Sequence[Photograph]) -> tuple[list[Photograph], str | None]:
@@ -103,7 +109,7 @@ def likely_pattern(photographs: Sequence[Photograph]) -> str | None:
     need, and few views.
     """
     likely: list[tuple[bool, bool, int, int, str]] = []
-    for k, pattern in enumerate((*_VIEW_FIRST, *_VIEW_LAST)):
+    for k, pattern in enumerate(_PATTERNS):
         labels: dict[str, set[str]] = {}
         for photograph in photographs:
             named = _with_view(photograph, pattern)

@@ -250,11 +250,14 @@ class ReadingsSheet:
         missing = [leg.motor_label for leg, joint in zip(self.motors, self._joints, strict=True)
                    if joint not in joint_of_column.values()]  # fmt: skip
         columns = few([describe(header[i]) for i in free]) or "none"
+        remedy = "rename the columns"
+        if {split[i][0] for i in free} >= {"x", "y", "z"}:
+            remedy = "where the tool stands is no reading: note where each motor stands"
         raise DatasetError(
             f"{self.path}, header: the readings of {few(missing)} could not be found: found the "
             f"columns {columns}, needed one for each of the {n} legs with an encoder, named after "
             f"the leg ({self.motors[0].name}), its joint ({self._joints[0]}) or its number "
-            "(L1, q1, 1); rename the columns."
+            f"(L1, q1, 1); {remedy}."
         )
 
     def _units(

@@ -20,6 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
 from legcal.files.schema import few, read_json, read_yaml
@@ -122,11 +123,29 @@ class OutputKind:
 
     def is_in(self, folder: Path) -> bool:
         """Return whether a folder holds an output of this kind written by legcal."""
+        return self._document_in(folder) is not None
+
+    def dataset_of(self, folder: Path) -> str:
+        """Return the dataset that the output in a folder is from, as it was stated, or ""."""
+        stated = (self._document_in(folder) or {}).get(DATASET_KEY)
+        return stated if isinstance(stated, str) else ""
+
+    def _document_in(self, folder: Path) -> dict[str, Any] | None:
         try:
             document = read_json(folder / self.marker)
         except (OSError, ValueError):
-            return False
-        return isinstance(document, dict) and self.key in document
+            return None
+        return document if isinstance(document, dict) and self.key in document else None
+
+
+DATASET_KEY = "dataset_folder"
+"""Key of a document that says which dataset an output folder is from: see :func:`seen_from`."""
+
+
+def seen_from(destination: Path, dataset: Path) -> str:
+    """Return the path from an output folder to its dataset, which moves with both of them."""
+    path = os.path.relpath(os.path.realpath(dataset), os.path.realpath(destination))
+    return Path(path).as_posix()
 
 
 RESULT = OutputKind("result", "result.json", "legcal_result")
@@ -143,12 +162,26 @@ def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
 
 
 def check_destination(
-    destination: Path, kind: OutputKind = RESULT, *, replaces: bool = True
+    destination: Path,
+    kind: OutputKind = RESULT,
+    *,
+    replaces: bool = True,
+    dataset: Path | None = None,
 ) -> None:
-    """Refuse an output folder that holds files, unless it *replaces* earlier output of its kind."""
+    """Refuse an output folder that holds files, unless it *replaces* earlier output of its kind.
+
+    Output of another *dataset* than the one given is not replaced either.
+    """
     check_path(destination, kind)
     is_earlier = kind.is_in(destination)
     is_new = not destination.is_dir() or not holds_files(destination)
+    stated = kind.dataset_of(destination) if is_earlier else ""
+    if stated and dataset is not None and stated != seen_from(destination, dataset):
+        raise UsageError(
+            f"{destination}: the {kind.noun} could not be written: found the {kind.noun} of "
+            f"another dataset ({os.path.normpath(destination / stated)}), needed a new or empty "
+            f"folder or a {kind.noun} of {dataset}; give another folder, or remove that one."
+        )
     if is_new or (replaces and (is_earlier or not kind.marker)):
         return
     found, needed, remedy = "a folder with files", "a new or empty folder", "give another folder"
@@ -237,13 +270,14 @@ def result_folder(
     stale: Iterable[Path] = (),
     *,
     replaceable: Container[Path] | None = None,
+    dataset: Path | None = None,
 ) -> Iterator[Path]:
     """Give a temporary folder; its files become the result when the block ends without error.
 
-    An earlier result is replaced file by file; other files beside it are kept. If the block or
-    the moving is interrupted, the destination is unchanged.
+    An earlier result is replaced file by file, if it is from the same *dataset*; other files beside
+    it are kept. If the block or the moving is interrupted, the destination is unchanged.
     """
-    check_destination(destination, kind)
+    check_destination(destination, kind, dataset=dataset)
     with (
         out_of_resources(destination, f"the {kind.noun}", ANOTHER_FOLDER),
         temporary_folder(_workshop(destination), destination.name) as temporary,

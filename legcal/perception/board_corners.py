@@ -149,7 +149,7 @@ def search_board(
 def _circles(board: Board, grey: Grey) -> SeenBoard:
     """Detect the whole grid of circles by OpenCV; of one that is cut off nothing is found."""
     how = cv2.SimpleBlobDetector.Params()
-    how.maxArea = float(grey.size)
+    how.maxArea = grey.size / board.n_corners  # larger blobs, as of the sheet, confuse the search
     is_plain = board.kind == "circles"
     layout = cv2.CALIB_CB_SYMMETRIC_GRID if is_plain else cv2.CALIB_CB_ASYMMETRIC_GRID
     blobs = cv2.SimpleBlobDetector.create(how)

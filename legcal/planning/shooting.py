@@ -34,7 +34,7 @@ from legcal.calibration.ordered_dataset import order_dataset
 from legcal.data.dataset import POSES_NAME, Dataset, inspect_files, load_dataset
 from legcal.data.image_choice import dataset_at
 from legcal.data.image_tables import measurements_at
-from legcal.data.measurements import measurement_table, measurements_in
+from legcal.data.measurements import Measurements, measurement_table, measurements_in
 from legcal.data.outlines import Outlines, along_legs
 from legcal.data.photograph_notes import notes_on_photographs
 from legcal.data.reasons import Reason, Rejection
@@ -253,7 +253,14 @@ class GuidedSession:
             one = measurements_at(m, np.zeros(1, dtype=np.intp))
             absolute = str(photograph.absolute())
             one = replace(one, image=(absolute,), view=np.array([v]), q=asked.q[None])
-            legs, n_visible = self._legs_in(replace(self.dataset, measurements=one))
+            new = replace(self.dataset, measurements=one)
+            legs, n_visible = self._legs_in(new)
+            before = self._photographs_of(v)
+            # One pose hardly tells the place of the camera from errors of the model.
+            if legs.sum() < FEW_LEGS * n_visible and len(before) < N_PLACING:
+                both = dataset_at(self.dataset, np.array(before))
+                if self._is_placed(v, replace(both, measurements=_joined(both.measurements, one))):
+                    legs, n_visible = self._legs_in(new)
             if legs.sum() < FEW_LEGS * n_visible:
                 problems.append(
                     f"It shows {legs.sum()} of {n_visible} legs where pose {asked.pose} has them: "
@@ -403,32 +410,41 @@ class GuidedSession:
         if not self.machine.is_determined or view not in [one.name for one in m.views]:
             return
         v = [one.name for one in m.views].index(view)
-        rows = [row for row in self.taken if m.view[row] == v and m.image[row]]
+        rows = self._photographs_of(v)
         if not rows or (view in self.cameras and m.image[rows[-1]] in self.found):
             return
         if view not in self.cameras:
             some = dataset_at(self.dataset, np.array(rows[-N_PLACING:]))
-            try:
-                detection = detected(
-                    order_dataset(some, in_turn, no_progress),
-                    np.arange(len(some.measurements.image)),
-                )
-            except LegcalError:
-                return
-            T = detection.T_base_camera[v]
-            found, visible = self._counted(detection.outlines, some.measurements.n_rows)
-            if T is None or detection.unplaced or found.sum() < SURELY * max(visible.sum(), 1):
+            if not self._is_placed(v, some):
                 if len(rows) >= N_PLACING:
                     self.notes.append(
                         f"The legs were not recognised in the photographs of view {view} so far: "
                         "look at light and background, and at the readings of its poses."
                     )
                 return
-            self.cameras[view] = T
         for row in rows:
             if m.image[row] not in self.found:
                 legs, _ = self._legs_in(dataset_at(self.dataset, np.array([row])))
                 self.found[m.image[row]] = legs
+
+    def _photographs_of(self, v: int) -> list[int]:
+        m = self.dataset.measurements
+        return [row for row in self.taken if m.view[row] == v and m.image[row]]
+
+    def _is_placed(self, v: int, some: Dataset) -> bool:
+        """Place the camera of a view by photographs of it; return whether these show its legs."""
+        try:
+            detection = detected(
+                order_dataset(some, in_turn, no_progress), np.arange(some.measurements.n_rows)
+            )
+        except LegcalError:
+            return False
+        T = detection.T_base_camera[v]
+        found, visible = self._counted(detection.outlines, some.measurements.n_rows)
+        if T is None or detection.unplaced or found.sum() < SURELY * max(visible.sum(), 1):
+            return False
+        self.cameras[some.measurements.views[v].name] = T
+        return True
 
     # What is known
 
@@ -524,6 +540,19 @@ def _cells(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     table = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig")))
     rows = [{k.strip(): (x or "").strip() for k, x in row.items()} for row in table]
     return [name.strip() for name in table.fieldnames or ()], rows
+
+
+def _joined(several: Measurements, one: Measurements) -> Measurements:
+    """Return rows and one more row, at a pose of its own."""
+    return replace(
+        several,
+        image=several.image + one.image,
+        view=np.concatenate([several.view, one.view]),
+        pose=np.append(several.pose, several.n_poses),
+        q=np.concatenate([several.q, one.q]),
+        pose_labels=(),
+        time=None,
+    )
 
 
 def _label(cells: Mapping[str, str]) -> tuple[str, str]:

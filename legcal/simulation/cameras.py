@@ -54,6 +54,7 @@ MAX_HAND_DRAWS = 60
 _MARGIN = 0.03  # free margin at each side, in units of the image size
 _CENTRING_STEPS = 3  # steps that bring the machine into the middle of the image
 _MIN_BOARD_SHARE = 0.75  # minimum share of poses in which a camera must see the board
+_WIDEST = 1.0  # tangent of the widest angle to the axis at which a camera shows the machine
 _MIN_DISTANCE = 0.3  # minimum distance between camera and machine, in machine sizes
 
 _N_BOARD_CANDIDATES = 2  # places of a board with cameras, of which the better is taken
@@ -237,8 +238,7 @@ def _before(
     """Return the pose of a camera in a direction, with all points in the image."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     rotation = look_at(target + toward, target, roll, up=up).rotation
-    low, high = sensor_extent(camera)
-    low, high = (1.0 - 2.0 * _MARGIN) * low, (1.0 - 2.0 * _MARGIN) * high
+    low, high = np.clip((1.0 - 2.0 * _MARGIN) * sensor_extent(camera), -_WIDEST, _WIDEST)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     p = rotation.inv().apply(points - target)
     for _ in range(_CENTRING_STEPS):

@@ -477,9 +477,12 @@ def parameter_errors(texts: Sequence[str], nominal: Machine) -> ParameterErrors:
             )
         kinds, spread = _ERROR_KINDS[kind], _spread(size, units, f"--error {kind}")
         if spread.size > 0.0 and not possible & set(kinds):
+            remedy = "leave it out"
+            if kind == "offsets" and nominal.actuators:
+                remedy = "base-joints also move the zeros of motors that carry joints"
             raise UsageError(
                 f"--error {kind} could not be used: found none in the mechanism "
-                f"'{nominal.name}', needed one that has them; leave it out."
+                f"'{nominal.name}', needed one that has them; {remedy}."
             )
         errors = replace(errors, **dict.fromkeys(kinds, spread))  # type: ignore[arg-type]
     return errors
