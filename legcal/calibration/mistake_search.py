@@ -322,7 +322,7 @@ class _Judge:
         near = Agreement.joined([look.before for look in looks])
         of_looks = np.array([look.near_known() for look in looks])
         best = of_looks[:, int(np.argmax(of_looks.sum(axis=0)))]
-        # A mistake may suit one view by chance, or be of that view: others have no right camera then
+        # A mistake may suit one view alone, by chance: others have no right camera then
         suited = [_total(x.before) + own >= _SUITS * float(x.before.expected.sum())
                     for x, own in zip(looks, best, strict=True)]  # fmt: skip
         searches = not (all(suited) and _suits(best.sum() + _total(near), near))
