@@ -235,11 +235,15 @@ def _fit_from_best_start(
         shifted, most_px = _common_mode_px(solution), problem.settings.largest_rms_px
         if shifted > most_px:
             kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
-            raise DidNotConverge(
-                f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
-                f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or "
-                "start from a better nominal model."
+            what, remedy = "", "check camera poses, readings and outlines, or the nominal model"
+            if solution.camera_doubts:
+                wrong = max(solution.camera_doubts, key=lambda one: one.apart)
+                what, remedy = f"{wrong.what}, and ", wrong.remedy
+            what += (
+                f"many outlines are shifted together by {shifted:.1f} px ({kind}), where light and "
+                f"blur explain at most {most_px:g} px"
             )
+            raise DidNotConverge(f"{what[0].upper()}{what[1:]}; {remedy}.")
         return dataclasses.replace(
             solution, notes=(*solution.notes, *notes), details=tuple(details)
         )

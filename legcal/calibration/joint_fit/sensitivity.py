@@ -202,13 +202,24 @@ class WrongIntrinsic:
             looks = " (the lens distortion of the photographs appears not to have been removed)"
         return f"found k1 = {found:.3f} +- {sigma:.3f}, given {given:.3f}{looks}"
 
-    def __str__(self) -> str:
+    @property
+    def what(self) -> str:
+        """The contradiction, as a clause."""
         of_view = self.kind in _OF_VIEWS
         against = "the other views of its camera" if of_view else "the measurements"
         return (
-            f"The {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
-            f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
-            f"this error; {_REMEDIES[self.kind].format(self.view)}."
+            f"the {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
+            f"{self.apart:.0f} standard deviations apart"
+        )
+
+    @property
+    def remedy(self) -> str:
+        """What to do, as a clause."""
+        return _REMEDIES[self.kind].format(self.view)
+
+    def __str__(self) -> str:
+        return (
+            f"T{self.what[1:]}; the stated uncertainty does not include this error; {self.remedy}."
         )
 
 
