@@ -42,7 +42,7 @@ from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
-from legcal.calibration.joint_fit.scale import explaining_missing_scale
+from legcal.calibration.joint_fit.scale import explaining_missing_scale, only_lengths
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
@@ -403,7 +403,7 @@ def _refine_minimum(
         raise DidNotConverge(contradicted)
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(problem, start, first.state, with_priors=True)
-    refuse_contradicted_priors(normal)
+    refuse_contradicted_priors(normal, only_lengths(problem))
     return assemble_solution(fit, normal, held, outlines, start.label)
 
 
@@ -433,7 +433,8 @@ def _refuse_contradicted(problem: FitProblem, state: State) -> None:
     noise = NoiseModel()
     if len(claimed):
         noise = robust_noise(problem.offsets(state), claimed)
-    refuse_contradicted_priors(information(linearize(problem.weighted(noise), state)))
+    normal = information(linearize(problem.weighted(noise), state))
+    refuse_contradicted_priors(normal, only_lengths(problem))
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:
