@@ -65,7 +65,6 @@ from legcal.perception.diagnostics import far_from_hints, images_left_out, is_me
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
 TOLERANCE = "tolerance"  # code of the doubt in parameters that moved far
-NO_IMPROVEMENT = "no_improvement"  # code of the doubt in a change that is no larger than its error
 # codes of what does not make the platform more uncertain by the covariance of the fit
 BESIDE_SIGMA = frozenset(
     ("strayed_camera", "scale", "pitch", "nominal_length", TOLERANCE, "no_better", "held_out")

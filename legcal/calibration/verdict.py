@@ -15,7 +15,6 @@ from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.doubts import (
     BESIDE_SIGMA,
     CAMERA,
-    NO_IMPROVEMENT,
     TOLERANCE,
     click_notes,
     doubts_of,
@@ -170,7 +169,7 @@ def _no_improvement(change: float, sigma: float, n_images: int, remedy: str) -> 
     more = (TRUSTED_SIGMAS / max(times, 1e-9)) ** 2  # the variance falls with their number
     number = "many more" if more > MOST_MORE else f"{math.ceil(more * n_images)} or more"
     remedy = remedy or f"take {number} images (now {n_images}), or better ones"
-    return Doubt(NO_IMPROVEMENT, what, f"keep the nominal one, or {remedy}", is_grave=True)
+    return Doubt("no_improvement", what, f"keep the nominal one, or {remedy}", is_grave=True)
 
 
 def _worst_first(doubts: Sequence[Doubt]) -> tuple[Doubt, ...]:
@@ -179,11 +178,11 @@ def _worst_first(doubts: Sequence[Doubt]) -> tuple[Doubt, ...]:
     Too small an improvement follows what may make the platform uncertain, and is before what does
     not.
     """
-    is_uncertain = any(one.code == NO_IMPROVEMENT for one in doubts)
+    is_uncertain = any(one.code == "no_improvement" for one in doubts)
 
     def place(one: Doubt) -> tuple[int, float]:
         place = 0 if one.is_grave else 3 if is_uncertain and one.code in BESIDE_SIGMA else 1
-        return 2 if one.code == NO_IMPROVEMENT else place, -(one.sigma_dX_m or 0.0)
+        return 2 if one.code == "no_improvement" else place, -(one.sigma_dX_m or 0.0)
 
     return tuple(sorted(doubts, key=place))
 
