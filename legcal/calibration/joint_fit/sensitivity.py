@@ -391,22 +391,12 @@ class CameraResiduals:
         shown = views[o.view] & changes["outlines"].any(axis=1)
         for edge in np.unique(edges[shown], axis=0):
             own = np.flatnonzero(shown & np.all(edges == edge, axis=1))
-            anywhere = np.zeros((*changes["outlines"].shape, 2 * len(own)))
+            every = np.arange(1 + 2 * len(own))
+            columns = {name: np.zeros((*x.shape, len(every))) for name, x in changes.items()}
+            for name, change in changes.items():
+                columns[name][..., 0] = change
             for k in range(2):
-                anywhere[own, k, 2 * np.arange(len(own)) + k] = 1.0
-            columns = {
-                name: np.concatenate(
-                    [
-                        change[..., None],
-                        anywhere
-                        if name == "outlines"
-                        else np.zeros((*change.shape, anywhere.shape[-1])),
-                    ],
-                    axis=-1,
-                )
-                for name, change in changes.items()
-            }
-            every = np.arange(1 + anywhere.shape[-1])
+                columns["outlines"][own, k, every[1 + k :: 2]] = 1.0
             scores = Projected.of(self._plain, columns).at(every)
             number = scores.given(scores.estimate(every[1:])).estimate(every[:1])
             if number.square <= _OF_OTHER_EDGES**2:
