@@ -162,7 +162,7 @@ def _no_improvement(change: float, sigma: float, n_images: int, remedy: str) -> 
     """Return the doubt in a change of the platform that is not surely one for the better [m]."""
     times = change / sigma if sigma > 0.0 else 0.0
     what = (
-        f"the change of the platform is {times:.1f} times its standard deviation, needed "
+        f"the change of the platform is {times:.2f} times its standard deviation, needed "
         f"{TRUSTED_SIGMAS:g}: these images do not show that this model is better than the nominal "
         "one"
     )
