@@ -444,6 +444,8 @@ def _units() -> Iterable[Refusal]:
     in_us = {"readings": dict.fromkeys(SERVOS, servo)}
     rows: list[tuple[str, np.ndarray, dict[str, Any], tuple[str, ...]]] = [
         ("degrees", np.degrees(angles), sigma, ("look like degrees", "write readings: deg")),
+        ("one-in-degrees", angles * np.array([1.0, 57.3, 1.0, 1.0, 1.0, 1.0]), sigma,
+         ("look like degrees", "write readings: {servo2: deg}")),
         ("radians", both_ways, degrees,
          ("% of the travel in deg", "in rad", "write readings: rad")),
         ("pulses", pulses, sigma, ("look like pulses", "centre_us: 1500")),

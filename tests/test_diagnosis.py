@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import yaml
 from edits import cell, keyed
+from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import settings, simulated
 from thinned import thinned
 
 from legcal import Dataset, calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration import mistake_search
 from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, _permuted
-from legcal.calibration.mistake_search import diagnose
+from legcal.calibration.mistake_search import diagnose, symmetries
 from legcal.calibration.mistakes import Assumed, Mistake, mistakes
 from legcal.calibration.ordered_dataset import OrderedDataset, order_dataset
 from legcal.data.image_choice import dataset_at
@@ -111,6 +112,19 @@ def _renumbered(d: Dataset) -> Dataset:
     return _with_legs(d, [replace(leg, B=legs[(j + 2) % 6].B) for j, leg in enumerate(legs)])
 
 
+def _numbered_back(d: Dataset) -> Dataset:
+    """Return a machine whose platform joints are numbered the other way round."""
+    legs = d.machine.legs
+    return _with_legs(d, [replace(leg, B=legs[-1 - j].B) for j, leg in enumerate(legs)])
+
+
+def _late_in_third_column(d: Dataset) -> Dataset:
+    """Return readings of one leg that are a row late, through both views."""
+    q = d.measurements.q.copy()
+    q[:, 2] = np.roll(q[:, 2], 1)
+    return _with_readings(d, q)
+
+
 def _thick(d: Dataset) -> Dataset:
     return replace(d, machine=d.machine.with_radii(lambda _, c: 2.0 * c.radius))
 
@@ -146,6 +160,13 @@ def outlines(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Datase
     return made
 
 
+def test_a_machine_is_as_symmetric_where_its_home_is_tilted() -> None:
+    machine = load_mechanism("3-upu")
+    tilt = RigidTransform.from_components([0.02, 0.03, 0.0], Rotation.from_rotvec([0.03, 0.0, 0.0]))
+    tilted = replace(machine, home=machine.home * tilt)
+    assert len(symmetries(tilted)) == len(symmetries(machine)) == 6
+
+
 def _try_only(kinds: Collection[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Try mistakes of some kinds, also beside others that are undone: all take seconds."""
 
@@ -162,7 +183,7 @@ def _diagnosed(d: Dataset) -> Diagnosis:
 
 BESIDE = {"images mirrored", "images upside down", "readings shifted", "direction of encoders"}
 USUAL = (
-    *(_exchanged, _thick, _doubled_row, _in_order_of_text),
+    *(_exchanged, _thick, _doubled_row, _in_order_of_text, _late_in_third_column),
     *(_exchanged_from_eighth, _reversed_from_eighth),
 )
 
@@ -179,6 +200,10 @@ USUAL = (
              "the outlines appear to be mirrored"),
             ("hexapod", _renumbered, "platform joints renumbered",
              "the platform joints of the model appear to be numbered", ""),
+            ("hexapod", _numbered_back, "joints reversed",
+             "the platform joints of the model appear to be numbered the other way round", ""),
+            ("hexapod", _late_in_third_column, "column shifted",
+             "the readings in column leg3_prismatic appear to be one row late", ""),
             ("hexapod", _thick, "diameter for radius",
              "the radii of the legs in the model appear to be diameters", ""),
             ("delta", _turned_arms, "base joints renumbered",

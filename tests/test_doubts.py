@@ -214,6 +214,19 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
         assert found.verdict.is_to_be_refused
 
 
+def test_too_small_an_improvement_is_said_before_what_has_no_part_in_it(
+    healthy: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera, place = Doubt("few_outlines", "few", "a"), Doubt("strayed_camera", "far", "b")
+    monkeypatch.setattr(verdict, "doubts_of", lambda *_: (place, camera))
+    monkeypatch.setattr(verdict, "TRUSTED_SIGMAS", 1e6)
+    found = _judged(healthy)
+    codes = [one.code for one in found.doubts]
+    assert codes == ["few_outlines", "no_improvement", "strayed_camera"]
+    assert "do not show that this model is better" in found.doubts[1].what
+    assert found.doubts[1].remedy.startswith("keep the nominal one, or take many more images")
+
+
 def test_a_platform_no_better_known_than_built_has_tolerances_as_its_next_step(
     healthy: Calibration,
 ) -> None:

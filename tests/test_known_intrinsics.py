@@ -25,9 +25,11 @@ from legcal.calibration.joint_fit.sensitivity import (
     FITTED_CAMERA,
     INTRINSICS,
     SIGMA_EXACT,
+    CameraResiduals,
 )
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.geometry.types import Array
+from legcal.estimation.problem import linearize
+from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 from legcal.vision.camera_file import read_camera
 
@@ -229,6 +231,24 @@ def test_a_view_at_another_zoom_than_the_others_of_its_camera_is_named() -> None
     found = float(note.partition("it differs by ")[2].partition(" +-")[0])
     assert found == pytest.approx(3.0, abs=1.2)
     assert [wrong.view for wrong in solution.camera_doubts] == ["c2"]
+
+
+def test_one_edge_on_a_reflection_says_nothing_of_a_camera() -> None:
+    posterior = irregular_hexapod(6).noisy(0).fit().posterior
+    problem, linear = posterior.problem, linearize(posterior.problem, posterior.state)
+    o, outlines = problem.outlines, linear["outlines"]
+    by_zoom = CameraResiduals(linear).zoomed(1)["outlines"]
+    one = np.argmax(np.bincount(o.leg[o.view == 1]))
+    is_one = (o.view == 1) & (o.leg == one) & (o.epsilon > 0)
+
+    def named(shown: BoolArray, size: float) -> list[str]:
+        rows = dict(linear.rows)
+        rows["outlines"] = replace(outlines, r=outlines.r - size * shown[:, None] * by_zoom)
+        found = CameraResiduals(replace(linear, rows=rows)).contradicted()
+        return [wrong.view for wrong in found]
+
+    assert named(o.view == 1, 0.03) == ["c2"]
+    assert named(is_one, 0.3) == []
 
 
 @pytest.fixture(scope="module")

@@ -275,6 +275,23 @@ def test_a_joint_that_moved_is_named_and_not_the_encoder_of_its_leg(
     assert abs(finding.amount - 5e-4) < 4.0 * finding.sigma < 3e-4
 
 
+def test_wrong_edges_in_one_image_are_no_change(healthy: Dataset, start: Start) -> None:
+    outlines, wrong, row, leg = healthy.observations, 13, np.arange(24), 1
+    elsewhere = with_rays(healthy, row == wrong, turned(400.0 * TURN)).observations
+    assert outlines is not None
+    assert elsewhere is not None
+    of_leg = outlines.leg == leg
+    is_wrong = of_leg & (outlines.row == wrong)
+    changed = replace(
+        outlines,
+        h=np.where(is_wrong[:, None], elsewhere.h, outlines.h),
+        ends=np.where(is_wrong[:, None, None], elsewhere.ends, outlines.ends),
+    )
+    seldom_seen = of_leg & (outlines.row >= 12) & ~np.isin(outlines.row, [wrong, 18, 20])
+    spoiled = replace(healthy, observations=changed.choose(~seldom_seen))
+    assert [one.kind for one in _findings(spoiled, start)] == []
+
+
 def test_a_stated_length_tells_a_pitch_that_all_motors_share(healthy: Dataset) -> None:
     truth, part = load_mechanism(next((healthy.folder / "truth/models").glob("*.yaml"))), 3e-3
     length = 1e3 * float(np.linalg.norm(truth.A_base[0] - truth.A_base[2]))

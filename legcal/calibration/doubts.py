@@ -65,6 +65,10 @@ from legcal.perception.diagnostics import far_from_hints, images_left_out, is_me
 
 CAMERA = "camera"  # code of the doubt in cameras that the measurements contradict
 TOLERANCE = "tolerance"  # code of the doubt in parameters that moved far
+# codes of what does not make the platform more uncertain by the covariance of the fit
+BESIDE_SIGMA = frozenset(
+    ("strayed_camera", "scale", "pitch", "nominal_length", TOLERANCE, "no_better", "held_out")
+)
 MAX_LEFT_OUT = 0.25  # of the images, beyond which something is wrong with the session
 MIN_USED = 2.0 / 3.0  # of the outlines of visible legs
 MOST_WIDTHS, MIN_WIDTHS = 0.55, 8  # share of the images of a part with another width; and number

@@ -35,7 +35,7 @@ from legcal.calibration.mistakes import (
 from legcal.calibration.ordered_dataset import OrderedDataset
 from legcal.errors import LegcalError
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.model import Machine, vectors_A_to_B
+from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.perception.agreement import (
     Agreement,
     Assumption,
@@ -320,8 +320,12 @@ class _Judge:
         left = np.argsort(-np.array(missing), kind="stable").tolist()
         looks = [_Look(self, tried, g) for g in left[:_NEAR_GROUPS]]
         near = Agreement.joined([look.before for look in looks])
-        gain = np.sum([look.near_known() for look in looks], axis=0)
-        searches = not _suits(gain.max(initial=0.0) + _total(near), near)
+        of_looks = np.array([look.near_known() for look in looks])
+        best = of_looks[:, int(np.argmax(of_looks.sum(axis=0)))]
+        # A mistake may suit one view alone, by chance: others have no right camera then
+        suited = [_total(x.before) + own >= _SUITS * float(x.before.expected.sum())
+                    for x, own in zip(looks, best, strict=True)]  # fmt: skip
+        searches = not (all(suited) and _suits(best.sum() + _total(near), near))
         gain, seen = np.zeros(len(tried)), list[Agreement]()
         judged = np.zeros(len(tried), dtype=np.bool_)
         done, total = 0, len(_FEW_STARTS) * len(tried)
@@ -618,12 +622,22 @@ class _Look:
 
 
 def symmetries(machine: Machine) -> list[Array]:
-    """Return motions (4, 4) of the base link that map legs at home to legs, and reflections.
+    """Return motions (4, 4) of the base link that map legs to legs, and reflections.
 
-    Two legs of a machine may come to lie on any two others: four points on four define a motion.
+    Legs are compared near home where all motors are as far in their travel: home itself is often
+    tilted or beside the middle. Two legs of a machine may come to lie on any two others: four
+    points on four define a motion.
     """
-    B = machine.home.apply(machine.B_platform)
-    A = B - vectors_A_to_B(machine, machine.home)
+    q = readings_at(machine, machine.home)
+    travel = np.array([leg.travel if leg.is_motor else (0.0, 0.0) for leg in machine.legs])
+    motors = [j for j in machine.motors if np.isfinite(travel[j]).all() and np.ptp(travel[j]) > 0.0]
+    part = np.mean([(q[j] - travel[j, 0]) / np.ptp(travel[j]) for j in motors] or 0.0)
+    q[motors] = travel[motors, 0] + part * np.ptp(travel[motors], axis=1)
+    alike = Assumed(machine, q[None], np.ones((1, 2)), np.zeros(1, dtype=np.intp))
+    A, B = (ends[0] for ends in alike.joints([0]))
+    if np.isnan(B).any():
+        B = machine.home.apply(machine.B_platform)
+        A = B - vectors_A_to_B(machine, machine.home)
     legs = np.stack([A, B], axis=1)  # (n_legs, 2, 3)
     size = float(np.std(legs.reshape(-1, 3), axis=0).max())
     found = list[Array]()

@@ -221,8 +221,8 @@ def _column_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
 def _numbering_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     """Yield joints of the platform, or of the base, that the model numbers wrongly.
 
-    From another one on, or two of them exchanged. Base joints with their motors that are some
-    numbers on are platform joints and columns that are as many back.
+    From another one on, the other way round, or two of them exchanged. Base joints with their
+    motors that are some numbers on are platform joints and columns that are as many back.
     """
     machine = given.machine
     files = inverse(data.order.legs).tolist()  # legs as the files have them
@@ -267,6 +267,20 @@ def _numbering_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistak
             f"with the {base} renumbered by {n - k}",
             f"correct the numbers of the {base} in the model",
             with_base_joints(turned[k], true),
+            test=_MOVE_ONE,
+        )
+    reversed_order = list(range(n))[::-1]
+    true = with_platform_joints(reversed_order)
+    for noun, turned_round in (
+        (base, with_base_joints(reversed_order, true)),
+        ("platform joints", true),
+    ):
+        yield Mistake(
+            "joints reversed",
+            f"the {noun} of the model appear to be numbered the other way round",
+            f"with the {noun} in reverse order",
+            f"reverse the numbers of the {noun} in the model",
+            turned_round,
             test=_MOVE_ONE,
         )
     for one, other in combinations(range(n), 2) if n > 3 else ():
@@ -322,7 +336,7 @@ def limited_to(data: OrderedDataset, given: Assumed, mistake: Mistake, rows: Int
 
 
 def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
-    """Yield readings shifted by a row, in all views or in one, and readings in order of text."""
+    """Yield readings shifted by a row, in all views, in one, or of one motor, and in text order."""
     whole, views = np.argsort(data.order.rows, kind="stable"), data.measurements.views
     of_view = [whole[data.measurements.view[whole] == v] for v in range(len(views))]
     nonempty = [rows for rows in of_view if len(rows)]
@@ -333,6 +347,8 @@ def _row_mistakes(data: OrderedDataset, given: Assumed) -> Iterator[Mistake]:
     for shifted, name in parts:
         if all(len(rows) > 2 for rows in shifted):
             yield from (_shifted(given, shifted, k, name) for k in _LATE)
+    for motor in given.machine.motors if len(whole) > 2 else ():
+        yield from (_column_shifted(given, whole, motor, k) for k in _LATE)
     for tables in (nonempty, [whole])[: len(nonempty)]:
         yield from _text_order(tables, given)
 
@@ -349,6 +365,21 @@ def _shifted(given: Assumed, tables: Sequence[IntArray], k: int, of_view: str = 
         "check which image belongs to which row",
         replace(given, q=q),
         amount_of=f"rows{of_view}",
+    )
+
+
+def _column_shifted(given: Assumed, rows: IntArray, motor: int, k: int) -> Mistake:
+    """Return readings of one motor shifted by a row, as by a cell that was deleted."""
+    q, name = given.q.copy(), given.machine.legs[motor].prismatic
+    q[rows, motor] = given.q[np.roll(rows, -k), motor]
+    return Mistake(
+        "column shifted",
+        f"the readings in column {name} appear to be one row {_LATE[k]}, those of other columns "
+        "not",
+        "with that column moved by 1 row",
+        "compare that column with the record of the session (a cell that was added or deleted)",
+        replace(given, q=q),
+        amount_of=f"rows of {name}",
     )
 
 

@@ -347,9 +347,9 @@ def _forward_selection(
 ) -> tuple[list[_Solved], _Scores]:
     """Return the numbers that the fit lacks, the most certain first, and the scores given them."""
     lacking = list[_Solved]()
-    while solved and sum(one.test.of.kind != "camera_file" for one in lacking) < MAX_FINDINGS:
-        best = min(solved, key=lambda number: (number.p_value, -number.explains))
-        if best.p_value * n_tests > DOUBT_BY_CHANCE:
+    while sum(one.test.of.kind != "camera_file" for one in lacking) < MAX_FINDINGS:
+        best = scores.most_certain(solved, n_tests)
+        if best is None:
             break
         lacking.append(best)
         scores = _Scores(scores.scores.given(best.estimated), scores.column)
@@ -812,14 +812,20 @@ class _Fit:
         In squares: *least* in units of the scatter that a number leaves behind, *in_all* in those
         of the covariances of outlines. Wrong edges near a right cause leave scatter behind.
         """
-        best, asked = None, 0
+        found, asked = list[tuple[_Solved, _Scores]](), 0
         for hypotheses in (*self.of_joints(), *self.of_screws()):
             tests = list(chain.from_iterable(map(self.course.tests, count(), hypotheses)))
             asked += len(tests)
-            for solved in self.scores(hypotheses).solved(tests):
-                if solved.explains > least and solved.explains * solved.scatter > in_all:
-                    least, best = solved.explains, solved
-        return best if best and best.p_value * asked <= DOUBT_BY_CHANCE else None
+            scores = self.scores(hypotheses)
+            for one in scores.solved(tests):
+                if one.explains > least and one.explains * one.scatter > in_all:
+                    found.append((one, scores))
+        for one, scores in sorted(found, key=lambda each: -each[0].explains):
+            if one.p_value * asked > DOUBT_BY_CHANCE:
+                return None
+            if scores.is_of_several_images(one, asked):
+                return one
+        return None
 
     def finding(self, number: _Solved, measurements: Measurements) -> UnmodelledEffect:
         """Return a number that the fit lacks."""
@@ -935,6 +941,35 @@ class _Scores:
         scores = scores.less(by_noise, toward, by_noise @ scores.score[columns])
         return _Scores(scores, self.column)
 
+    def most_certain(self, solved: Sequence[_Solved], n_tests: int) -> _Solved | None:
+        """Return the number that is least likely by chance; None if all may be chance."""
+        for number in sorted(solved, key=lambda one: (one.p_value, -one.explains)):
+            if number.p_value * n_tests > DOUBT_BY_CHANCE:
+                return None
+            if self.is_of_several_images(number, n_tests):
+                return number
+        return None
+
+    def is_of_several_images(self, number: _Solved, n_tests: int) -> bool:
+        """Return whether a number is certain beside an error of its own in any one image.
+
+        Wrong edges or readings of a single image are neither a change nor an error of a motor.
+        """
+        of_blocks = self._of_hypotheses[number.test.place]
+        columns, block = (
+            number.estimated.columns,
+            np.nonzero(self.column[number.test.place] >= 0)[1],
+        )
+        every = number.estimated._replace(columns=np.arange(len(columns)))
+        score, variance = of_blocks.left([every])
+        apart = score[0] ** 2 / np.maximum(variance[0], LEAST_SEEN * of_blocks.size)
+        for one in dict.fromkeys(block[np.argsort(-apart, kind="stable")].tolist()):
+            beside = of_blocks.given(of_blocks.estimate(np.flatnonzero(block == one)))
+            (again,) = _solved_by(beside, [number.test], every.chosen[None], columns)
+            if again.p_value * n_tests > DOUBT_BY_CHANCE:
+                return False
+        return True
+
     def solved(self, tests: Sequence[_Test]) -> list[_Solved]:
         """Estimate the number of each test."""
         return [
@@ -950,19 +985,30 @@ class _Scores:
         number, block = np.nonzero(used)
         holds = np.array([test.holds for test in tests])[:, block]
         chosen = np.equal(number[:, None], np.arange(len(column))) * holds[..., None]
-        estimated = of_blocks.estimates(np.arange(len(number)), chosen.astype(np.float64))
-        score, variance = of_blocks.left(estimated)
-        tested = variance > LEAST_SEEN * of_blocks.size
-        total = np.sum(np.where(tested, score**2 / np.where(tested, variance, 1.0), 0.0), axis=1)
-        scatters = np.maximum(total / np.maximum(tested.sum(axis=1), 1), 1.0).tolist()
-        for test, found, scatter in zip(tests, estimated, scatters, strict=True):
-            rank, square = found.rank, found.square / scatter
-            if test.of.kind == "drift":  # all numbers but the first are levels that may be anything
-                variance_of_first = max(
-                    float(found.covariance[0, 0]) * scatter, np.finfo(np.float64).tiny
-                )
-                rank, square = min(rank, 1), float(found.amount[0]) ** 2 / variance_of_first
-            yield _Solved(test, found._replace(columns=column[used]), rank, square, scatter)
+        columns = column[used]
+        yield from _solved_by(of_blocks, tests, chosen.astype(np.float64), columns)
+
+
+def _solved_by(
+    of_blocks: Scores,  # (c,) of one hypothesis
+    tests: Sequence[_Test],
+    chosen: Array,  # (n_tests, c, d)
+    columns: IntArray,  # (c,) among those of all hypotheses
+) -> Iterator[_Solved]:
+    """Yield the number of each test of a hypothesis by its scores in single blocks."""
+    estimated = of_blocks.estimates(np.arange(len(columns)), chosen)
+    score, variance = of_blocks.left(estimated)
+    tested = variance > LEAST_SEEN * of_blocks.size
+    total = np.sum(np.where(tested, score**2 / np.where(tested, variance, 1.0), 0.0), axis=1)
+    scatters = np.maximum(total / np.maximum(tested.sum(axis=1), 1), 1.0).tolist()
+    for test, found, scatter in zip(tests, estimated, scatters, strict=True):
+        rank, square = found.rank, found.square / scatter
+        if test.of.kind == "drift":  # all numbers but the first are levels that may be anything
+            variance_of_first = max(
+                float(found.covariance[0, 0]) * scatter, np.finfo(np.float64).tiny
+            )
+            rank, square = min(rank, 1), float(found.amount[0]) ** 2 / variance_of_first
+        yield _Solved(test, found._replace(columns=columns), rank, square, scatter)
 
 
 class _Solved(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ import numpy as np
 from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.documents import Doubt, Holdout
 from legcal.calibration.doubts import (
+    BESIDE_SIGMA,
     CAMERA,
     TOLERANCE,
     click_notes,
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
 
 MOST_HIDDEN = 3.0  # predicted errors of the platform, that a slip may have without showing
 NEGLIGIBLE = 0.3  # of the predicted error: it adds less than a twentieth to that
+MOST_MORE = 5.0  # times as many images, beyond which their number is no advice
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 MAX_BEYOND = 0.05  # largest share of the outlines of a view beyond the boards without a note
 _ALONG = 9  # points along an outline
@@ -116,22 +119,10 @@ def judge(
     if displacement > 0.0:
         found += f"; what is in doubt may add {mm_deg(displacement, rotation)}"
     of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
-    if change <= TRUSTED_SIGMAS * float(np.hypot(sigma, of_cameras)):
-        what = "a predicted improvement below two sigma is no improvement"
-        more = remedy or "take more images or better ones"
-        doubts = (*doubts, Doubt("no_improvement", what, more, is_grave=True))
-    # Grave ones first, then those of known effects, the largest first; too small an improvement
-    # follows what may have caused it
-    doubts = tuple(
-        sorted(
-            doubts,
-            key=lambda one: (
-                one.code == "no_improvement",
-                not one.is_grave,
-                -(one.sigma_dX_m or 0.0),
-            ),
-        )
-    )
+    known_to = float(np.hypot(sigma, of_cameras))
+    if change <= TRUSTED_SIGMAS * known_to:
+        doubts = (*doubts, _no_improvement(change, known_to, measurements.n_rows, remedy))
+    doubts = _worst_first(doubts)
     sentence = f"Calibrated: {found}."
     if doubts:
         n_more = len(doubts) - 1
@@ -165,6 +156,35 @@ def judge(
         tuple(diagnosis),
         group=group,
     )
+
+
+def _no_improvement(change: float, sigma: float, n_images: int, remedy: str) -> Doubt:
+    """Return the doubt in a change of the platform that is not surely one for the better [m]."""
+    times = change / sigma if sigma > 0.0 else 0.0
+    what = (
+        f"the change of the platform is {times:.2f} times its standard deviation, needed "
+        f"{TRUSTED_SIGMAS:g}: these images do not show that this model is better than the nominal "
+        "one"
+    )
+    more = (TRUSTED_SIGMAS / max(times, 1e-9)) ** 2  # the variance falls with their number
+    number = "many more" if more > MOST_MORE else f"{math.ceil(more * n_images)} or more"
+    remedy = remedy or f"take {number} images (now {n_images}), or better ones"
+    return Doubt("no_improvement", what, f"keep the nominal one, or {remedy}", is_grave=True)
+
+
+def _worst_first(doubts: Sequence[Doubt]) -> tuple[Doubt, ...]:
+    """Return grave doubts, then others, by their effect on the platform.
+
+    Too small an improvement follows what may make the platform uncertain, and is before what does
+    not.
+    """
+    is_uncertain = any(one.code == "no_improvement" for one in doubts)
+
+    def place(one: Doubt) -> tuple[int, float]:
+        place = 0 if one.is_grave else 3 if is_uncertain and one.code in BESIDE_SIGMA else 1
+        return 2 if one.code == "no_improvement" else place, -(one.sigma_dX_m or 0.0)
+
+    return tuple(sorted(doubts, key=place))
 
 
 def camera_file_notes(dataset: Dataset, solution: Solution) -> list[str]:

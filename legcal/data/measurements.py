@@ -281,8 +281,10 @@ def readings_in(
     usual = f"correct the {what} or the limits"
     remedies: dict[tuple[int, ...], str] = {(j,): usual for j in outside}  # by columns
     for alike in often.values():
-        of_alike = [motors[j] for j in alike], [stated[j] for j in alike]
-        if not lengths and (cause := likely_cause(values[:, alike], *of_alike, place)):
+        of_alike, turns = [motors[j] for j in alike], motors[alike[0]].reads_angle
+        of_some = sum(leg.reads_angle == turns for leg in motors) > len(alike)
+        named = of_alike, [stated[j] for j in alike], place
+        if not lengths and (cause := likely_cause(values[:, alike], *named, of_some=of_some)):
             kept = {columns: text for columns, text in remedies.items() if columns[0] not in alike}
             remedies = {**kept, tuple(alike): cause}
     for columns, remedy in remedies.items():

@@ -349,14 +349,19 @@ class Meaning:
         travel = np.ptp([leg.travel for leg in legs], axis=1)
         return np.asarray(np.ptp(self.q, axis=0) / travel)
 
-    def said(self, legs: Sequence[Leg], stated: str, place: UnitPlace) -> str:
-        """Return what the numbers look like, and what to do if *stated* is another unit."""
+    def said(
+        self, legs: Sequence[Leg], stated: str, place: UnitPlace, joints: Sequence[str] = ()
+    ) -> str:
+        """Return what the numbers look like, and what to do if *stated* is another unit.
+
+        Of some *joints*, or of all.
+        """
         unit, remedies = self.units[0], list[str]()
         words = f"whole leg lengths{f' in {unit.words}' * (unit.name != 'm')}"
         if not self.are_lengths:
             words = "readings with the opposite sign" if self.is_reversed else unit.words
         if unit.name != stated:
-            remedies.append(_stating(unit.name, place))
+            remedies.append(_stating(unit.name, place, joints))
         if self.are_lengths:
             remedies.append("subtract the leg lengths at reading zero (legcal inspect tells them)")
         if self.is_reversed:
@@ -369,9 +374,12 @@ class Meaning:
 UnitPlace = Literal["headings", "dataset file"]
 
 
-def _stating(unit: str, place: UnitPlace) -> str:
-    """Return how to state the unit of readings."""
-    return f"{f'state {unit}' if place == 'headings' else f'write readings: {unit}'} in the {place}"
+def _stating(unit: str, place: UnitPlace, joints: Sequence[str] = ()) -> str:
+    """Return how to state the unit of readings, of some *joints* or of all."""
+    of_each = f"{{{', '.join(f'{joint}: {unit}' for joint in joints)}}}" if joints else unit
+    return (
+        f"{f'state {unit}' if place == 'headings' else f'write readings: {of_each}'} in the {place}"
+    )
 
 
 def joint_values(values: Array, units: Sequence[ReadingUnit]) -> Array:
@@ -412,6 +420,8 @@ def likely_cause(
     legs: Sequence[Leg],  # that all slide, or all turn
     units: Sequence[ReadingUnit],  # stated, of one name
     place: UnitPlace,
+    *,
+    of_some: bool = False,  # whether others of their kind are inside
 ) -> str:
     """Return the likely mistake in readings outside the travel, and its remedy; "" if unclear.
 
@@ -427,7 +437,8 @@ def likely_cause(
         best = max(possible, key=lambda m: float(m.used(legs).mean()))
         as_stated = float(Meaning(tuple(units), joint_values(values, units)).used(legs).max())
         if best.used(legs).mean() >= HARDLY_MOVES or not HARDLY_MOVES <= as_stated <= 1.0:
-            return best.said(legs, name, place)
+            joints = [str(leg.prismatic) for leg in legs] if of_some else ()
+            return best.said(legs, name, place, joints)
         return (
             "they move no further than the travel, and so look like readings from another zero: "
             "shift them into it, or correct limits and offset of the model"

@@ -197,6 +197,12 @@ def image_verdict(
     if explanation.own >= SHARE_OF_OTHERS * usual[view]:
         little = "shows little of the legs: {}, in other images most; check its light and sharpness"
         return USED, Cause(little, (much,))
+    q, given = measurements.q, measurements.q[row]
+    same = (measurements.view == view) & np.all((q == given) | np.isnan(given), axis=1)
+    if len(others := np.setdiff1d(np.flatnonzero(same), row)):
+        copied = "{}, and its readings are those of image {}; correct its row if it was copied"
+        cause = Cause(copied, (much, measurements.image[int(others[0])]))
+        return Rejection(Reason.OTHER_SCENE), cause
     nothing = (
         "{}, and no other explanation fits; check that it is a photograph of this machine, taken "
         "by this camera at this reading"

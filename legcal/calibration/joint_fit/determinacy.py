@@ -34,8 +34,9 @@ from legcal.machine.parameters import (
 _MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
 _REMEDY = (
     "add images from other directions, of other legs or at poses that differ more, or state what "
-    "is known: values with a prior, or tolerances (machine_kind) with --only all"
+    "is known: values with a prior"
 )
+_OR_TOLERANCES = ", or tolerances (machine_kind) with --only all"
 _MIN_SPREAD = 2.5e-12  # mean leg lengths: floor of the error of the nominal model
 
 
@@ -90,7 +91,8 @@ def undetermined_directions(normal: FitNormal) -> HeldDirections:
         description = _in_words(names, sparse_basis(basis)[0], problem.legs.names)
         raise NotIdentifiable(
             f"The fit is not determined: {len(basis)} of {len(names)} combinations of parameters "
-            f"are uncertain by more than a tenth of a leg length: {description}; {_REMEDY}."
+            f"are uncertain by more than a tenth of a leg length: {description}; "
+            f"{_REMEDY}{_OR_TOLERANCES * (problem.choices.built is None)}."
         )
     weak: tuple[str, ...] = ()
     if len(
@@ -129,7 +131,8 @@ def refuse_undetermined_inliers(
         if accepted.all():
             raise NotIdentifiable(
                 f"The fit is not determined: at its minimum, {description} is uncertain by more "
-                f"than a tenth of a leg length; {_REMEDY}."
+                f"than a tenth of a leg length; {_REMEDY}"
+                f"{_OR_TOLERANCES * (problem.choices.built is None)}."
             )
         raise NotIdentifiable(
             f"The fit is not determined: without the rejected outlines, {description} is not "

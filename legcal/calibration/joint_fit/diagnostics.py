@@ -49,10 +49,11 @@ RADIUS_SIGMAS = 3.0  # between fitted and nominal radii with default priors
 _MAX_NAMES = 4  # names listed; further ones are counted
 
 
-def refuse_contradicted_priors(normal: FitNormal) -> None:
+def refuse_contradicted_priors(normal: FitNormal, by_model: Collection[str]) -> None:
     """Refuse stated priors that contradict the measurements.
 
-    *normal* is the information at a minimum.
+    *normal* is the information at a minimum, *by_model* are lengths of which only the radii of the
+    model say anything else.
 
     Raises DidNotConverge with one sentence for each prior.
     """
@@ -62,10 +63,18 @@ def refuse_contradicted_priors(normal: FitNormal) -> None:
     names = problem.choices.priors.keys()
     unit_of = dict(zip(problem.named, problem.units, strict=True))
     # A stated length stands beside the tolerance of its part: the narrower one is named.
-    found = sorted(_contradicted(normal, names), key=lambda one: -one[1].sigma)
     problems = {
-        name: _contradiction(name, unit_of[name], (prior.mean, prior.sigma), estimate.mean, apart)
-        for name, prior, estimate, apart in found
+        name: _contradiction(
+            name,
+            unit_of[name],
+            (prior.mean, prior.sigma),
+            estimate.mean,
+            apart,
+            by_model=name in by_model,
+        )
+        for name, prior, estimate, apart in sorted(
+            _contradicted(normal, names), key=lambda one: -one[1].sigma
+        )
     }
     if problems:
         raise DidNotConverge([Problem(one, code=Code.BAD_VALUE) for one in problems.values()])
@@ -77,17 +86,25 @@ def _contradiction(
     stated: tuple[float, float],  # value and standard deviation, zero where it is fixed
     measured: float,
     apart: float,  # standard deviations
+    *,
+    by_model: bool = False,  # whether only the radii of the model contradict it
 ) -> str:
     """Describe a stated value that the measurements contradict."""
     mean, sigma = stated
     what, remedy = ("prior", "") if sigma else ("fixed value", "give it a prior, ")
     given = "stated or assumed" if sigma else "stated"  # of a twist without a choice
     in_words = f"{mean:.6g} +- {sigma:.2g} {unit}" if sigma else f"{mean:.6g} {unit}"
+    against, by = "the measurements", "measured"
+    correct = "correct it, or readings and camera files that contradict it, "
+    if by_model:
+        against, by = "the radii of the model", "by these"
+        correct = (
+            "either may be wrong: measure it again, and use the model of this machine's size, "
+        )
     return (
-        f"The {what} of {name} contradicts the measurements: {given} {in_words}, measured about "
+        f"The {what} of {name} contradicts {against}: {given} {in_words}, {by} about "
         f"{measured:.4g} {unit}, {apart:.0f} standard deviations apart (limit {_SIGNIFICANT:g}); "
-        f"correct it, or readings and camera files that contradict it, {remedy}or free it "
-        f"(--set {name}=free)."
+        f"{correct}{remedy}or free it (--set {name}=free)."
     )
 
 

@@ -41,7 +41,7 @@ from legcal.calibration.joint_fit.parameter_choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.platform import expected_error, platform_by_parameters
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
-from legcal.calibration.joint_fit.scale import explaining_missing_scale
+from legcal.calibration.joint_fit.scale import explaining_missing_scale, only_lengths
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution
 from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
@@ -234,11 +234,15 @@ def _fit_from_best_start(
         shifted, most_px = _common_mode_px(solution), problem.settings.largest_rms_px
         if shifted > most_px:
             kind = max(solution.quality.shared_px, key=solution.quality.shared_px.__getitem__)
-            raise DidNotConverge(
-                f"Many outlines are shifted together by {shifted:.1f} px ({kind}); light and blur "
-                f"explain at most {most_px:g} px. Check camera poses, readings and outlines, or "
-                "start from a better nominal model."
+            what, remedy = "", "check camera poses, readings and outlines, or the nominal model"
+            if solution.camera_doubts:
+                wrong = max(solution.camera_doubts, key=lambda one: one.apart)
+                what, remedy = f"{wrong.what}, and ", wrong.remedy
+            what += (
+                f"many outlines are shifted together by {shifted:.1f} px ({kind}), where light and "
+                f"blur explain at most {most_px:g} px"
             )
+            raise DidNotConverge(f"{what[0].upper()}{what[1:]}; {remedy}.")
         return dataclasses.replace(
             solution, notes=(*solution.notes, *notes), details=tuple(details)
         )
@@ -396,7 +400,7 @@ def _refine_minimum(
         raise DidNotConverge(contradicted)
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(problem, start, first.state, with_priors=True)
-    refuse_contradicted_priors(normal)
+    refuse_contradicted_priors(normal, only_lengths(problem))
     return assemble_solution(fit, normal, held, outlines, start.label)
 
 
@@ -426,7 +430,8 @@ def _refuse_contradicted(problem: FitProblem, state: State) -> None:
     noise = NoiseModel()
     if len(claimed):
         noise = robust_noise(problem.offsets(state), claimed)
-    refuse_contradicted_priors(information(linearize(problem.weighted(noise), state)))
+    normal = information(linearize(problem.weighted(noise), state))
+    refuse_contradicted_priors(normal, only_lengths(problem))
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:

@@ -124,6 +124,12 @@ def scale_witnesses(problem: FitProblem) -> list[str]:
     return [*_witnesses_in_images(problem), *(name for name, _ in _stated_lengths(problem))]
 
 
+def only_lengths(problem: FitProblem) -> list[str]:
+    """Return the stated lengths that alone say how large the machine is, besides radii."""
+    stated = _stated_lengths(problem)
+    return stated[0][1] if len(stated) == 1 and not _witnesses_in_images(problem) else []
+
+
 def _witnesses_in_images(problem: FitProblem) -> list[str]:
     """Return the measured lengths that images come with: readings, a board."""
     has_board = any(len(corners) for corners in problem.boards)

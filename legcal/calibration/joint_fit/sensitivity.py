@@ -33,6 +33,7 @@ SIGMA_EXACT = 3e-3  # of such a focal length, relative: refocused, or known from
 _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
+_OF_OTHER_EDGES = 3.0  # the same without any one edge of a part in a view
 
 
 def sensitivity_to_cameras(
@@ -201,13 +202,24 @@ class WrongIntrinsic:
             looks = " (the lens distortion of the photographs appears not to have been removed)"
         return f"found k1 = {found:.3f} +- {sigma:.3f}, given {given:.3f}{looks}"
 
-    def __str__(self) -> str:
+    @property
+    def what(self) -> str:
+        """The contradiction, as a clause."""
         of_view = self.kind in _OF_VIEWS
         against = "the other views of its camera" if of_view else "the measurements"
         return (
-            f"The {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
-            f"{self.apart:.0f} standard deviations apart; the stated uncertainty does not include "
-            f"this error; {_REMEDIES[self.kind].format(self.view)}."
+            f"the {_TESTED[self.kind][2]} {self.view} does not agree with {against}: {self.found}, "
+            f"{self.apart:.0f} standard deviations apart"
+        )
+
+    @property
+    def remedy(self) -> str:
+        """What to do, as a clause."""
+        return _REMEDIES[self.kind].format(self.view)
+
+    def __str__(self) -> str:
+        return (
+            f"T{self.what[1:]}; the stated uncertainty does not include this error; {self.remedy}."
         )
 
 
@@ -280,7 +292,8 @@ class CameraResiduals:
         """Return the intrinsics in camera files that contradict the measurements.
 
         None where outlines scatter more than they claim even with these cameras corrected: then
-        something else is wrong, of which cameras take a part.
+        something else is wrong, of which cameras take a part. Nor what one edge alone says, as
+        that of a polished part on its reflection.
         """
         owners = np.array(shared_cameras(self.problem.outlines.views, self.problem.first_cameras))
         contradicted = list[WrongIntrinsic]()
@@ -288,7 +301,8 @@ class CameraResiduals:
             wrong = self._wrong_intrinsics(owner, owners == owner)
             apart = self._view_apart(owners == owner)
             clearest = max((test.apart for test in wrong), default=_SIGNIFICANT)
-            contradicted += wrong if apart is None or apart.apart <= clearest else [apart]
+            wrong = wrong if apart is None or apart.apart <= clearest else [apart]
+            contradicted += wrong if wrong and self._is_of_several_edges(wrong) else []
         squares = float(self.linear["outlines"].squared_norms.sum())
         left = 1.0 - sum(test.apart**2 for test in contradicted) / max(squares, 1e-300)
         scatter = Scatter.of(self.problem, self.state).ratio()
@@ -365,6 +379,29 @@ class CameraResiduals:
                     WrongIntrinsic(kind, name, values, change, sigma, apart, wrong, is_turned)
                 )
         return max(differ, key=lambda test: test.apart, default=None)
+
+    def _is_of_several_edges(self, wrong: Sequence[WrongIntrinsic]) -> bool:
+        """Return whether the corrections of a camera are seen without any one edge of a part.
+
+        In any one view: each of its outlines may then be anywhere.
+        """
+        o, error = self.problem.outlines, np.sum([one.error for one in wrong], axis=0)
+        changes, views = self.changes(error), np.any(error, axis=1)
+        edges = np.column_stack([o.view, o.radius, o.epsilon])
+        shown = views[o.view] & changes["outlines"].any(axis=1)
+        for edge in np.unique(edges[shown], axis=0):
+            own = np.flatnonzero(shown & np.all(edges == edge, axis=1))
+            every = np.arange(1 + 2 * len(own))
+            columns = {name: np.zeros((*x.shape, len(every))) for name, x in changes.items()}
+            for name, change in changes.items():
+                columns[name][..., 0] = change
+            for k in range(2):
+                columns["outlines"][own, k, every[1 + k :: 2]] = 1.0
+            scores = Projected.of(self._plain, columns).at(every)
+            number = scores.given(scores.estimate(every[1:])).estimate(every[:1])
+            if number.square <= _OF_OTHER_EDGES**2:
+                return False
+        return True
 
     def _known_views(self, error: Array) -> BoolArray:
         """Return which views have the intrinsics in *error* from camera files, (n_views,)."""
