@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def examined(session: Spoiled, folder: Path) -> Examination:
     before = sorted(session.path.rglob("*"))
     with pytest.MonkeyPatch.context() as patch:  # trying mistakes would take most of the time
-        patch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+        patch.setattr("legcal.calibration.doctor.diagnose", lambda *_: ())
         found = doctor(session.path, output=folder)
     assert sorted(session.path.rglob("*")) == before
     return found

@@ -16,6 +16,7 @@ from thinned import thinned
 
 from legcal import Dataset, calibrate, load_dataset, load_mechanism, simulate
 from legcal.calibration import mistake_search
+from legcal.calibration.board import usable_board
 from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, _permuted
 from legcal.calibration.mistake_search import diagnose, symmetries
 from legcal.calibration.mistakes import Assumed, Mistake, mistakes
@@ -176,8 +177,13 @@ def _try_only(kinds: Collection[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mistake_search, "mistakes", few)
 
 
+def _likely(d: Dataset) -> tuple[Diagnosis, ...] | None:
+    data = order_dataset(d, in_turn, no_progress)
+    return diagnose(data, usable_board(data))
+
+
 def _diagnosed(d: Dataset) -> Diagnosis:
-    (found,) = diagnose(order_dataset(d, in_turn, no_progress)) or ()
+    (found,) = _likely(d) or ()
     return found
 
 
@@ -275,7 +281,7 @@ def test_where_most_images_agree_nothing_is_to_be_explained(
     folder = tmp_path / "set"
     chosen = SimulationSettings(Level.OUTLINES, board="chessboard", hand_held=True)
     simulate("hexapod", folder, chosen)
-    assert diagnose(order_dataset(load_dataset(folder), in_turn, no_progress)) is None
+    assert _likely(load_dataset(folder)) is None
 
 
 def test_a_board_of_another_size_is_named_without_further_guesses(
@@ -307,7 +313,7 @@ def test_outlines_under_the_names_of_other_legs_in_a_view_are_named(
     outlines: Callable[[str], Dataset], model: str, names: dict[int, int], what: str
 ) -> None:
     d = outlines(model)
-    assert not diagnose(order_dataset(d, in_turn, no_progress))
+    assert not _likely(d)
     renamed = _misnamed(d, names)
     mistake = _diagnosed(renamed)
     assert mistake.what == f"the outlines of {what} in view c2"

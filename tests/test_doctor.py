@@ -111,7 +111,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
         remedy="exchange their headers", mended="with them exchanged",
         images=6, images_before=1, images_after=6,
     )  # fmt: skip
-    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: (mistake,))
+    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda *_: (mistake,))
     session = spoiled(tmp_path / "set", 2, ("c1", "c3"))
     rough = session.entry["views"]["c3"]["T_base_camera"]
     right, rough["xyz"] = rough["xyz"], [2.0, 2.0, 2.0]
@@ -138,7 +138,7 @@ def test_a_mistake_comes_first_and_its_diagnosis_is_in_the_document(
 def test_what_was_tried_in_vain_is_said_only_where_legs_are_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda *_: ())
     session = spoiled(tmp_path / "set", 3, ("c1", "c3"))
     assert NONE_EXPLAINS not in [one.what for one in doctor(session.write()).findings]
     session.change("c1", 0, lambda picture: 0 * picture)
@@ -161,7 +161,7 @@ def test_a_black_photograph_is_no_reason_to_look_for_mistakes(
 def test_a_photograph_in_the_hand_that_is_not_placed_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda data: ())
+    monkeypatch.setattr("legcal.calibration.doctor.diagnose", lambda *_: ())
     camera = small_camera(tmp_path, 480, 360)
     shot = settings(
         level=Level.PHOTOGRAPHS, views=1, poses=5, camera=camera, board="charuco", hand_held=True

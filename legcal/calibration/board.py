@@ -22,7 +22,7 @@ from legcal.data.dataset import CORNERS_NAME, MIN_CORNERS, Dataset
 from legcal.data.measurements import Measurements, few_views
 from legcal.data.outlines import LegAxes
 from legcal.data.reasons import Reason
-from legcal.errors import Cause, DatasetError, NotVisible, by_cause
+from legcal.errors import Cause, DatasetError, LegcalError, NotVisible, by_cause
 from legcal.geometry.motions import components, pose_distance
 from legcal.geometry.types import IntArray
 from legcal.perception.free_poses import require_rough_cameras, require_standing_joints
@@ -253,6 +253,14 @@ def observe_board(data: OrderedDataset) -> BoardViews | None:
     return BoardViews(dataset.boards, corners, T_board_camera, T_camera_board, names, size)
 
 
+def usable_board(data: OrderedDataset) -> BoardViews | None:
+    """Return the boards as seen in images; None also where they cannot be used, told by others."""
+    try:
+        return observe_board(data)
+    except LegcalError:
+        return None
+
+
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:
     """Return a rough T_base_board: as stated, or from the rough T_base_camera of views.
 
@@ -381,8 +389,12 @@ def needs_rough_cameras(data: OrderedDataset) -> bool:
     return not data.machine.is_determined and not by_board
 
 
-def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]:
+def rough_placement(
+    data: OrderedDataset, board: BoardViews | None = None
+) -> tuple[Placement, BoardViews | None]:
     """Return the placement by the nominal model and rough cameras, and the boards in the images.
+
+    Boards are looked for in the images if they have not been before.
 
     Raises NotIdentifiable if images are to be searched whose pose the readings do not determine,
     and a view of them has no rough camera pose or joints at A move; NotVisible if images are to be
@@ -400,7 +412,7 @@ def rough_placement(data: OrderedDataset) -> tuple[Placement, BoardViews | None]
         hints = [view.T_base_camera for view in data.measurements.views]
         require_rough_cameras(data.measurements, data.photographs.detect.tolist(), hints)
     placement = nominal_placement(data.machine, data.measurements, data.T_base_platform)
-    board = observe_board(data)
+    board = board or observe_board(data)
     if board is not None:
         T_base_board = base_of_board(data.dataset, board, placement.T_base_camera)
         if T_base_board is not None:

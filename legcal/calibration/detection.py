@@ -23,7 +23,7 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from legcal.brief import brief
-from legcal.calibration.board import needs_rough_cameras, rough_placement
+from legcal.calibration.board import BoardViews, needs_rough_cameras, rough_placement
 from legcal.calibration.diagnosis import Diagnosis
 from legcal.calibration.documents import (
     DiagnosisBlock,
@@ -237,17 +237,23 @@ def require_images(dataset: Dataset) -> IntArray:
     return rows
 
 
-def detected(data: OrderedDataset, images: IntArray, to_click: Sequence[str] = ()) -> Detection:
+def detected(
+    data: OrderedDataset,
+    images: IntArray,
+    to_click: Sequence[str] = (),
+    board: BoardViews | None = None,
+) -> Detection:
     """Recognise and measure the legs; return the detection in the order of the files.
 
-    Nothing is searched where views have to be clicked first: see :func:`views_to_click`.
+    Nothing is searched where views have to be clicked first: see :func:`views_to_click`. Boards are
+    looked for in the images if they have not been before.
     """
     dataset, order, photographs = data.dataset, data.order, data.photographs
     if to_click:
         scene = nominal_placement(data.machine, data.measurements, data.T_base_platform)
         board, outlines, unplaced = None, no_outlines(), _to_click(data, to_click)
     else:
-        scene, board = rough_placement(data)
+        scene, board = rough_placement(data, board)
         outlines, unplaced = given_outlines(photographs), dict[str, NotPlaced]()
     cylinders = photographs.cylinders
     notes_on_images, notes = list[str](), list[str]()

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from legcal.calibration.board import notes_on_views, observe_board
+from legcal.calibration.board import BoardViews, notes_on_views, observe_board
 from legcal.calibration.detection import (
     CHECKS,
     DETECTION,
@@ -137,10 +137,9 @@ def doctor(
         detection, tried = None, None
         if exposures or (usable and dataset.observations is not None):
             data = order_dataset(dataset_at(dataset, np.array(usable)), pool, report)
-            tried = _diagnose(checklist, data)
-            detection = _searched(checklist, data) if exposures else None
-            if not exposures:
-                _look_at_boards(checklist, data)
+            board = _look_at_boards(checklist, data, tells=not exposures)
+            tried = _diagnose(checklist, data, board)
+            detection = _searched(checklist, data, board) if exposures else None
         views = _conditions(dataset, exposures, detection)
         if detection is not None:
             _look_at_legs(checklist, detection, views, choices)
@@ -345,18 +344,24 @@ def _look_at_cameras(checklist: _Checklist, choices: Choices) -> None:
         checklist.add("camera", "note", message)
 
 
-def _look_at_boards(checklist: _Checklist, data: OrderedDataset) -> None:
-    """Check whether boards place the cameras of given outlines, which nothing else is asked of."""
+def _look_at_boards(
+    checklist: _Checklist, data: OrderedDataset, *, tells: bool
+) -> BoardViews | None:
+    """Return the boards in the images, None without any or if they cannot be used.
+
+    Whether they place the cameras of given outlines is told here, which nothing else is asked of.
+    """
     try:
         board = observe_board(data)
     except (DatasetError, NotVisible) as error:
-        for problem in error.problems:
+        for problem in error.problems if tells else ():
             checklist.add("camera", "error", problem)
-        return
-    if board is not None:
+        return None
+    if board is not None and tells:
         corners, rows = data.order.restore(board.corners), np.arange(data.measurements.n_rows)
         for note in notes_on_views(data.dataset, corners, rows):
             checklist.add("camera", "warning", note)
+    return board
 
 
 def _look_at_parameters(checklist: _Checklist, rows: Sequence[int], choices: Choices) -> None:
@@ -480,8 +485,10 @@ def _look_at_views(checklist: _Checklist, exposures: Mapping[int, Exposure]) -> 
         )
 
 
-def _diagnose(checklist: _Checklist, data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
-    tried = diagnose(data)
+def _diagnose(
+    checklist: _Checklist, data: OrderedDataset, board: BoardViews | None
+) -> tuple[Diagnosis, ...] | None:
+    tried = diagnose(data, board)
     checklist.diagnosis = tried or ()
     checklist.checks["mistakes"] = (
         "one explains the images better"
@@ -508,14 +515,17 @@ def _diagnose(checklist: _Checklist, data: OrderedDataset) -> tuple[Diagnosis, .
     return tried
 
 
-def _searched(checklist: _Checklist, data: OrderedDataset) -> Detection | None:
+def _searched(
+    checklist: _Checklist, data: OrderedDataset, board: BoardViews | None
+) -> Detection | None:
     """Search the images for the legs; None if that fails."""
     m = data.dataset.measurements
     for message in notes_on_moves(m, data.dataset.moves):
         checklist.add("photographs", "note", message)
     rows = np.array([row for row in range(m.n_rows) if m.image[row]], dtype=np.intp)
     try:
-        return detected(data, rows, views_to_click(data) if checklist.refuses else ())
+        to_click = views_to_click(data) if checklist.refuses else ()
+        return detected(data, rows, to_click, board)
     except (DatasetError, NotIdentifiable, NotVisible, DidNotConverge) as error:
         if checklist.refuses:
             raise

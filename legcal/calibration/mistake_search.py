@@ -17,7 +17,7 @@ from itertools import permutations, product
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.board import observe_board
+from legcal.calibration.board import BoardViews, usable_board
 from legcal.calibration.diagnosis import MIN_SHARE, Diagnosis, exchanged_legs
 from legcal.calibration.mistakes import (
     TURNS,
@@ -33,7 +33,6 @@ from legcal.calibration.mistakes import (
     turned_images,
 )
 from legcal.calibration.ordered_dataset import OrderedDataset
-from legcal.errors import LegcalError
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.model import Machine, readings_at, vectors_A_to_B
 from legcal.perception.agreement import (
@@ -82,7 +81,7 @@ _LEAST_GAIN = 0.03  # where an opposite is worse: errors of the model make up fo
 _SURE_SIGMAS = 4.5  # of a gain that may be small: in nearly all of many images
 
 
-def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
+def diagnose(data: OrderedDataset, board: BoardViews | None = None) -> tuple[Diagnosis, ...] | None:
     """Return the likely mistakes of a session, the likeliest first; empty if none is likely.
 
     None where there is nothing to explain, or too little to judge by. Views of one or two images
@@ -93,7 +92,7 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     rows = _rows_seen(data)
     if not (machine.is_determined and len(machine.motors) and len(rows)):
         return None
-    groups = _groups(data, rows)
+    groups = _groups(data, rows, board)
     if not groups:
         return None
     judge = _Judge(data, groups)
@@ -114,11 +113,11 @@ def diagnose(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     finalists, gain = judge.finalists(tried)
     likeliest = judge.likeliest(judge.judged(finalists))
     renamed = () if likeliest else judge.exchanged_legs()
-    if not (likeliest or renamed):
+    most_agree = judge.own.images >= _MOST * len(judge.own.row)
+    if not (likeliest or renamed or most_agree):  # two at once leave few images that agree
         likeliest = judge.of_two(tried, gain)
     data.progress(STAGE, 1, 1)
     if not likeliest:
-        most_agree = judge.own.images >= _MOST * len(judge.own.row)
         return renamed or (None if most_agree else ())
     suited = [judge.hints_suited(one) for _, one in likeliest]
     by_hints = len(suited) > 1 and suited[0] > max(suited[1:])
@@ -132,7 +131,7 @@ def agreement_with_zeros(data: OrderedDataset, zeros: Sequence[Mapping[str, floa
     Of each hypothesis, by motor [m or rad]; all are 0 where there is no image.
     """
     rows = _rows_seen(data)
-    groups = _groups(data, rows, 1) if len(rows) else []
+    groups = _groups(data, rows, usable_board(data), 1) if len(rows) else []
     if not groups:
         return [0.0] * len(zeros)
     judge = _Judge(data, groups)
@@ -157,12 +156,10 @@ def _rows_seen(data: OrderedDataset) -> IntArray:
     return np.array(shown, dtype=np.intp)
 
 
-def _groups(data: OrderedDataset, rows: IntArray, least: int = MIN_IMAGES) -> list[Group]:
+def _groups(
+    data: OrderedDataset, rows: IntArray, board: BoardViews | None, least: int = MIN_IMAGES
+) -> list[Group]:
     """Return groups of views with enough images; views of the board on the base form one."""
-    try:
-        board = observe_board(data)
-    except LegcalError:  # told by others; views judge alone then
-        board = None
     hints = [view.T_base_camera for view in data.measurements.views]
     joined = None if board is None else board.T_board_camera
     groups = group_views(data.measurements, rows, hints, joined)

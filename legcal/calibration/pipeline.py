@@ -26,7 +26,7 @@ from typing import get_args
 
 import numpy as np
 
-from legcal.calibration.board import board_notes, rough_placement
+from legcal.calibration.board import board_notes, rough_placement, usable_board
 from legcal.calibration.diagnosis import NONE_EXPLAINS, Diagnosis, exchanged_legs, notes_beside
 from legcal.calibration.documents import Holdout
 from legcal.calibration.doubts import MAX_LEFT_OUT, used_share
@@ -388,7 +388,7 @@ def _diagnosis(data: OrderedDataset) -> tuple[Diagnosis, ...] | None:
     """Return the likely mistakes; a session that agrees with itself loads none of the search."""
     from legcal.calibration.mistake_search import diagnose
 
-    return diagnose(data)
+    return diagnose(data, usable_board(data))
 
 
 def _with_notes(

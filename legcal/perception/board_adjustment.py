@@ -457,10 +457,12 @@ def _joint_pose(
     candidates = _distinct([pose for poses in of_row.values() for pose in poses], SIMILAR_ANGLE)
     if not candidates:
         raise DatasetError(_another_board(name, board, "no pose of", "showing them there"))
-    everything = board.points[corners.corner], corners.px, corners.sigma_px
-    refined = [_refine(camera, *everything, start.T_camera_board[0]) for start in candidates]
-    joint = sorted((pose for pose in refined if pose is not None), key=lambda pose: pose.cost)
-    joint = _distinct(joint, SIMILAR_ANGLE)
+    joint = candidates
+    if len(np.unique(corners.row)) > 1:  # one image alone has these already
+        everything = board.points[corners.corner], corners.px, corners.sigma_px
+        refined = [_refine(camera, *everything, start.T_camera_board[0]) for start in candidates]
+        joint = sorted((pose for pose in refined if pose is not None), key=lambda pose: pose.cost)
+        joint = _distinct(joint, SIMILAR_ANGLE)
     if not joint:
         raise DatasetError(
             _another_board(name, board, "no one pose of", "one that all its images show")
