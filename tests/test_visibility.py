@@ -1,6 +1,6 @@
 """What cameras see of legs, and where solids of all kinds and borders hide them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -14,6 +14,7 @@ import legcal
 from legcal.data.outlines import Outlines
 from legcal.geometry.motions import components, look_at
 from legcal.machine.configurations import Configurations, random_configurations
+from legcal.machine.kinematics import platform_in_base, platforms_in_base
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
 from legcal.machine.shapes import PlacedOccluders
@@ -152,13 +153,10 @@ def test_an_image_of_several_poses_shows_what_it_shows_alone(
 ) -> None:
     """Also where solids of legs hide others: they stand elsewhere in each image."""
     machine, camera, T = with_solids("hexapod"), sample_camera(), look_at(FAR, MIDDLE)
-    motions = [
-        machine.T_base_Rb.inv() * pose * machine.T_platform_Re
-        for pose in random_configurations(machine, 6, 0).poses
-    ]
+    motions = platforms_in_base(machine, random_configurations(machine, 6, 0).poses)
     occluders, every = machine.occluders, np.ones((1, machine.n_legs), dtype=np.bool_)
 
-    def seen(some: list[RigidTransform]) -> tuple[Seen, Outlines]:
+    def seen(some: Sequence[RigidTransform]) -> tuple[Seen, Outlines]:
         R, t = components(some)
         base = machine.T_base_Rb
         bodies = Bodies.at(machine.legs, R, t, machine.size, T_base_Rb=base, occluders=occluders)
@@ -170,7 +168,7 @@ def test_an_image_of_several_poses_shows_what_it_shows_alone(
     for k, motion in enumerate(motions):
         alone, edges_alone = seen([motion])
         together = parts.only(k)
-        order, order_alone = (np.lexsort((x.part, x.leg)) for x in (together, alone))
+        order, order_alone = (np.lexsort((np.array(x.part), x.leg)) for x in (together, alone))
         np.testing.assert_array_equal(together.leg[order], alone.leg[order_alone])
         np.testing.assert_allclose(together.ends[order], alone.ends[order_alone], atol=1e-6)
         here = edges.choose(edges.row == k)
@@ -183,8 +181,8 @@ def test_joints_on_the_base_span_a_plate_and_those_on_arms_and_carriages_do_not(
     name: str, n_seen: int
 ) -> None:
     machine = legcal.load_mechanism(name)
-    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
-    bodies = Bodies.at(machine.legs, *components([home]), machine.size, T_base_Rb=machine.T_base_Rb)
+    R, t = components([platform_in_base(machine, machine.home)])
+    bodies = Bodies.at(machine.legs, R, t, machine.size, T_base_Rb=machine.T_base_Rb)
     base, platform = (X[0, : machine.n_legs].mean(axis=0) for X in (bodies.A, bodies.B))
     behind = base + 4.0 * machine.size * (base - platform) / np.linalg.norm(base - platform)
     aside = np.array([0.0, 1e-3, 0.0])
