@@ -37,8 +37,6 @@ from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (
     PosePairs,
     frames_after,
-    jacobian,
-    residuals,
     search,
     tool_motions,
 )
@@ -381,16 +379,6 @@ UNKNOWN = (np.array([1e-3, 1e-2]), (False, False))
 
 def fitted(pairs: PosePairs, noise: tuple[Array, tuple[bool, bool]] = STATED) -> FrameFit:
     return fit(pairs, search(pairs, 3).frames[0], PoseNoise(*noise))
-
-
-def test_residuals_are_the_step_that_was_made_and_zero_where_nothing_was_measured() -> None:
-    pairs, frames = pairs_at(BASE, TOOL), frames_of(BASE, TOOL)
-    step = 1e-4 * np.random.default_rng(9).normal(size=12)
-    oriented = np.arange(len(pairs)) < 3
-    some = replace(pairs, oriented=oriented)
-    r = residuals(frames_after(frames, -step), some)
-    np.testing.assert_allclose(r, jacobian(frames, some) @ step, atol=1e-7)
-    assert np.all((r[:, 3:] != 0.0).any(axis=1) == oriented)
 
 
 def test_the_nearest_rotation_is_never_a_mirror() -> None:
