@@ -309,7 +309,7 @@ def test_outlines_where_no_board_was_seen_are_noted(tmp_path: Path) -> None:
     (note,) = [note for note in found.notes if "no board" in note]
     (share,) = re.findall(r"^Up to (\d\d) % of the outlines of views? c1", note)
     o, m = found.solution.outlines, found.dataset.measurements
-    is_beyond = np.linspace(*o.ends[..., 0].T, 100) > 0.5 * m.views[0].camera.width
+    is_beyond = np.linspace(o.ends[:, 0, 0], o.ends[:, 1, 0], 100) > 0.5 * m.views[0].camera.width
     of_views = [is_beyond[:, o.used & (m.view[o.row] == v)].mean() for v in (0, 1)]
     assert float(share) == pytest.approx(100.0 * max(of_views), abs=1.5)
     assert np.ptp(of_views) > 0.1
