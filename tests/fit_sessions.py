@@ -341,6 +341,7 @@ def irregular_hexapod(
 # A calibration board on the base of a machine
 
 BOARD = Board("chessboard", 7, 6, 0.025)
+ON_BASE = FixedBoard(BOARD, "base")
 SIGMA_PX = 0.05
 BOARD_SCALE = "board.scale"
 
@@ -354,26 +355,37 @@ def place_of_board(session: MachineSession) -> RigidTransform:
     return RigidTransform.from_components(middle, turn)
 
 
-def corners_of(session: MachineSession, *, seed: int | None = None) -> Corners:
+def _corners(
+    session: MachineSession,
+    fixed: FixedBoard,
+    places: Sequence[RigidTransform],  # T_Rb_board of each image
+    seed: Sequence[int] | None,
+) -> Corners:
     """Return the corners in every image, exact or with the errors that they claim."""
-    T_Rb_board = place_of_board(session)
-    seen, views = [], session.measurements.view
-    for row, v in enumerate(views.tolist()):
-        camera = session.measurements.views[v].camera
-        in_camera = (session.truth.T_camera_Rb[v] * T_Rb_board).apply(BOARD.points)
-        seen.append((np.full(len(in_camera), row), camera.project(in_camera)))
-    of_row = np.concatenate([r for r, _ in seen])
-    px: Array = np.concatenate([p for _, p in seen])
+    m, points = session.measurements, fixed.board.points
+    px: Array = np.concatenate(
+        [
+            m.views[v].camera.project((session.truth.T_camera_Rb[v] * T).apply(points))
+            for v, T in zip(m.view.tolist(), places, strict=True)
+        ]
+    )
     if seed is not None:
         px = px + SIGMA_PX * np.random.default_rng(seed).standard_normal(px.shape)
-    corner = np.tile(np.arange(BOARD.n_corners), len(views))
-    return found_corners(of_row, corner, px, np.full(len(px), SIGMA_PX))
+    row = np.repeat(np.arange(m.n_rows), len(points))
+    corner = np.tile(fixed.first + np.arange(len(points)), m.n_rows)
+    return found_corners(row, corner, px, np.full(len(px), SIGMA_PX))
+
+
+def corners_of(session: MachineSession, *, seed: int | None = None) -> Corners:
+    """Return the corners of the board on the base."""
+    places = [place_of_board(session)] * session.measurements.n_rows
+    return _corners(session, ON_BASE, places, None if seed is None else [seed])
 
 
 def with_board(session: MachineSession, corners: Corners) -> tuple[BoardCorners, Start]:
     """Return what is seen of the board, and the wrong start with a board that is wrong as well."""
     start = replace(session.start, T_Rb_board=place_of_board(session) * _WRONG)
-    return BoardCorners((FixedBoard(BOARD, "base"),), corners), start
+    return BoardCorners((ON_BASE,), corners), start
 
 
 # A calibration board on the platform, beside the one on the base or alone
@@ -387,28 +399,15 @@ def with_boards(
     session: MachineSession, *, seed: int | None = None, base: bool = True
 ) -> tuple[BoardCorners, Start]:
     """Return what is seen of a board on the platform and one on the base, and the wrong start."""
-    first = BOARD.n_corners if base else 0
-    fixed = FixedBoard(ON_PLATFORM, "platform", None, first)
-    m, truth = session.measurements, session.truth
-    places = [truth.T_Rb_Re[p] * T_RE_BOARD for p in m.pose.tolist()]
-    px: Array = np.concatenate(
-        [
-            m.views[v].camera.project((truth.T_camera_Rb[v] * T).apply(ON_PLATFORM.points))
-            for v, T in zip(m.view.tolist(), places, strict=True)
-        ]
-    )
-    if seed is not None:
-        px = px + SIGMA_PX * np.random.default_rng([seed, 1]).standard_normal(px.shape)
-    n = ON_PLATFORM.n_corners
-    row, corner = np.repeat(np.arange(m.n_rows), n), np.tile(first + np.arange(n), m.n_rows)
-    corners = found_corners(row, corner, px, np.full(len(px), SIGMA_PX))
-    start = replace(session.start, T_Re_board=T_RE_BOARD * _WRONG)
+    fixed = FixedBoard(ON_PLATFORM, "platform", None, BOARD.n_corners if base else 0)
+    places = [session.truth.T_Rb_Re[p] * T_RE_BOARD for p in session.measurements.pose.tolist()]
+    corners = _corners(session, fixed, places, None if seed is None else [seed, 1])
     if not base:
+        start = replace(session.start, T_Re_board=T_RE_BOARD * _WRONG)
         return BoardCorners((fixed,), corners), start
-    start = replace(start, T_Rb_board=place_of_board(session) * _WRONG)
-    on_base = corners_of(session, seed=seed)
-    boards = FixedBoard(BOARD, "base"), fixed
-    return BoardCorners(boards, Corners.joined([on_base, corners])), start
+    seen, start = with_board(session, corners_of(session, seed=seed))
+    both = BoardCorners((ON_BASE, fixed), Corners.joined([seen.corners, corners]))
+    return both, replace(start, T_Re_board=T_RE_BOARD * _WRONG)
 
 
 # The same pixels otherwise, and edges of bodies

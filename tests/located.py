@@ -47,14 +47,15 @@ class Located:
 
 
 def located(
-    name: str,
+    model: str | Machine,
     n: int = 20,
     *,
     noise: float = 1.0,
     platform: Sequence[RigidTransform] | None = None,
 ) -> Located:
     """Return a machine at BASE with a tool at TOOL, measured at poses of the workspace or these."""
-    machine, chance = shipped(name), np.random.default_rng(1)
+    machine = shipped(model) if isinstance(model, str) else model
+    chance = np.random.default_rng(1)
     if platform is None:
         drawn = random_configurations(machine, n, 1)
         q, platform = drawn.readings, drawn.poses

@@ -203,8 +203,10 @@ def test_single_corners_and_images_that_disagree_are_left_out() -> None:
 
 
 TRUTH = CAMERAS["plumb_bob"]
-ZOOMED = replace(
-    TRUTH, K=np.diag([1.04, 1.04, 1.0]) @ TRUTH.K + [[0, 0, -12.5], [0, 0, -9.8], [0] * 3]
+CENTRE = np.array([[0.0, 0.0, 312.4], [0.0, 0.0, 244.9], [0.0, 0.0, 0.0]])
+ZOOMED, FAR_ZOOMED = (
+    replace(TRUTH, K=np.diag([1.0 + by, 1.0 + by, 1.0]) @ TRUTH.K - by * CENTRE)
+    for by in (0.04, 0.5)
 )
 
 
@@ -253,6 +255,8 @@ def test_two_groups_of_one_size_are_refused_and_named() -> None:
         refuse_divided(found, [f"{k}.jpg" for k in range(10)])
     for word in ("two groups", "0.jpg, 1.jpg", "5.jpg, 6.jpg", "focal length about"):
         assert word in str(refused.value)
+    uneven = fitted(together(five(FAR_ZOOMED), seen_corners(TRUTH, 6, 2, sheet=SHEET)))
+    assert set(uneven.left_out) == set(range(5))  # though the first fit follows the fewer
     few = replace(found, rival=(), images=found.images[:5], left_out=dict.fromkeys(range(7), "?"))
     with pytest.raises(NotIdentifiable, match="only 5 of 12 images agree"):
         refuse_divided(few, [f"{k}.jpg" for k in range(12)])

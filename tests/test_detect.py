@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal import detect, doctor
 from legcal.calibration.detection import Detection, Examination
-from legcal.data.outlines import Outlines, found_outlines
+from legcal.data.outlines import Outlines, found_outlines, join_outlines
 from legcal.data.reasons import USED, Reason, Rejection
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
@@ -288,3 +288,6 @@ def test_curves_are_the_outlines_and_the_axis_of_the_leg_through_the_lens(model:
     weak = Rejection(Reason.CONTRAST, "2.1")
     one = replace(found, used=np.array([True, False]), reason=(USED, weak))
     assert list(curves(cam, one)) == ["edge 1", "rejected"]
+    both = join_outlines([found, replace(found, part=("leg1_tube",) * 2)])
+    parts = marks_of_image(cam, both, predicted(cam), ("leg1",))
+    assert [part.name for part in parts] == ["leg1 rod", "leg1 tube"]

@@ -252,16 +252,3 @@ def test_the_slope_is_that_of_the_likelihood() -> None:
     ]
     np.testing.assert_allclose(effects.slope(at)[0], numeric, rtol=1e-6)
     assert effects.log_likelihood(np.zeros(2)) == 0.0
-
-
-def test_the_likelihood_is_that_of_the_scores() -> None:
-    effects = random_effects(np.random.default_rng(3), (1.0, 0.7))
-    variances = np.array([1.2, 0.3])
-    D = np.diag(variances[effects.kind])
-
-    def gaussian(covariance: Array) -> float:
-        value = effects.z @ np.linalg.solve(covariance, effects.z)
-        return float(-0.5 * (value + np.linalg.slogdet(covariance)[1]))
-
-    expected = gaussian(effects.K + effects.K @ D @ effects.K) - gaussian(effects.K)
-    assert effects.log_likelihood(variances) == pytest.approx(expected, rel=1e-9)

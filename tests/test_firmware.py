@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from command_line import run
 from edits import keyed
+from layouts import Layout, LegLayout, write_machine
 from lxml import etree
+from machines import MACHINES
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import (
@@ -22,7 +24,7 @@ from legcal import (
     load_mechanism,
     simulate,
 )
-from legcal.descriptions.controllers import firmware_table, read_delta
+from legcal.descriptions.controllers import firmware_table, ini_entries, read_delta
 from legcal.descriptions.new_model import Dimensions, create_model, description_of
 from legcal.descriptions.table import described_machine
 from legcal.geometry.types import Array
@@ -370,13 +372,22 @@ def test_a_linuxcnc_hexapod_in_inches_comes_back_from_its_hal_file(tmp_path: Pat
         machine.home.rotation.as_euler("xyz", degrees=True), [1.0, -2.0, 3.0], atol=1e-9
     )
     np.testing.assert_allclose([leg.length_at(leg.travel[1]) for leg in machine.legs], 0.0254 * 30)
-    path = tmp_path / "again.txt"
-    export(machine.yaml_path, "linuxcnc", path)
-    assert not re.search(r"setp .*\.\d{10}", path.read_text())  # people read them
-    again = machine_of(path.read_text(), tmp_path, "again.txt")
-    for one, two in zip(machine.legs, again.legs, strict=True):
-        np.testing.assert_allclose([*one.A, *one.B, one.q0], [*two.A, *two.B, two.q0], atol=1e-9)
-        np.testing.assert_allclose(one.travel, two.travel, atol=1e-9)
+    backwards = write_machine(tmp_path, MACHINES["6-UPS"](), Layout((LegLayout(flip_slider=True),)))
+    for hexapod in (machine, load_mechanism(backwards)):
+        path = tmp_path / "again.txt"
+        export(hexapod.yaml_path, "linuxcnc", path, force=True)
+        text = path.read_text()
+        assert not re.search(r"setp .*\.\d{10}", text)  # people read them
+        again, ini = machine_of(text, tmp_path, "again.txt"), ini_entries(text)
+        np.testing.assert_allclose(again.home.as_matrix(), hexapod.home.as_matrix(), atol=1e-9)
+        for j, (one, two) in enumerate(zip(hexapod.legs, again.legs, strict=True)):
+            np.testing.assert_allclose(
+                [*one.A, *one.B, one.q0], [*two.A, *two.B, two.q0], atol=1e-9
+            )
+            ends = sorted(map(one.length_at, one.travel))
+            np.testing.assert_allclose(ends, [two.length_at(q) for q in two.travel])
+            at_home = np.linalg.norm(one.A - hexapod.home.apply(one.B))
+            assert float(ini[f"JOINT_{j}.HOME"]) == pytest.approx(1e3 * at_home)
 
 
 def test_a_rig_of_flypt_is_written_as_it_was_read(tmp_path: Path) -> None:

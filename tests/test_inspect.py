@@ -33,6 +33,7 @@ def test_counts_of_the_paper_follow_from_legs_and_motors() -> None:
     expected = {  # n, n_d, r, n_ac, idle spins
         "hexapod": (6, 3, 0, 6, 0),
         "hexapod-strut": (7, 3, 0, 6, 1),
+        "6-sps": (6, 3, 0, 6, 6),
         "3-rpr": (3, 2, 3, 3, 0),
     }
     for name, counts in expected.items():

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from command_line import run
 from csv_rows import write_rows
+from hexapod_example import Run
 from located import (
     BASE,
     SIGMA_ANGLE,
@@ -27,15 +28,14 @@ from located import (
     write_poses,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
+from test_platform_error import changed
 from thinned import thinned
 
-from legcal import Location, ToolPoses, locate
+from legcal import Location, ToolPoses, load_mechanism, load_result, locate
 from legcal.calibration.location.fit import FrameFit, fit
 from legcal.calibration.location.frames import (
     PosePairs,
     frames_after,
-    jacobian,
-    residuals,
     search,
     tool_motions,
 )
@@ -49,6 +49,9 @@ from legcal.errors import (
 )
 from legcal.geometry.motions import nearest_rotation, rotation_matrices
 from legcal.geometry.types import Array
+from legcal.machine.model import platform_pose
+from legcal.machine.model_writer import write_model
+from legcal.machine.parameters import parametrization_of
 
 KNOWN: dict[str, Any] = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
 
@@ -160,6 +163,30 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
     assert right.p_value is not None
     assert right.p_value > 1e-3
     assert right.dof == 36
+
+
+def test_errors_of_a_calibrated_model_are_in_the_covariance(
+    example_run: Run, tmp_path: Path
+) -> None:
+    """A machine that differs from its calibrated model as the result states."""
+    calibrated, result = example_run.output / "calibrated.yaml", load_result(example_run.output)
+    model = load_mechanism(calibrated)
+    parameters = parametrization_of(model, twists=True)
+    drawn = np.random.default_rng(2).multivariate_normal(
+        np.zeros(len(result.names)), result.covariance
+    )
+    by_name = dict(zip(result.names, drawn.tolist(), strict=True))
+    step = np.array([by_name.get(name, 0.0) for name in parameters.names])
+    poses = located(changed(model, parameters, step, tmp_path / "true"), noise=0.05).poses
+    alone = write_model(model, tmp_path / "alone")[0]  # without the result beside it
+    stated = {name: 0.05 * sigma for name, sigma in KNOWN.items()}
+    squares = []
+    for path in (calibrated, alone):
+        found = locate(load_mechanism(path), poses, **stated)
+        error = frames_error(found)
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+    assert 3.0 < squares[0] < 33.0  # chi2 of 12
+    assert squares[1] > 1e3
 
 
 def _hexapod(n: int, change: Callable[[ToolPoses], dict[str, Any]]) -> Located:
@@ -307,16 +334,6 @@ UNKNOWN = (np.array([1e-3, 1e-2]), (False, False))
 
 def fitted(pairs: PosePairs, noise: tuple[Array, tuple[bool, bool]] = STATED) -> FrameFit:
     return fit(pairs, search(pairs, 3).frames[0], PoseNoise(*noise))
-
-
-def test_residuals_are_the_step_that_was_made_and_zero_where_nothing_was_measured() -> None:
-    pairs, frames = pairs_at(BASE, TOOL), frames_of(BASE, TOOL)
-    step = 1e-4 * np.random.default_rng(9).normal(size=12)
-    oriented = np.arange(len(pairs)) < 3
-    some = replace(pairs, oriented=oriented)
-    r = residuals(frames_after(frames, -step), some)
-    np.testing.assert_allclose(r, jacobian(frames, some) @ step, atol=1e-7)
-    assert np.all((r[:, 3:] != 0.0).any(axis=1) == oriented)
 
 
 def test_the_nearest_rotation_is_never_a_mirror() -> None:

@@ -263,7 +263,7 @@ REFUSALS: dict[str, tuple[Callable[[Motion, Path], tuple[object, ...]], str]] = 
     "no offset": (lambda m, t: (_video(m, t), "--readings", _ticks(m, t), "--offset", "nan"),
                   "correct --offset"),
     "a row without a time": (lambda m, t: (_video(m, t), "--readings", _holed(m, t)),
-                             "found '',"),
+                             "column Uhrzeit [s]: the time could not be read: found '',"),
 }  # fmt: skip
 
 
@@ -285,6 +285,7 @@ def _timeless(motion: Motion, folder: Path) -> Path:
 def _holed(motion: Motion, folder: Path) -> Path:
     path = _ticks(motion, folder)
     first, second, *others = path.read_text().splitlines()
+    first = first.replace("time", "Uhrzeit [s]")
     path.write_text("\n".join([first, second[second.index(",") :], *others]))
     return path
 

@@ -1,6 +1,6 @@
 """What cameras see of legs, and where solids of all kinds and borders hide them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -8,20 +8,27 @@ import numpy as np
 import pytest
 import trimesh
 from machines import copied_model
+from scipy.spatial.transform import RigidTransform
 
 import legcal
-from legcal.geometry.motions import look_at
+from legcal.data.outlines import Outlines
+from legcal.geometry.motions import components, look_at
 from legcal.machine.configurations import Configurations, random_configurations
+from legcal.machine.kinematics import platform_in_base, platforms_in_base
 from legcal.machine.leg import Cylinder
 from legcal.machine.model import Machine
 from legcal.machine.shapes import PlacedOccluders
+from legcal.perception.body_edges import predicted_edges
 from legcal.simulation.observe import legs_in_image, shares
 from legcal.simulation.solids import pose_machine, solids_of
 from legcal.vision.camera import Camera, sample_camera
 from legcal.vision.distortion import DistortionModel
 from legcal.vision.visibility import (
+    Bodies,
+    Seen,
     in_picture,
     pixels_inside,
+    visible_parts,
     visible_segments,
 )
 
@@ -139,6 +146,48 @@ def test_hidden_is_what_rays_at_the_model_do_not_reach(
         n_hidden += int(np.count_nonzero(by_rays))
     assert n_hidden > 50
     assert max(share) < 0.003  # polygons stand for circles, one around and one within
+
+
+def test_an_image_of_several_poses_shows_what_it_shows_alone(
+    with_solids: Callable[[str], Machine],
+) -> None:
+    """Also where solids of legs hide others: they stand elsewhere in each image."""
+    machine, camera, T = with_solids("hexapod"), sample_camera(), look_at(FAR, MIDDLE)
+    motions = platforms_in_base(machine, random_configurations(machine, 6, 0).poses)
+    occluders, every = machine.occluders, np.ones((1, machine.n_legs), dtype=np.bool_)
+
+    def seen(some: Sequence[RigidTransform]) -> tuple[Seen, Outlines]:
+        R, t = components(some)
+        base = machine.T_base_Rb
+        bodies = Bodies.at(machine.legs, R, t, machine.size, T_base_Rb=base, occluders=occluders)
+        view, ends = np.zeros(len(some), dtype=np.intp), (bodies.A, bodies.B)
+        edges = predicted_edges(occluders, [(camera, T)], view, ends, every)
+        return visible_parts(camera, T, bodies), edges
+
+    parts, edges = seen(motions)
+    for k, motion in enumerate(motions):
+        alone, edges_alone = seen([motion])
+        together = parts.only(k)
+        order, order_alone = (np.lexsort((np.array(x.part), x.leg)) for x in (together, alone))
+        np.testing.assert_array_equal(together.leg[order], alone.leg[order_alone])
+        np.testing.assert_allclose(together.ends[order], alone.ends[order_alone], atol=1e-6)
+        here = edges.choose(edges.row == k)
+        np.testing.assert_array_equal(here.leg, edges_alone.leg)
+        np.testing.assert_allclose(here.ends, edges_alone.ends, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "n_seen"), [("hexapod", 0), ("delta", 6), ("3-prs", 3)])
+def test_joints_on_the_base_span_a_plate_and_those_on_arms_and_carriages_do_not(
+    name: str, n_seen: int
+) -> None:
+    machine = legcal.load_mechanism(name)
+    R, t = components([platform_in_base(machine, machine.home)])
+    bodies = Bodies.at(machine.legs, R, t, machine.size, T_base_Rb=machine.T_base_Rb)
+    base, platform = (X[0, : machine.n_legs].mean(axis=0) for X in (bodies.A, bodies.B))
+    behind = base + 4.0 * machine.size * (base - platform) / np.linalg.norm(base - platform)
+    aside = np.array([0.0, 1e-3, 0.0])
+    seen = visible_parts(sample_camera(), look_at(behind, base + aside), bodies)
+    assert np.count_nonzero(seen.visible_legs(1, machine.n_legs)) == n_seen
 
 
 @pytest.mark.parametrize("name", ["leg1", "leg6"])  # a box, and a mesh that is hollow

@@ -619,8 +619,7 @@ class UrdfPatch:
             if element.get("name") == link
             for visual in element.findall("visual")
             for geometry in visual.findall("geometry")
-            for shape in list(geometry.iterchildren(etree.Element))[:1]
-            if shape.tag == "cylinder"
+            for shape in geometry.findall("cylinder")
         ]
 
     def add_frame(self, parent: str, child: str, link: str, joint: str, T: RigidTransform) -> None:

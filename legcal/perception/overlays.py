@@ -6,6 +6,7 @@ that both are legible when the picture fills a screen.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -94,19 +95,17 @@ def marks_of_image(
     of_bodies = outlines.choose(are_of_bodies(outlines))
     outlines = outlines.choose(~are_of_bodies(outlines))
     of_part = {(leg.leg, segment.link): leg for leg in predicted for segment in leg.segments}
-    several = {leg.leg for leg in predicted if len(leg.segments) > 1}
     pairs: dict[tuple[int, str], list[int]] = {}
     for i, key in enumerate(zip(outlines.leg.tolist(), outlines.part, strict=True)):
         pairs.setdefault(key, []).append(i)
-    several |= {leg for leg, _ in pairs if len([None for j, _ in pairs if j == leg]) > 1}
-    found = []
+    n_parts, found = Counter(leg for leg, _ in pairs), []
     for (leg, part), rows in pairs.items():
         pair = outlines.choose(np.array(rows, dtype=np.intp))
         marks = _part_marks(camera, pair, part, of_part.get((leg, part)))
         if not marks:
             continue
         name = leg_names[leg]
-        if leg in several:
+        if n_parts[leg] > 1:
             name += " " + part.removeprefix(name).lstrip("_- ")
         if "edited" in pair.source:
             name += " (edited)"
