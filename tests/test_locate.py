@@ -49,7 +49,6 @@ from legcal.errors import (
 )
 from legcal.geometry.motions import nearest_rotation, rotation_matrices
 from legcal.geometry.types import Array
-from legcal.machine.model import platform_pose
 from legcal.machine.model_writer import write_model
 from legcal.machine.parameters import parametrization_of
 
