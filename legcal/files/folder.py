@@ -175,17 +175,17 @@ def check_destination(
     check_path(destination, kind)
     is_earlier = kind.is_in(destination)
     is_new = not destination.is_dir() or not holds_files(destination)
-    stated = kind.dataset_of(destination) if is_earlier else ""
-    if stated and dataset is not None and stated != seen_from(destination, dataset):
-        raise UsageError(
-            f"{destination}: the {kind.noun} could not be written: found the {kind.noun} of "
-            f"another dataset ({os.path.normpath(destination / stated)}), needed a new or empty "
-            f"folder or a {kind.noun} of {dataset}; give another folder, or remove that one."
-        )
-    if is_new or (replaces and (is_earlier or not kind.marker)):
+    other = ""
+    if is_earlier and dataset is not None:
+        stated = kind.dataset_of(destination)
+        other = stated if stated != seen_from(destination, dataset) else ""
+    if is_new or (replaces and not other and (is_earlier or not kind.marker)):
         return
     found, needed, remedy = "a folder with files", "a new or empty folder", "give another folder"
-    if is_earlier:
+    if other:
+        found = f"the {kind.noun} of another dataset ({os.path.normpath(destination / other)})"
+        needed, remedy = f"{needed} or a {kind.noun} of {dataset}", f"{remedy}, or remove that one"
+    elif is_earlier:
         found, remedy = f"an earlier {kind.noun}", f"{remedy}, or remove that one"
     elif replaces:
         found = "a folder with other files and"
