@@ -3,7 +3,6 @@
 What commands write for small sessions of all classes is compared in test_recorded_sessions.py.
 """
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.calibration.result_folder import write_result
 from legcal.calibration.summary import sentences
 from legcal.calibration.verdict import judge
-from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
+from legcal.errors import DatasetError, LegcalError, NotVisible
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.dataset import SimulatedDataset
@@ -284,23 +283,6 @@ def test_a_second_run_searches_no_image(example_run: Run, monkeypatch: pytest.Mo
     with pytest.raises(KeyboardInterrupt):
         calibrate(example_run.folder, progress=lambda stage, done, total: stages.append(stage))
     assert stages == []
-
-
-def test_a_result_is_replaced_by_one_of_the_same_dataset_alone(
-    planar: tuple[Path, Calibration], tmp_path: Path
-) -> None:
-    place = tmp_path / "moved"
-    for name in ("set", "result"):
-        shutil.copytree(planar[0].parent / name, place / name)
-    shutil.copytree(place / "set", tmp_path / "other")
-    before = (place / "result" / "result.json").read_bytes()
-    with pytest.raises(UsageError, match=r"of another dataset \(.*moved/set\).* remove that"):
-        calibrate(tmp_path / "other", output=place / "result")
-    assert (place / "result" / "result.json").read_bytes() == before
-    again = calibrate(place / "set", output=place / "result", leave_out="c1")
-    written = json.loads((place / "result" / "result.json").read_bytes())
-    assert written["dataset_folder"] == "../set"
-    assert set(written["views"]) == set(again.result.views) == {"c2", "c3"}
 
 
 def test_good_photographs_give_no_notes(example_run: Run) -> None:

@@ -58,14 +58,7 @@ from legcal.data.outlines import (
 )
 from legcal.data.reasons import Reason, Rejection, reason_in_words
 from legcal.errors import Cause, DatasetError, OutOfResources, UsageError, printable
-from legcal.files.folder import (
-    DATASET_KEY,
-    OutputKind,
-    check_destination,
-    path_problem,
-    result_folder,
-    seen_from,
-)
+from legcal.files.folder import OutputKind, check_destination, path_problem, result_folder
 from legcal.files.quantity import SHOWN_IN
 from legcal.files.schema import MAX_IMAGE, Document, read_bytes, read_json
 from legcal.geometry.lines import cross
@@ -537,11 +530,11 @@ _TOO_MANY = (
 
 
 def check_detection_destination(destination: Path, dataset: Path | None) -> None:
-    """Refuse an output folder of another kind, of another dataset, or with an edited table.
+    """Refuse an output folder of another kind, or with an edited table.
 
     An edited table may be replaced if a copy is in the dataset folder. Raises UsageError.
     """
-    check_destination(destination, DETECTION, dataset=dataset)
+    check_destination(destination, DETECTION)
     table = destination / OBSERVATIONS_NAME
     written = _earlier(destination).get("table")
     with suppress(OSError):
@@ -570,9 +563,7 @@ def write_detection(
     dataset = detection.dataset
     check_detection_destination(destination, dataset.folder)
     earlier = _own_files(destination)
-    with result_folder(
-        destination, DETECTION, earlier, replaceable=earlier, dataset=dataset.folder
-    ) as folder:
+    with result_folder(destination, DETECTION, earlier, replaceable=earlier) as folder:
         table = folder / OBSERVATIONS_NAME
         names = dataset.machine.leg_names
         write_observations(table, detection.outlines, dataset.measurements, names)
@@ -586,7 +577,6 @@ def write_detection(
         record = {
             "legcal_detection": 1,
             **examination.document(),
-            DATASET_KEY: seen_from(destination, dataset.folder),
             "table": hashlib.sha256(read_bytes(table, MAX_IMAGE)).hexdigest(),
             "files": [*files, DETECTION.marker],
         }

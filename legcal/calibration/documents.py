@@ -471,7 +471,6 @@ class Result(Legs, Heading, SparseDocument):
     only: Literal["zeros", "lengths", "all"] | None = None  # the group, where one was asked for
     zeros: list[MotorZero] | None = None  # of the motors, likewise
     overlays: list[Overlay] | None = None  # left out where none were asked for
-    dataset_folder: str | None = None  # relative to the result folder; in the file alone
     next: list[NextStep] | None = None  # what to do next, in ``calibrate --json`` alone
 
     def nominal_actuator(self, calibrated: Actuator | None) -> Actuator | None:

@@ -179,8 +179,8 @@ def calibrate(
     DidNotConverge
         If no solver reached its tolerance. Nothing is written in any of these cases.
     UsageError
-        If ``output`` holds something else or the result of another dataset, or ``priors``,
-        ``fixed`` and ``free`` name what is no parameter or contradict each other.
+        If ``output`` holds something else, or ``priors``, ``fixed`` and ``free`` name what is no
+        parameter or contradict each other.
     """
     # 1. Load and identify.
     if criteria not in (*get_args(Criteria), None):
@@ -189,8 +189,6 @@ def calibrate(
         check_destination(output_path(output))
     overrides = overrides_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    if output is not None:
-        check_destination(Path(output), dataset=dataset.folder)
     if overlays:
         check_overlays(dataset, None if output is None else Path(output))
     choices = chosen_parameters(dataset, overrides, only)

@@ -38,14 +38,7 @@ from legcal.errors import (
     OutOfResources,
     UsageError,
 )
-from legcal.files.folder import (
-    DATASET_KEY,
-    RESULT,
-    in_the_way,
-    path_problem,
-    result_folder,
-    seen_from,
-)
+from legcal.files.folder import RESULT, in_the_way, path_problem, result_folder
 from legcal.files.schema import read_json
 from legcal.geometry.types import Array
 from legcal.machine.files import RESULT_YAML
@@ -92,15 +85,15 @@ def write_result(
     this test, and overlays if they cannot be drawn. *beside* may write further files into the
     folder.
 
-    Raises UsageError if the destination is not an earlier result of this dataset; DidNotConverge
-    if the written model does not load with the computed parameters.
+    Raises UsageError if the destination is not an earlier result; DidNotConverge if the written
+    model does not load with the computed parameters.
     """
     dataset, solution, steps = calibration.dataset, calibration.solution, calibration.steps
     machine = dataset.machine
     stale = [OBSERVATIONS_NAME, CORNERS_NAME, STAGED_NAME, str(urdf_of(Path(STAGED_NAME)))]
     stale += [REPORT_NAME] * PAGE.is_at(destination / REPORT_NAME)
     old = [*map(Path, stale), *earlier_overlays(destination)]
-    with result_folder(destination, stale=old, dataset=dataset.folder) as folder:
+    with result_folder(destination, stale=old) as folder:
         write_calibrated(machine, calibration.legs, folder / RESULT_YAML)
         if steps.legs is not None:
             try:
@@ -131,8 +124,7 @@ def write_result(
                 notes = (*calibration.notes, note)
                 calibration = replace(calibration, notes=notes, overlays={})
                 shutil.rmtree(folder / OVERLAYS, ignore_errors=True)
-        origin = {DATASET_KEY: seen_from(destination, dataset.folder)}
-        document = json.dumps(calibration.result.document() | origin, indent=1, allow_nan=False)
+        document = json.dumps(calibration.result.document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
         table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
         outlines = with_body_edges(solution.outlines, solution.edges)

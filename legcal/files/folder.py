@@ -20,7 +20,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
 
 from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
 from legcal.files.schema import few, read_json, read_yaml
@@ -123,29 +122,11 @@ class OutputKind:
 
     def is_in(self, folder: Path) -> bool:
         """Return whether a folder holds an output of this kind written by legcal."""
-        return self._document_in(folder) is not None
-
-    def dataset_of(self, folder: Path) -> str:
-        """Return the dataset that the output in a folder is from, as it was stated, or ""."""
-        stated = (self._document_in(folder) or {}).get(DATASET_KEY)
-        return stated if isinstance(stated, str) else ""
-
-    def _document_in(self, folder: Path) -> dict[str, Any] | None:
         try:
             document = read_json(folder / self.marker)
         except (OSError, ValueError):
-            return None
-        return document if isinstance(document, dict) and self.key in document else None
-
-
-DATASET_KEY = "dataset_folder"
-"""Key of a document that says which dataset an output folder is from: see :func:`seen_from`."""
-
-
-def seen_from(destination: Path, dataset: Path) -> str:
-    """Return the path from an output folder to its dataset, which moves with both of them."""
-    path = os.path.relpath(os.path.realpath(dataset), os.path.realpath(destination))
-    return Path(path).as_posix()
+            return False
+        return isinstance(document, dict) and self.key in document
 
 
 RESULT = OutputKind("result", "result.json", "legcal_result")
@@ -162,30 +143,16 @@ def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
 
 
 def check_destination(
-    destination: Path,
-    kind: OutputKind = RESULT,
-    *,
-    replaces: bool = True,
-    dataset: Path | None = None,
+    destination: Path, kind: OutputKind = RESULT, *, replaces: bool = True
 ) -> None:
-    """Refuse an output folder that holds files, unless it *replaces* earlier output of its kind.
-
-    Output of another *dataset* than the one given is not replaced either.
-    """
+    """Refuse an output folder that holds files, unless it *replaces* earlier output of its kind."""
     check_path(destination, kind)
     is_earlier = kind.is_in(destination)
     is_new = not destination.is_dir() or not holds_files(destination)
-    other = ""
-    if is_earlier and dataset is not None:
-        stated = kind.dataset_of(destination)
-        other = stated if stated != seen_from(destination, dataset) else ""
-    if is_new or (replaces and not other and (is_earlier or not kind.marker)):
+    if is_new or (replaces and (is_earlier or not kind.marker)):
         return
     found, needed, remedy = "a folder with files", "a new or empty folder", "give another folder"
-    if other:
-        found = f"the {kind.noun} of another dataset ({os.path.normpath(destination / other)})"
-        needed, remedy = f"{needed} or a {kind.noun} of {dataset}", f"{remedy}, or remove that one"
-    elif is_earlier:
+    if is_earlier:
         found, remedy = f"an earlier {kind.noun}", f"{remedy}, or remove that one"
     elif replaces:
         found = "a folder with other files and"
@@ -270,14 +237,13 @@ def result_folder(
     stale: Iterable[Path] = (),
     *,
     replaceable: Container[Path] | None = None,
-    dataset: Path | None = None,
 ) -> Iterator[Path]:
     """Give a temporary folder; its files become the result when the block ends without error.
 
-    An earlier result is replaced file by file, if it is from the same *dataset*; other files beside
-    it are kept. If the block or the moving is interrupted, the destination is unchanged.
+    An earlier result is replaced file by file; other files beside it are kept. If the block or
+    the moving is interrupted, the destination is unchanged.
     """
-    check_destination(destination, kind, dataset=dataset)
+    check_destination(destination, kind)
     with (
         out_of_resources(destination, f"the {kind.noun}", ANOTHER_FOLDER),
         temporary_folder(_workshop(destination), destination.name) as temporary,
