@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import csc_array
 
 from legcal.calibration.joint_fit.diagnostics import MOST_SCATTER, Scatter
 from legcal.calibration.joint_fit.factors import ObservedCorners, ObservedEdges, ObservedOutlines
@@ -34,6 +35,7 @@ _KEYS = ("fx", "fy", "cx", "cy", "k1")  # intrinsics in errors and tests
 _FOCAL: Mapping[str, float] = {"fx": 1.0, "fy": 1.0}  # relative
 _SIGNIFICANT = 5.0  # standard deviations
 _OF_OTHER_EDGES = 3.0  # the same without any one edge of a part in a view
+_AT_ONCE = 1000  # outlines that are projected together
 
 
 def sensitivity_to_cameras(
@@ -387,20 +389,31 @@ class CameraResiduals:
         """
         o, error = self.problem.outlines, np.sum([one.error for one in wrong], axis=0)
         changes, views = self.changes(error), np.any(error, axis=1)
-        edges = np.column_stack([o.view, o.radius, o.epsilon])
-        shown = views[o.view] & changes["outlines"].any(axis=1)
-        for edge in np.unique(edges[shown], axis=0):
-            own = np.flatnonzero(shown & np.all(edges == edge, axis=1))
-            every = np.arange(1 + 2 * len(own))
-            columns = {name: np.zeros((*x.shape, len(every))) for name, x in changes.items()}
+        shown = np.flatnonzero(views[o.view] & changes["outlines"].any(axis=1))
+        edges = np.column_stack([o.view, o.radius, o.epsilon])[shown]
+        _, edge, size = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+        together = np.cumsum(size) // _AT_ONCE
+        for part in np.unique(together).tolist():
+            own = np.flatnonzero(together[edge] == part)
+            free = (2 * shown[own, None] + np.arange(2)).ravel()  # both ends of each outline
+            columns = dict[str, csc_array]()
             for name, change in changes.items():
-                columns[name][..., 0] = change
-            for k in range(2):
-                columns["outlines"][own, k, every[1 + k :: 2]] = 1.0
-            scores = Projected.of(self._plain, columns).at(every)
-            number = scores.given(scores.estimate(every[1:])).estimate(every[:1])
-            if number.square <= _OF_OTHER_EDGES**2:
-                return False
+                any_end = free if name == "outlines" else free[:0]
+                value = np.append(change.ravel(), np.ones(len(any_end)))
+                at = np.append(np.arange(change.size), any_end)
+                column = np.append(
+                    np.zeros(change.size, dtype=np.intp), 1 + np.arange(len(any_end))
+                )
+                shape = change.size, 1 + len(free)
+                columns[name] = csc_array((value, (at, column)), shape=shape)
+            projected = Projected.of(self._plain, columns)
+            for one in np.flatnonzero(together == part).tolist():
+                of_edge = 1 + np.flatnonzero(np.repeat(edge[own] == one, 2))
+                scores = projected.at(np.append(0, of_edge))
+                anywhere = scores.estimate(1 + np.arange(len(of_edge)))
+                number = scores.given(anywhere).estimate(np.arange(1))
+                if number.square <= _OF_OTHER_EDGES**2:
+                    return False
         return True
 
     def _known_views(self, error: Array) -> BoolArray:
