@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from simulated import settings, simulated, standing
 
 from legcal import Calibration, Dataset, calibrate, evaluate, load_dataset, load_mechanism
+from legcal.calibration import session_changes
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.variables import Start, fitted_legs
 from legcal.calibration.session_changes import ALL_MOTORS, UnmodelledEffect, session_tests
@@ -290,6 +291,30 @@ def test_wrong_edges_in_one_image_are_no_change(healthy: Dataset, start: Start) 
     seldom_seen = of_leg & (outlines.row >= 12) & ~np.isin(outlines.row, [wrong, 18, 20])
     spoiled = replace(healthy, observations=changed.choose(~seldom_seen))
     assert [one.kind for one in _findings(spoiled, start)] == []
+
+
+@pytest.mark.parametrize(
+    ("poses", "last", "slip", "blocks"),
+    [
+        pytest.param(12, 3, 2e-3, 8, id="the last block of a long session"),
+        pytest.param(5, 3, 1e-4, 60, id="few images"),
+    ],
+)
+def test_a_slip_that_few_images_show_is_named(
+    tmp_path: Path, poses: int, last: int, slip: float, blocks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_changes, "MAX_BLOCKS", blocks)
+    session = load_dataset(simulated(tmp_path / "set", "hexapod", poses=poses).folder)
+    m = session.measurements
+    n = m.n_rows
+    solution = calibrate(session).solution
+    nominal = Start(solution.legs, solution.T_camera_Rb, solution.T_Rb_Re, "nominal")
+    q = m.q + slip * np.outer(np.arange(n) >= n - last, np.arange(6) == 2)
+    m = replace(m, q=q, time=np.arange(n, dtype=np.float64))
+    (finding,) = _findings(replace(session, measurements=m), nominal)
+    assert (finding.kind, finding.subject) == ("encoder", "leg3")
+    assert finding.between == (m.pose_labels[n - last - 1], m.pose_labels[n - last])
+    assert abs(finding.amount - slip) < 4.0 * finding.sigma < slip
 
 
 def test_a_stated_length_tells_a_pitch_that_all_motors_share(healthy: Dataset) -> None:

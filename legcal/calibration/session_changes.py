@@ -54,6 +54,7 @@ MAX_FINDINGS = 3
 MAX_BLOCKS = 60  # groups of consecutive images between which changes are looked for
 MIN_IMAGES = 3  # on each side of a change
 _MAX_OTHER_VIEWS = 5  # views whose side of a change is tried
+_BY_OTHERS = 0.0027  # probability by chance of a number that one image may not be the reason of
 _HUBER = 3.0  # standard deviations from which on outlines count less
 ALL_MOTORS = "all motors"
 
@@ -241,6 +242,7 @@ class _Hypothesis:
     unit: str
     columns: Mapping[str, Array]  # (n, q, d) of factors by name
     share: Mapping[str, Array]  # (n, n_blocks) of blocks of images in each residual
+    size: IntArray  # (n_blocks,) images in each block
     changes: bool  # from some image on; else in all images
 
 
@@ -668,8 +670,11 @@ class _Fit:
         whitening = np.asarray(problem.factor("readings").whitening)[:, 0, 0]
         columns = {"readings": (-readings.sign * whitening)[:, None, None] * by[:, None]}
         share = self.course.of_poses(readings.pose)
-        share = share if groups is None else share @ groups
-        return _Hypothesis(kind, subject, unit, columns, {"readings": share}, kind == "encoder")
+        size = self.course.size
+        if groups is not None:
+            share, size = share @ groups, np.asarray(size @ groups, dtype=np.intp)
+        changes = kind == "encoder"
+        return _Hypothesis(kind, subject, unit, columns, {"readings": share}, size, changes)
 
     def of_motors(self) -> Iterator[_Hypothesis]:
         """Yield what may be wrong with the readings of motors."""
@@ -721,15 +726,15 @@ class _Fit:
             camera = {
                 name: np.stack([change[name] for change in moved], axis=-1) for name in shares
             }
-            yield _Hypothesis("camera", view, "", camera, shares, True)
+            yield _Hypothesis("camera", view, "", camera, shares, course.size, True)
             zoom = residuals.zoomed(v)
             focal = {name: -zoom[name][..., None] for name in shares}
-            yield _Hypothesis("focal_length", view, "1", focal, shares, True)
+            yield _Hypothesis("focal_length", view, "1", focal, shares, course.size, True)
         for views in np.unique(of_files, axis=0):
             errors = chain.from_iterable(residuals.errors_of_files(views).values())
             if changes := [residuals.changes(error) for error in errors]:
                 columns = {of: np.stack([one[of] for one in changes], axis=-1) for of in shares}
-                yield _Hypothesis("camera_file", "", "", columns, shares, False)
+                yield _Hypothesis("camera_file", "", "", columns, shares, course.size, False)
 
     def of_joints(self) -> Iterator[list[_Hypothesis]]:
         """Yield joints that may have moved, by leg."""
@@ -761,7 +766,9 @@ class _Fit:
                         }
                     )
                 by = {of: np.stack([one[of] for one in moved], axis=-1) for of in share}
-                joints.append(_Hypothesis("joint", f"{name}.{side}", "m", by, share, True))
+                joints.append(
+                    _Hypothesis("joint", f"{name}.{side}", "m", by, share, course.size, True)
+                )
             yield joints
 
     def of_screws(self) -> Iterator[list[_Hypothesis]]:
@@ -823,7 +830,7 @@ class _Fit:
         for one, scores in sorted(found, key=lambda each: -each[0].explains):
             if one.p_value * asked > DOUBT_BY_CHANCE:
                 return None
-            if scores.is_of_several_images(one, asked):
+            if scores.is_of_several_images(one):
                 return one
         return None
 
@@ -946,27 +953,29 @@ class _Scores:
         for number in sorted(solved, key=lambda one: (one.p_value, -one.explains)):
             if number.p_value * n_tests > DOUBT_BY_CHANCE:
                 return None
-            if self.is_of_several_images(number, n_tests):
+            if self.is_of_several_images(number):
                 return number
         return None
 
-    def is_of_several_images(self, number: _Solved, n_tests: int) -> bool:
-        """Return whether a number is certain beside an error of its own in any one image.
+    def is_of_several_images(self, number: _Solved) -> bool:
+        """Return whether a number is seen beside an error of its own in any one image.
 
         Wrong edges or readings of a single image are neither a change nor an error of a motor.
+        Blocks of as many images as a change needs are no single image. The others are asked about
+        this number alone, which all of them chose.
         """
-        of_blocks = self._of_hypotheses[number.test.place]
-        columns, block = (
-            number.estimated.columns,
-            np.nonzero(self.column[number.test.place] >= 0)[1],
-        )
+        place, size = number.test.place, number.test.of.size
+        of_blocks, columns = self._of_hypotheses[place], number.estimated.columns
+        block = np.nonzero(self.column[place] >= 0)[1]
         every = number.estimated._replace(columns=np.arange(len(columns)))
         score, variance = of_blocks.left([every])
         apart = score[0] ** 2 / np.maximum(variance[0], LEAST_SEEN * of_blocks.size)
         for one in dict.fromkeys(block[np.argsort(-apart, kind="stable")].tolist()):
+            if size[one] >= MIN_IMAGES:
+                continue
             beside = of_blocks.given(of_blocks.estimate(np.flatnonzero(block == one)))
             (again,) = _solved_by(beside, [number.test], every.chosen[None], columns)
-            if again.p_value * n_tests > DOUBT_BY_CHANCE:
+            if again.p_value > _BY_OTHERS:
                 return False
         return True
 
