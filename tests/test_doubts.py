@@ -210,6 +210,7 @@ def test_a_camera_that_is_contradicted_has_its_effect_on_the_platform(healthy: C
         large = {"sensitivities": {FITTED_CAMERA: size * focal}}
         found = _judged(healthy, **changes | large)
         assert [one.code for one in found.doubts] == ["camera", "no_improvement"]
+        assert found.doubts[1].remedy.endswith("calibrate the camera again")
         assert found.doubts[0].is_grave == (size > by_half)
         assert found.verdict.is_to_be_refused
 
@@ -225,6 +226,9 @@ def test_too_small_an_improvement_is_said_before_what_has_no_part_in_it(
     assert codes == ["few_outlines", "no_improvement", "strayed_camera"]
     assert "do not show that this model is better" in found.doubts[1].what
     assert found.doubts[1].remedy.startswith("keep the nominal one, or take many more images")
+    monkeypatch.setattr(verdict, "platform_accuracy", lambda *_: None)
+    found = _judged(healthy)
+    assert found.doubts[1].what.startswith("the change of joints and lengths is ")
 
 
 def test_a_platform_no_better_known_than_built_has_tolerances_as_its_next_step(

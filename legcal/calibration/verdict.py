@@ -121,7 +121,10 @@ def judge(
     of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
     known_to = float(np.hypot(sigma, of_cameras))
     if change <= TRUSTED_SIGMAS * known_to:
-        doubts = (*doubts, _no_improvement(change, known_to, measurements.n_rows, remedy))
+        of = "joints and lengths" if platform is None else "the platform"
+        if change > TRUSTED_SIGMAS * sigma:  # more images do not mend a camera
+            remedy = remedy or "calibrate the camera again"
+        doubts = (*doubts, _no_improvement(of, change, known_to, measurements.n_rows, remedy))
     doubts = _worst_first(doubts)
     sentence = f"Calibrated: {found}."
     if doubts:
@@ -158,11 +161,11 @@ def judge(
     )
 
 
-def _no_improvement(change: float, sigma: float, n_images: int, remedy: str) -> Doubt:
-    """Return the doubt in a change of the platform that is not surely one for the better [m]."""
+def _no_improvement(of: str, change: float, sigma: float, n_images: int, remedy: str) -> Doubt:
+    """Return the doubt in a change [m] of something that is not surely one for the better."""
     times = change / sigma if sigma > 0.0 else 0.0
     what = (
-        f"the change of the platform is {times:.2f} times its standard deviation, needed "
+        f"the change of {of} is {times:.2f} times its standard deviation, needed more than "
         f"{TRUSTED_SIGMAS:g}: these images do not show that this model is better than the nominal "
         "one"
     )
