@@ -121,10 +121,10 @@ def judge(
     of_cameras, _ = model_error([doubt for doubt in doubts if doubt.code == CAMERA])
     known_to = float(np.hypot(sigma, of_cameras))
     if change <= TRUSTED_SIGMAS * known_to:
-        of = "joints and lengths" if platform is None else "the platform"
+        changed = "joints and lengths" if platform is None else "the platform"
         if change > TRUSTED_SIGMAS * sigma:  # more images do not mend a camera
             remedy = remedy or "calibrate the camera again"
-        doubts = (*doubts, _no_improvement(of, change, known_to, measurements.n_rows, remedy))
+        doubts = (*doubts, _no_improvement(changed, change, known_to, measurements.n_rows, remedy))
     doubts = _worst_first(doubts)
     sentence = f"Calibrated: {found}."
     if doubts:
