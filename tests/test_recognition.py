@@ -372,6 +372,39 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     np.testing.assert_allclose(placed.as_matrix(), T.as_matrix(), atol=1e-12)
 
 
+def test_a_view_that_contradicts_the_others_is_placed_again_by_what_these_show(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Near its rough pose, and its joints are where the others have them: not twice as far off."""
+    rng = np.random.default_rng(2)
+    nominal, n = lp.machine(6, rng), 3
+    shift = 0.01 * lp.SIZE * rng.normal(size=(6, 2, 3))
+    true = lp.MachineSpec(nominal.A + shift[:, 0], nominal.B + shift[:, 1])
+    T, platforms = lp.camera(rng), [lp.platform(rng) for _ in range(n)]
+    seen = lp.pictures(true, T, platforms, rng)
+    nothing = lp.pictures(true, T, platforms[:1], rng, missing=1.1)
+    B = np.array([nominal.posed(P) for P in [*platforms, platforms[0]]])
+    search = _search(Search, nominal, B)
+    views = View("c1", CAMERA), View("c2", CAMERA)
+    m = replace(search.measurements, views=views, view=np.array([0] * n + [1]))
+    pairs = dict(enumerate(picture.pairs for picture in [*seen, *nothing]))
+    wanted = np.ones((2, 6), dtype=np.bool_)
+    search = replace(search, measurements=m, edge_pairs=pairs, wanted=wanted)
+    moved = replace(search, A_base=search.A_base + shift[:, 0], B_base=search.B_base + shift[:, 1])
+    patched = {
+        "_decided_by_outlines": lambda search, group, pictures, one: one,
+        "_by_edges": lambda *_: place_camera([], 6),
+        "_is_mirrored": lambda *_: False,
+        "_fitted": lambda *_: object(),
+        "with_common_shift": lambda *_: (moved, shift, np.array([False])),
+    }
+    for name, made in patched.items():  # there are no images to measure outlines in
+        monkeypatch.setattr(recognition, name, made)
+    placement = recognition.place_views(search, np.arange(n + 1), [T, None])
+    assert [*placement.unplaced] == ["c2"]
+    assert np.abs(placement.shift[0] - shift).max() < 0.3 * np.abs(shift).max()
+
+
 # The fit of a view to outlines.
 
 N_LEGS, N_IMAGES = 6, 4
