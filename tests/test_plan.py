@@ -268,7 +268,10 @@ def test_what_else_is_in_the_way_is_refused(planned: Plan, shot: Path) -> None:
         named = "legs are [34].. px wide .* a --camera with more pixels"
         refused(error, named, model="linear-delta", camera=coarse, setting=None)
     refused(NotVisible, "; use a board with larger", board="charuco:7x5:4mm:3mm:DICT_4X4_50")
+    refused(NotVisible, "use another board, wider --bounds", board="chessboard:90x61:1m")
     refused(NotVisible, "; use a board with larger squares", board="chessboard:9x6:5mm")
+    refused(NotVisible, "; widen --bounds, or use a board", board="chessboard:9x6:5mm",
+            bounds="-9m:9m,-9m:9m,-9m:9m")  # fmt: skip
     refused(NotIdentifiable, "give --images . or more", images=1)
     refused(DatasetError, "needed images of 3-rps", model="3-rps", given=shot / "session")
     upright, tilted = map(load_mechanism, ("3-upu", "3-upu-tilted"))

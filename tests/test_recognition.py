@@ -372,6 +372,39 @@ def test_clicks_that_agree_place_a_view_whose_images_show_too_little(
     np.testing.assert_allclose(placed.as_matrix(), T.as_matrix(), atol=1e-12)
 
 
+def test_a_view_that_contradicts_the_others_is_placed_again_by_what_these_show(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Near its rough pose, and its joints are where the others have them: not twice as far off."""
+    rng = np.random.default_rng(2)
+    nominal, n = lp.machine(6, rng), 3
+    shift = 0.01 * lp.SIZE * rng.normal(size=(6, 2, 3))
+    true = lp.MachineSpec(nominal.A + shift[:, 0], nominal.B + shift[:, 1])
+    T, platforms = lp.camera(rng), [lp.platform(rng) for _ in range(n)]
+    seen = lp.pictures(true, T, platforms, rng)
+    nothing = lp.pictures(true, T, platforms[:1], rng, missing=1.1)
+    B = np.array([nominal.posed(P) for P in [*platforms, platforms[0]]])
+    search = _search(Search, nominal, B)
+    views = View("c1", CAMERA), View("c2", CAMERA)
+    m = replace(search.measurements, views=views, view=np.array([0] * n + [1]))
+    pairs = dict(enumerate(picture.pairs for picture in [*seen, *nothing]))
+    wanted = np.ones((2, 6), dtype=np.bool_)
+    search = replace(search, measurements=m, edge_pairs=pairs, wanted=wanted)
+    moved = replace(search, A_base=search.A_base + shift[:, 0], B_base=search.B_base + shift[:, 1])
+    patched = {
+        "_decided_by_outlines": lambda search, group, pictures, one: one,
+        "_by_edges": lambda *_: place_camera([], 6),
+        "_is_mirrored": lambda *_: False,
+        "_fitted": lambda *_: object(),
+        "with_common_shift": lambda *_: (moved, shift, np.array([False])),
+    }
+    for name, made in patched.items():  # there are no images to measure outlines in
+        monkeypatch.setattr(recognition, name, made)
+    placement = recognition.place_views(search, np.arange(n + 1), [T, None])
+    assert [*placement.unplaced] == ["c2"]
+    assert np.abs(placement.shift[0] - shift).max() < 0.3 * np.abs(shift).max()
+
+
 # The fit of a view to outlines.
 
 N_LEGS, N_IMAGES = 6, 4
@@ -420,32 +453,43 @@ def test_exact_outlines_give_back_the_camera() -> None:
     assert _fitted(0, is_used=False)[0] is None  # no outline is used
 
 
-def test_views_of_one_machine_share_the_errors_of_its_joints() -> None:
-    """Errors of 1 % of the legs: four cameras agree on them, and not better than is stated.
+def _seen_by_cameras(seed: int, n_right: int, n_other: int) -> tuple[Search, Array, list[ViewFit]]:
+    """Return the model, errors of its joints of 1 % of the legs, and the fits of cameras.
 
-    What a fifth one saw, of other joints, is told from them and left out.
+    First of those that see these errors, then of others, each with joints three times as far off.
+    """
+    rng = np.random.default_rng(seed)
+    made = lp.machine(N_LEGS, rng)
+    B = np.array([made.posed(lp.platform(rng)) for _ in range(N_IMAGES)])
+    search = _search(Search, made, B)
+    (group,) = group_views(search.measurements, np.arange(N_IMAGES), [None], None)
+    wrong, *others = 0.01 * lp.SIZE * rng.normal(size=(1 + n_other, N_LEGS, 2, 3))
+    fits = []
+    for shown in (*(wrong for _ in range(n_right)), *(3.0 * other for other in others)):
+        T, A, B = lp.camera(rng), search.A_base + shown[:, 0], search.B_base + shown[:, 1]
+        fit = fit_view(search, group, T, np.zeros((N_LEGS, 2, 3)), _outlines(T, A, B))
+        assert fit is not None
+        fits.append(fit)
+    return search, wrong, fits
+
+
+def test_views_of_one_machine_share_the_errors_of_its_joints() -> None:
+    """Four cameras agree on them, and not better than is stated.
+
+    What others saw, of other joints, is told from them and left out, the farthest first.
     """
     for seed in range(4):
-        rng = np.random.default_rng(seed)
-        made = lp.machine(N_LEGS, rng)
-        B = np.array([made.posed(lp.platform(rng)) for _ in range(N_IMAGES)])
-        search = _search(Search, made, B)
-        (group,) = group_views(search.measurements, np.arange(N_IMAGES), [None], None)
-        wrong, other = 0.01 * lp.SIZE * rng.normal(size=(2, N_LEGS, 2, 3))
-        fits = []
-        for shown in (wrong, other, wrong, wrong, wrong):
-            T, A, B = lp.camera(rng), search.A_base + shown[:, 0], search.B_base + shown[:, 1]
-            fit = fit_view(search, group, T, np.zeros((N_LEGS, 2, 3)), _outlines(T, A, B))
-            assert fit is not None
-            fits.append(fit)
+        search, wrong, fits = _seen_by_cameras(seed, 4, 1)
         moved, shift, agree = with_common_shift(search, fits)
-        assert agree.tolist() == [True, False, True, True, True]
+        assert agree.tolist() == [True] * 4 + [False]
         before, after = (_own_errors(search, errors) for errors in (wrong, wrong - shift))
         assert np.square(after).sum() < 0.1 * np.square(before).sum()
         whitening = moved.shift_whitening
         assert whitening is not None
         assert np.square(np.einsum("lij,lj->li", whitening, after)).mean() < 1.0
         assert moved.joint_error < 0.6 * search.joint_error
+        search, _, fits = _seen_by_cameras(seed, 3, 2)
+        assert with_common_shift(search, fits)[2].tolist() == [True] * 3 + [False] * 2
 
 
 def _own_errors(search: Search, errors: Array) -> Array:

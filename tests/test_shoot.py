@@ -142,19 +142,23 @@ def test_the_second_photograph_of_a_machine_that_is_off_by_millimetres_is_taken(
 ) -> None:
     off, folder, taken = legcal.Spread(4e-3), tmp_path / "session", tmp_path / "taken"
     errors = legcal.ParameterErrors(base_joints=off, platform_joints=off)
-    settings = legcal.SimulationSettings(poses=2, views=1, seed=3, errors=errors)
+    settings = legcal.SimulationSettings(poses=4, views=1, seed=3, errors=errors)
     legcal.simulate("linear-delta", folder, settings)
     shutil.move(folder / "images", taken)
     session = GuidedSession(folder)
-    first, second = sorted(taken.iterdir())
     wrong = tmp_path / "wrong.png"
-    cv2.imwrite(str(wrong), np.asarray(cv2.imread(str(second)))[:, ::-1])
-    session.accept(asked(session), first, session.check(asked(session), first))
-    assert "at another pose" in " ".join(session.check(asked(session), wrong).problems)
-    found = session.check(asked(session), second)
-    assert found.problems == ()
-    assert found.legs is not None
-    assert found.legs.sum() >= 0.6 * found.n_visible > 2.0
+    for k, path in enumerate(sorted(taken.iterdir())[:3]):
+        if k > 0:
+            cv2.imwrite(str(wrong), np.asarray(cv2.imread(str(path)))[:, ::-1])
+            before = dict(session.cameras)
+            assert "at another pose" in " ".join(session.check(asked(session), wrong).problems)
+            assert session.cameras == before  # a photograph that is refused places no camera
+        found = session.check(asked(session), path)
+        assert found.problems == ()
+        if k > 0:
+            assert found.legs is not None
+            assert found.legs.sum() >= 0.6 * found.n_visible > 2.0
+        session.accept(asked(session), path, found)
 
 
 def test_a_photograph_that_finds_no_room_is_kept_by_word_once_there_is_some(

@@ -20,11 +20,16 @@ from legcal.calibration.board import rough_placement
 from legcal.calibration.detection import Detection
 from legcal.calibration.estimate import outlier_images
 from legcal.calibration.ordered_dataset import order_dataset
-from legcal.data.measurements import View
+from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.data.reasons import Reason, Rejection
-from legcal.geometry.types import BoolArray
-from legcal.perception.diagnostics import hint_notes
+from legcal.geometry.types import Array, BoolArray
+from legcal.perception.diagnostics import (
+    ImageExplanation,
+    OutlineCount,
+    hint_notes,
+    image_verdict,
+)
 from legcal.perception.image_quality import measure_exposure
 from legcal.perception.photographs import MeasuredImages, place_and_measure
 from legcal.progress import no_progress
@@ -314,3 +319,18 @@ def test_images_most_of_whose_outlines_disagree_are_named(tmp_path: Path) -> Non
     for legs, edges in (((0,), ()), ((0, 1), ()), ((0,), (1,))):
         wrong = (o.row == 1) & (np.isin(o.leg, legs) | np.isin(o.edge, edges))
         assert outlier_images(_with_rejected(o, wrong)) == {}
+
+
+def test_readings_of_another_image_are_named_where_there_are_readings() -> None:
+    copied = np.array([[0.1, np.nan], [0.2, np.nan], [0.1, np.nan], [0.1, np.nan]])
+    views, of_view = (View("c1", PINHOLE), View("c2", PINHOLE)), np.array([0, 0, 0, 1])
+    m = Measurements(views, ("a", "b", "c", "d"), of_view, np.arange(4), copied, np.full(2, 1e-6))
+    nothing, usual, counts = ImageExplanation(0.0), dict.fromkeys((0, 1), 1.0), OutlineCount(1, 12)
+
+    def said(readings: Array, row: int) -> str:
+        of = replace(m, q=readings)
+        return str(image_verdict(of, row, nothing, usual, {row: counts})[1])
+
+    assert "its readings are those of image a; correct its row" in said(copied, 2)
+    for readings, row in ((copied, 1), (copied, 3), (np.full((4, 2), np.nan), 2)):
+        assert "no other explanation" in said(readings, row)

@@ -530,4 +530,4 @@ def platform_chart(result: Result) -> list[Canvas]:
             )
         )
     ]
-    return [scatter("Platform error", lines, "pose", "platform [mm]", log="y")] if poses else []
+    return [scatter("Platform error", lines, "pose", "platform [mm]", log=True)] if poses else []

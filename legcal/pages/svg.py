@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from os import fspath
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -285,16 +285,16 @@ def scatter(
     y_label: str,
     *,
     words: Sequence[str] = (),
-    log: Literal["", "y", "xy"] = "",
+    log: bool = False,
 ) -> Canvas:
     """Draw points, whose numbers are for the script of the page, or lines through them.
 
-    *words* name the x of 0, 1, 2, ...; the axes of *log* are logarithmic.
+    *words* name the x of 0, 1, 2, ...; y is logarithmic with *log*.
     """
     labels = [points.label for points in groups if points.label]
     top, width, height = 8.0 + 16.0 * len(labels), 340.0, 290.0 + 16.0 * len(labels)
-    x_axis = _Axis.of([points.x for points in groups], "x" in log)
-    y_axis = _Axis.of([points.y for points in groups], "y" in log)
+    x_axis = _Axis.of([points.x for points in groups], False)
+    y_axis = _Axis.of([points.y for points in groups], log)
     y_ticks = [(tick, f"{tick:g}") for tick in y_axis.ticks]
     # The title of the axis stands beside the longest label.
     left = max(52.0, 28.0 + 6.6 * max((len(label) for _, label in y_ticks), default=0))

@@ -198,7 +198,8 @@ def image_verdict(
         little = "shows little of the legs: {}, in other images most; check its light and sharpness"
         return USED, Cause(little, (much,))
     q, given = measurements.q, measurements.q[row]
-    same = (measurements.view == view) & np.all((q == given) | np.isnan(given), axis=1)
+    is_read = np.isfinite(given)
+    same = (measurements.view == view) & is_read.any() & np.all(q[:, is_read] == given[is_read], 1)
     if len(others := np.setdiff1d(np.flatnonzero(same), row)):
         copied = "{}, and its readings are those of image {}; correct its row if it was copied"
         cause = Cause(copied, (much, measurements.image[int(others[0])]))

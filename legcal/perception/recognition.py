@@ -208,11 +208,10 @@ def _fitted(search: Search, placed: tuple[Group, PoseCandidates]) -> ViewFit | N
 
 
 def _seen_by(search: Search, task: _Task) -> _Task:
-    """Return a task with the legs of another model predicted."""
-    pictures = {
-        row: search.picture(row, pairs=picture.pairs) for row, picture in task.pictures.items()
-    }
-    return task._replace(pictures=pictures)
+    """Return a task with the legs of another model predicted, and nothing found yet."""
+    known = {row: picture.pairs for row, picture in task.pictures.items()}
+    pictures = {row: search.picture(row, pairs=known.get(row)) for row in task.group.rows}
+    return _Task(task.group, pictures, None)
 
 
 def _is_mirrored(

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.special import chdtrc
 
 from legcal.data.outlines import Outlines, is_edited, join_outlines
 from legcal.data.reasons import Reason
@@ -60,7 +59,7 @@ ITERATIONS, FIXED_ITERATIONS = 8, 2  # of Gauss-Newton, and those before sigmas 
 OUTLINE_EVIDENCE, MAX_OUTLINES = 2.0, 4  # of an outline, half a square; of a leg in an image
 EVIDENCE_OF_IMAGE = 0.15  # of EVIDENCE, for each image: more of them agree more by chance
 WEAK = 0.7  # part of the least evidence without which a view that edge pairs placed is none
-MIN_AGREEMENT = 0.01  # probability, below which the joints of a group contradict those of others
+MAX_GAP = 2.33  # of the joints of a group to those of others [standard deviations of a normal]
 SHOWN = 1e-9  # of the best known combination of shifts, from which on a group shows another one
 SHIFT_COST = 0.25  # of a squared shift [standard deviations^-2]: half, as some are the pose's
 GOOD_FIT = 0.85  # part of the evidence that outlines can give at most
@@ -369,17 +368,19 @@ def _agreeing(prior: Array, weights: Array, told: Array) -> BoolArray:
     """
     agree = np.ones(len(told), dtype=np.bool_)
     while agree.sum() > 2:
-        p = np.ones(len(told))
+        gaps = np.full(len(told), -np.inf)
         for k in np.flatnonzero(agree).tolist():
             others = np.linalg.inv(prior + weights[agree].sum(axis=0) - weights[k])
             gap = told[k] - weights[k] @ others @ (told[agree].sum(axis=0) - told[k])
             variance, axes = np.linalg.eigh(weights[k] + weights[k] @ others @ weights[k])
             shown = variance > SHOWN * variance[-1]
             square = np.sum((gap @ axes[:, shown]) ** 2 / variance[shown])
-            p[k] = chdtrc(shown.sum(), square)
-        if p.min() >= MIN_AGREEMENT:
+            # As probabilities of large squares are zero, by Wilson and Hilferty's (1931) roots.
+            spread = 2.0 / (9.0 * shown.sum())
+            gaps[k] = (np.cbrt(square / shown.sum()) - (1.0 - spread)) / np.sqrt(spread)
+        if gaps.max() <= MAX_GAP:
             break
-        agree[np.argmin(p)] = False
+        agree[np.argmax(gaps)] = False
     return agree
 
 

@@ -162,7 +162,7 @@ def _distance_to_frame_all(toward: Array, points: Array, camera: Camera, setting
 
 
 def parse_bounds(text: str) -> Array:
-    """Parse bounds (3, 2) [m] from a text ``-2:2,-2:2,0:1.5``."""
+    """Parse bounds (3, 2) [m] from a text ``-2m:2m,-2m:2m,0m:1.5m``."""
     parts = [part.split(":") for part in text.split(",")]
     if len(parts) != 3 or any(len(part) != 2 for part in parts):
         raise UsageError(

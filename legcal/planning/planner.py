@@ -362,6 +362,8 @@ def _visible_places(
     )
     if task.board is not None:
         remedy = "use a board with larger squares, or a smaller one that is whole in the image"
+    if task.bounds is not None:
+        remedy = f"widen --bounds, or {remedy}"
     asked = blind[:: len(blind) // _N_ASKED + 1]
     if narrow := task.too_narrow([Candidates(place, poses) for place in asked]):
         remedy = f"{narrow}: {_FINER}"

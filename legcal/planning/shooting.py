@@ -255,13 +255,14 @@ class GuidedSession:
             one = replace(one, image=(absolute,), view=np.array([v]), q=asked.q[None])
             new = replace(self.dataset, measurements=one)
             legs, n_visible = self._legs_in(new)
-            before = self._photographs_of(v)
+            before, T = self._photographs_of(v), self.cameras[m.views[v].name]
             # One pose hardly tells the place of the camera from errors of the model.
-            if legs.sum() < FEW_LEGS * n_visible and len(before) < N_PLACING:
+            if legs.sum() < FEW_LEGS * n_visible and 0 < len(before) < N_PLACING:
                 both = dataset_at(self.dataset, np.array(before))
                 if self._is_placed(v, replace(both, measurements=_joined(both.measurements, one))):
                     legs, n_visible = self._legs_in(new)
             if legs.sum() < FEW_LEGS * n_visible:
+                self.cameras[m.views[v].name] = T
                 problems.append(
                     f"It shows {legs.sum()} of {n_visible} legs where pose {asked.pose} has them: "
                     "is the machine at another pose, or has the camera moved? Set the pose and "

@@ -192,7 +192,7 @@ def truth_blocks(calibration: Calibration, truth: Machine, calibrated: Machine) 
     before = evaluate(calibration.dataset.machine, truth)
     after = evaluate(calibrated, truth)
     at_platform = (
-        "The motors do not determine the pose of the platform: parameters are compared alone."
+        "The motors do not determine the pose of the platform, so that its errors are not compared."
     )
     if len(after.displacement):
         by_nominal, by_calibrated = (
