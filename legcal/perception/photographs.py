@@ -50,7 +50,7 @@ from legcal.vision.cylinder import EPSILON
 from legcal.vision.image_file import Grey, shrink
 from legcal.workers import Run
 
-DETECTOR_VERSION = 22  # raise it whenever outlines or notes that are kept come out differently
+DETECTOR_VERSION = 23  # raise it whenever outlines or notes that are kept come out differently
 MEASURING = "Measuring outlines"  # a stage of progress
 CHOICE_ROUNDS = 2  # in which outlines decide between poses that readings leave open
 FreePosesOf = Mapping[int, tuple[RigidTransform, ...]]  # T_base_platform of poses, likeliest first
