@@ -15,7 +15,7 @@ import numpy as np
 
 from legcal.data.measurements import Measurements
 from legcal.data.reasons import Reason, Rejection
-from legcal.files.schema import in_order
+from legcal.files.schema import natural_key
 from legcal.geometry.tables import Table
 from legcal.geometry.types import BoolArray, IntArray
 
@@ -103,10 +103,15 @@ def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Ord
     Numbers in names of views, images and poses are in order, since they are listed so.
     """
     legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
-    views = _order_of([in_order(name) for name in measurements.view_names])
+    views = _order_of([natural_key(name) for name in measurements.view_names])
     labels = measurements.pose_labels or ("",) * measurements.n_poses
     keys = [
-        (in_order(measurements.views[v].name), in_order(image), in_order(labels[p]), readings)
+        (
+            natural_key(measurements.views[v].name),
+            natural_key(image),
+            natural_key(labels[p]),
+            readings,
+        )
         for v, image, p, readings in zip(
             measurements.view.tolist(),
             measurements.image,

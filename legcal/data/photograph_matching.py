@@ -25,8 +25,8 @@ from legcal.files.schema import (
     closest,
     describe,
     few,
-    in_order,
     is_name,
+    natural_key,
     read_bytes,
 )
 from legcal.files.table import Table
@@ -159,7 +159,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
             f"{folder}: the photographs could not be found: found {actual}, needed PNG, JPEG or "
             f"TIFF files there or in folders in it; {remedy}."
         )
-    return sorted(photographs, key=lambda photograph: in_order(photograph.name))
+    return sorted(photographs, key=lambda photograph: natural_key(photograph.name))
 
 
 def match(
@@ -401,7 +401,7 @@ def _counted(photographs: Sequence[Photograph]) -> list[Photograph]:
     of_one_camera = len({_NUMBERS.sub("0", name) for name in names}) == 1
     if not of_one_camera or len(set(names)) < len(names):
         return list(photographs)
-    counted = sorted(photographs, key=lambda one: in_order(PurePosixPath(one.name).name))
+    counted = sorted(photographs, key=lambda one: natural_key(PurePosixPath(one.name).name))
     n_folders = len({photograph.folder for photograph in photographs})
     blocks = [folder for folder, _ in groupby(counted, key=lambda one: one.folder)]
     return counted if len(blocks) == n_folders else list(photographs)

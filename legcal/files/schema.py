@@ -296,8 +296,8 @@ def few(names: Sequence[str], most: int = MAX_NAMED) -> str:
     return ", ".join(names[:most]) + f" and {more} more" * (more > 0)
 
 
-def in_order(name: str) -> tuple[object, ...]:
-    """Return a key by which numbers in names are in order: ``img2`` before ``img10``."""
+def natural_key(name: str) -> tuple[object, ...]:
+    """Return a key of natural order, numbers in names by their size: ``img2`` before ``img10``."""
     parts = PurePosixPath(name.casefold()).parts
     split = [_NUMBERS.split(part) for part in parts]
     keys = [tuple((int(x), "") if x.isdecimal() else (-1, x) for x in words) for words in split]

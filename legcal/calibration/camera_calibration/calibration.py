@@ -34,7 +34,7 @@ from legcal.calibration.camera_calibration.document import (
 from legcal.calibration.camera_calibration.lens import ChosenLens, chosen_lens, given_lens
 from legcal.data.photograph_notes import differences, recorded
 from legcal.errors import DatasetError, DidNotConverge, NotVisible, Problem, UsageError
-from legcal.files.schema import MAX_IMAGE, describe, few, in_order, read_bytes
+from legcal.files.schema import MAX_IMAGE, describe, few, natural_key, read_bytes
 from legcal.perception.board_adjustment import SHEET, BoardImages
 from legcal.perception.board_corners import (
     NumberedCorners,
@@ -411,7 +411,7 @@ def _matching(name: str) -> list[Path]:
         return [path]
     else:
         hits = [Path(hit) for hit in glob.glob(name, recursive=True)]
-    hits.sort(key=lambda hit: in_order(hit.as_posix()))
+    hits.sort(key=lambda hit: natural_key(hit.as_posix()))
     return [hit for hit in hits if hit.suffix.lower() in suffixes and hit.is_file()]
 
 
