@@ -201,6 +201,7 @@ def test_a_background_along_one_line_leaves_moves_open() -> None:
     assert found_in([image[60:420] for image in images]) == {}
 
 
+@pytest.mark.system
 def test_legs_are_found_as_if_the_camera_had_stood_still(tmp_path: Path) -> None:
     """Photographs before a wallpaper, as they are, and by a camera that was touched."""
     views = standing("hexapod", 1, small_camera(tmp_path, WIDTH, HEIGHT))

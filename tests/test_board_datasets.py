@@ -60,6 +60,7 @@ def test_every_image_of_a_hand_held_view_is_a_view_in_the_order_of_rows(folder: 
     assert np.bincount(dataset.corners.row).tolist() == [6, 6]
 
 
+@pytest.mark.system
 def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,6 +113,7 @@ def test_a_camera_in_the_hand_that_no_step_relates_to_the_machine_is_refused_for
     assert any(note.startswith("views c1-1, ") and "no T_base_camera" in note for note in notes)
 
 
+@pytest.mark.system
 def test_a_right_board_is_not_accused_where_the_legs_hardly_tell_the_scale(tmp_path: Path) -> None:
     """Readings are angles; the first minimum ends 0.1 % off in the scale, which counts 70 times."""
     folder = tmp_path / "d"
@@ -188,6 +190,7 @@ def test_an_edited_corner_wins_and_a_rejected_one_needs_no_place(tmp_path: Path)
     assert "c2,a.png,5,,,,rejected,hidden,edited" in (tmp_path / "again.csv").read_text()
 
 
+@pytest.mark.system
 def test_a_camera_in_the_hand_has_one_order_of_images(tmp_path: Path) -> None:
     made = simulated(
         tmp_path / "set", "hexapod", views=1, poses=24, board="charuco", hand_held=True

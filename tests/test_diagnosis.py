@@ -250,6 +250,7 @@ def test_given_outlines_name_a_mistake_as_photographs_do(
     assert ("To distinguish them" in found.sentence) == bool(found.same_as)
 
 
+@pytest.mark.system
 def test_two_mistakes_at_once_are_named_together_with_both_remedies(
     outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,6 +263,7 @@ def test_two_mistakes_at_once_are_named_together_with_both_remedies(
         assert told in found.sentence
 
 
+@pytest.mark.system
 def test_what_was_tried_in_vain_stands_beside_a_refusal(
     outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -273,6 +275,7 @@ def test_what_was_tried_in_vain_stands_beside_a_refusal(
     assert NONE_EXPLAINS in refused.value.notes
 
 
+@pytest.mark.system
 def test_where_most_images_agree_nothing_is_to_be_explained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +287,7 @@ def test_where_most_images_agree_nothing_is_to_be_explained(
     assert _likely(load_dataset(folder)) is None
 
 
+@pytest.mark.system
 def test_a_board_of_another_size_is_named_without_further_guesses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -435,6 +439,7 @@ def _base_joints_exchanged(d: Dataset) -> Dataset:
     return _with_legs(d, legs)
 
 
+@pytest.mark.system
 def test_joints_exchanged_in_the_model_are_named_before_readings_that_it_cannot_reach(
     outlines: Callable[[str], Dataset], monkeypatch: pytest.MonkeyPatch
 ) -> None:

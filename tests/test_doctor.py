@@ -158,6 +158,7 @@ def test_a_black_photograph_is_no_reason_to_look_for_mistakes(
     }
 
 
+@pytest.mark.system
 def test_a_photograph_in_the_hand_that_is_not_placed_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

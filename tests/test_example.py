@@ -38,6 +38,7 @@ def test_an_installation_without_the_example_says_so(
     assert not (tmp_path / "copy").exists()
 
 
+@pytest.mark.system
 def test_a_view_that_is_not_recognised_at_first_is_placed_near_the_fit_to_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

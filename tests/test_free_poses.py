@@ -162,6 +162,7 @@ def test_images_that_leave_a_pose_open_are_left_out(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("kind", "seed"), [("3-RPS, two motors", 8), ("3-SPS + passive UPS", 16)])
 def test_poses_that_a_few_lines_leave_ambiguous_are_searched_from_many_places(
     kind: str, seed: int, tmp_path: Path

@@ -137,6 +137,7 @@ def test_only_complete_sharp_photographs_of_the_pose_that_is_asked_are_taken(
     assert len(list(watched.iterdir())) == 9  # copied, not moved
 
 
+@pytest.mark.system
 def test_the_second_photograph_of_a_machine_that_is_off_by_millimetres_is_taken(
     tmp_path: Path,
 ) -> None:
