@@ -148,6 +148,7 @@ def test_a_camera_in_the_hand_is_told_from_one_on_a_tripod() -> None:
     assert not is_moved(strips.__getitem__, rows)
 
 
+@pytest.mark.system
 def test_photographs_without_a_common_background_are_refused_as_taken_in_the_hand(
     tmp_path: Path,
 ) -> None:

@@ -101,6 +101,7 @@ def test_an_image_in_the_hand_that_the_board_does_not_place_is_left_out_by_name(
     assert set(refused.value.problems) <= set(found_by_doctor)
 
 
+@pytest.mark.system
 def test_a_camera_in_the_hand_that_no_step_relates_to_the_machine_is_refused_for_that(
     tmp_path: Path,
 ) -> None:

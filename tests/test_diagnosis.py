@@ -365,6 +365,7 @@ def _misnamed(d: Dataset, names: dict[int, int]) -> Dataset:
     return replace(d, observations=replace(given, leg=leg, part=tuple(part)))
 
 
+@pytest.mark.system
 def test_a_fit_that_leaves_out_exchanged_legs_names_them_and_accuses_no_reading(
     tmp_path: Path,
 ) -> None:
