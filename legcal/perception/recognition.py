@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -190,7 +191,7 @@ def _all_placed(
         if not known:
             return placed
         shown, shift, agree = with_common_shift(search, list(known.values()))
-        for k in (k for k, is_one in zip(known, agree.tolist(), strict=True) if not is_one):
+        for k in compress(known, ~agree):
             placed[k] = replace(placed[k][0], by_outlines=False), False
             left.append(k)
             del fits[k]

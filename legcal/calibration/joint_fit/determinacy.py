@@ -32,11 +32,6 @@ from legcal.machine.parameters import (
 )
 
 _MAX_OTHERS = 0.05  # non-kinematic part of a direction, above which it cannot be held
-_REMEDY = (
-    "add images from other directions, of other legs or at poses that differ more, or state what "
-    "is known: values with a prior"
-)
-_OR_TOLERANCES = ", or tolerances (machine_kind) with --only all"
 _MIN_SPREAD = 2.5e-12  # mean leg lengths: floor of the error of the nominal model
 
 
@@ -92,7 +87,7 @@ def undetermined_directions(normal: FitNormal) -> HeldDirections:
         raise NotIdentifiable(
             f"The fit is not determined: {len(basis)} of {len(names)} combinations of parameters "
             f"are uncertain by more than a tenth of a leg length: {description}; "
-            f"{_REMEDY}{_OR_TOLERANCES * (problem.choices.built is None)}."
+            f"{_remedy(problem)}."
         )
     weak: tuple[str, ...] = ()
     if len(
@@ -131,13 +126,21 @@ def refuse_undetermined_inliers(
         if accepted.all():
             raise NotIdentifiable(
                 f"The fit is not determined: at its minimum, {description} is uncertain by more "
-                f"than a tenth of a leg length; {_REMEDY}"
-                f"{_OR_TOLERANCES * (problem.choices.built is None)}."
+                f"than a tenth of a leg length; {_remedy(problem)}."
             )
         raise NotIdentifiable(
             f"The fit is not determined: without the rejected outlines, {description} is not "
             "determined; correct the rejected outlines, or add images."
         )
+
+
+def _remedy(problem: FitProblem) -> str:
+    """Return what determines a fit; tolerances only where they are not its priors already."""
+    tolerances = ", or tolerances (machine_kind) with --only all"
+    return (
+        "add images from other directions, of other legs or at poses that differ more, or state "
+        f"what is known: values with a prior{tolerances * (problem.choices.built is None)}"
+    )
 
 
 def _are_open(information: Array, direction: Array, length: float) -> BoolArray:
